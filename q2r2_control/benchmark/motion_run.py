@@ -1,4 +1,8 @@
-"""One controller in one work motion, and the figures of it: the same for ours, for peers, and for tests."""
+"""One controller in one work motion, with its figures, and the bench of ours and peers, which take turns.
+
+All get the same cell, limits, targets and ticks, in one process. Peers run open loop as ours does, with targets ahead
+of time by what they would lag. Beside ours stands ours in free air: the difference is the cost of the pairs.
+"""
 
 from __future__ import annotations
 
@@ -234,11 +238,7 @@ class BenchReport:
 
 
 def run_bench(
-    config: Config,
-    motions: Sequence[WorkMotion],
-    peers: Sequence[str],
-    rounds: int = 1,
-    progress: Callable[[str], None] = lambda what: None,
+    config: Config, motions: Sequence[WorkMotion], peers: Sequence[str], rounds: int, progress: Callable[[str], None]
 ) -> BenchReport:
     """Run ``motions``, which are made for ``config/dual_iiwa7.yaml``, with ours and with ``peers`` where installed.
 

@@ -82,10 +82,9 @@ class WorkMotion:
 
 
 def motions_named(names: Iterable[str]) -> tuple[WorkMotion, ...]:
-    """The motions of :data:`WORK_MOTIONS` of these names, in its order.
+    """The motions of :data:`WORK_MOTIONS` of these names, in its order; ``carry`` stands for all ``carry-...``.
 
-    ``carry`` stands for all motions whose names begin with ``carry-``, and so on. Raises :class:`ConfigError` for a
-    name that is neither.
+    Raises :class:`ConfigError` for a name that is neither.
     """
     chosen: set[str] = set()
     for name in names:
@@ -135,10 +134,7 @@ _LEAST_GAP = 0.18  # between tools at one height, for wrists 20 mm apart [m]
 
 
 def carry(gap: float, speed: float, shortest: float = 3.0) -> WorkMotion:
-    """Both tools, ``gap`` [m] apart, go round at ``speed`` [m/s] as if they held one thing.
-
-    In whole laps that take at least the time ``shortest`` [s].
-    """
+    """Both tools, ``gap`` [m] apart, go round at ``speed`` [m/s], in whole laps of at least ``shortest`` [s] in all."""
     rate = speed / _CARRY_RADIUS
     turn = 2.0 * math.pi * max(1, math.ceil(shortest * rate / (2.0 * math.pi)))
 
@@ -163,6 +159,14 @@ def _between_tools(home: Array, gap: float) -> Array:
     return np.column_stack((home[:, 0], 0.5 * gap * np.sign(home[:, 1]), home[:, 2]))
 
 
+def _home(home: Array) -> Array:
+    return home
+
+
+def _swapped(home: Array) -> Array:
+    return home[::-1]
+
+
 def _ahead(home: Array) -> Array:
     """Straight ahead to 0.80 m; 0.73 m can be reached."""
     return np.column_stack((np.full(2, 0.80), home[:, 1:]))
@@ -182,6 +186,7 @@ _CROSSED = np.array([(0.44, -0.05, 0.33), (0.44, 0.05, 0.33)])
 _BEFORE_REACHING = np.array([(0.50, 0.05, 0.47), (0.50, -0.25, 0.30)])
 _REACHED_UNDER = np.array([(0.50, 0.05, 0.47), (0.50, 0.08, 0.30)])
 _PASSING = 2.0  # [s]
+_THROUGH = ((_PASSING, _CROSSED), (_PASSING, _PAST))
 
 
 def _oscillate(t: float, home: Array) -> Array:
@@ -205,30 +210,11 @@ def _slide(t: float, home: Array) -> Array:
 _ALL = (
     *(carry(gap, speed) for gap in (0.40, 0.20, 0.16) for speed in (0.15, 0.30, 0.50)),
     carry(0.16, 0.04),
-    _to(
-        "meet",
-        "the tools meet, asked for 30 mm more than each can, stay 2 s and part",
-        *((1.5, _met), (2.0, _met), (1.5, lambda home: home)),
-    ),
-    _to(
-        "pass",
-        "the arms get past each other, at different depths and heights",
-        (_PASSING, _PAST),
-        approach=(_APART,),
-        reachable=True,
-    ),
+    _to("meet", "the tools meet 30 mm nearer than they can, stay 2 s and part", (1.5, _met), (2.0, _met), (1.5, _home)),
+    _to("pass", "the arms get past each other in depth", (_PASSING, _PAST), approach=(_APART,), reachable=True),
     _to("pass-back", "the same, back", (_PASSING, _APART), approach=(_APART, _PAST), reachable=True),
-    _to(
-        "cross",
-        "the tools change sides; the targets go through each other, a small detour leads there",
-        *((_PASSING, _CROSSED), (_PASSING, _PAST)),
-        approach=(_FACING,),
-    ),
-    _to(
-        "swap",
-        "each tool is asked for the other one's home, where neither arm reaches and both are in the way",
-        (_PASSING, lambda home: home[::-1]),
-    ),
+    _to("cross", "the tools change sides through each other", *_THROUGH, approach=(_FACING,)),
+    _to("swap", "each tool is asked for the other one's home, where neither arm reaches", (_PASSING, _swapped)),
     _to(
         "reach-under",
         "the right tool, tilted by 0.9 rad, reaches under the left one",
@@ -237,9 +223,7 @@ _ALL = (
         tilt=(0.0, 0.9),
         reachable=True,
     ),
-    WorkMotion(
-        "oscillate", "the targets swing at 0.5 Hz, up to 0.06 m from each other", 6.0, _oscillate, reachable=False
-    ),
+    WorkMotion("oscillate", "the targets swing up to 0.06 m from each other", 6.0, _oscillate, reachable=False),
     WorkMotion(
         name="slide",
         about="the left tool slides 0.3 m over the table, asked to be 10 mm lower than it may",
@@ -248,11 +232,7 @@ _ALL = (
         approach=(_slide(0.0, np.empty((2, 3))),),
         reachable=False,
     ),
-    _to(
-        "stretch",
-        "both tools are asked for 70 mm more than they reach, and back",
-        *((2.0, _ahead), (0.5, _ahead), (2.0, lambda home: home)),
-    ),
+    _to("stretch", "both tools are asked for 70 mm more than they reach", (2.0, _ahead), (0.5, _ahead), (2.0, _home)),
 )
 WORK_MOTIONS: dict[str, WorkMotion] = {motion.name: motion for motion in _ALL}
 
@@ -266,11 +246,6 @@ def _circle(t: float, home: Array) -> Array:
 TIMED_MOTIONS = (
     WorkMotion("free motion", "circles of 0.1 m radius at 0.5 Hz in free space", 3.0, _circle, rest=0.0),
     WorkMotion(
-        "contact",
-        "each target jumps to where the other tool started: the arms block each other",
-        duration=3.0,
-        path=lambda t, home: home[::-1],
-        reachable=False,
-        rest=0.0,
+        "contact", "targets jump to the other tool's start", 3.0, lambda t, home: home[::-1], reachable=False, rest=0.0
     ),
 )

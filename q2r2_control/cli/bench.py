@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator
 from typing import Annotated
 
-import typer
 from rich.table import Table
 from rich.text import Text
+from typer import Exit, Option
 
 from q2r2_control.benchmark.motion_run import PATIENCE, BenchReport, BenchRow, MotionFigures, run_bench
 from q2r2_control.benchmark.peers.base import PEERS, WITHOUT_ACCELERATION_LIMIT
@@ -42,15 +42,10 @@ _NOTES = (
 
 
 def bench(
-    rounds: Annotated[int | None, typer.Option(min=1, help=f"How often: {_ROUNDS}, with --work 1.")] = None,
-    peers: Annotated[bool, typer.Option(help="Measure roboplan, mink and pink too, where they are installed.")] = True,
-    work: Annotated[
-        bool, typer.Option("--work", help="Two-armed work motions instead of a circle and a contact.")
-    ] = False,
-    motion: Annotated[
-        list[str] | None,
-        typer.Option(help="With --work: only this motion, or those that begin with it, such as carry; repeatable."),
-    ] = None,
+    rounds: Annotated[int | None, Option(min=1, help=f"How often: {_ROUNDS}, with --work 1.")] = None,
+    peers: Annotated[bool, Option(help="Measure roboplan, mink and pink too, where they are installed.")] = True,
+    work: Annotated[bool, Option("--work", help="Two-armed work motions instead of circle and contact.")] = False,
+    motion: Annotated[list[str] | None, Option(help="With --work: only this, or such as begin so; repeatable.")] = None,
     json: Json = False,
 ) -> None:
     """Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.
@@ -107,9 +102,9 @@ def _cells(row: BenchRow, figures: MotionFigures) -> tuple[Cell, ...]:
 
 
 def soak(
-    ticks: Annotated[int, typer.Option(min=100, help="How many.")] = 1_000_000,
-    contact: Annotated[bool, typer.Option("--contact", help="Fingers may touch table and fingers.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of all that is drawn at random.")] = 0,
+    ticks: Annotated[int, Option(min=100, help="How many.")] = 1_000_000,
+    contact: Annotated[bool, Option("--contact", help="Fingers may touch table and fingers.")] = False,
+    seed: Annotated[int, Option(min=0, help="Of all that is drawn at random.")] = 0,
     json: Json = False,
 ) -> None:
     """Check every promise of the controller in random hostile targets, ticks, starts and solver failures.
@@ -126,7 +121,7 @@ def soak(
         list(_soak_notes(report, "--contact " if contact else "")),
     )
     print_report(report.as_json(), (table,), json)
-    raise typer.Exit(0 if report.passed else 1)
+    raise Exit(0 if report.passed else 1)
 
 
 def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:

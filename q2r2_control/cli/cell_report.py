@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,23 +17,15 @@ from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.plugins import INPUTS, PLANTS, check_installed, load_class
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.robot.stop_torque import StopTorque, stop_torques
 from q2r2_control.supervision.preflight import preflight_faults
 
 _NEAREST = 8
 
 
-@dataclass(frozen=True, slots=True)
-class JointCheck:
-    """One joint. Positions in rad (m for a sliding joint), velocity per second, torque in Nm (N)."""
-
-    name: str
-    lower: float
-    home: float
-    upper: float
-    velocity: float
-    torque: float
+# Positions in rad (m for a sliding joint), velocity per second, torque in Nm (N).
+_JOINT = ("name", "lower", "home", "upper", "velocity", "torque")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,17 +38,14 @@ class ArmCheck:
     tool_model: str | None
     tool_frame: str
     tool_position: list[float]
-    joints: list[JointCheck]
+    joints: list[dict[str, Any]]  # the figures of _JOINT by name
     object: str | None  # what its gripper is to hold, which is part of the tool then
 
 
 @dataclass(frozen=True, slots=True)
-class KeptPair:
+class KeptPair(PairDistance):
     """Distance of a monitored pair at home, and the one that it keeps [m]."""
 
-    name_a: str
-    name_b: str
-    distance: float
     kept: float
 
 
@@ -151,6 +141,7 @@ def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
         *(np.array(robot.joint_names), robot.position_lower, robot.home, robot.position_upper),
         *(robot.velocity_limit, robot.torque_limit),
     )
+    rows = zip(*(column[list(arm.joints)].tolist() for column in columns), strict=True)
     sizes = flange.model
     if flange.thickness is not None and flange.radius is not None:
         sizes = f"{_millimetres(flange.thickness)} thick, radius {_millimetres(flange.radius)}"
@@ -161,6 +152,6 @@ def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
         tool_model=settings.tool.model,
         tool_frame=arm.tool_frame,
         tool_position=robot.tool_pose(robot.home, name).translation.tolist(),
-        joints=list(map(JointCheck, *(column[list(arm.joints)].tolist() for column in columns))),
+        joints=[dict(zip(_JOINT, row, strict=True)) for row in rows],
         object=None if held is None else _object_of(held),
     )

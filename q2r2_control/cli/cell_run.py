@@ -16,7 +16,6 @@ from q2r2_control.cli.output import (
     notice_of_compiling,
     recording_line,
     say,
-    stderr_console,
     summary_table,
     task_line,
     verdict_markup,
@@ -55,7 +54,6 @@ class AnnouncedHeadset(HeadsetServer):
         self._headset, self._console = headset, console
 
     def start(self) -> None:
-        """See :meth:`HeadsetServer.start`."""
         super().start()
         for line in (f"listening on {written(*self.address)}", *access_lines(*self.address, self._headset.networks)):
             say(f"headset: {line}", self._console)
@@ -141,13 +139,13 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
         with recorder:
             run = _run_cell(config, options, recorder)
     except PlantError:
-        _print_lines(stderr_console(), _recording_lines(recorder.summary))
+        _print_lines(Console(stderr=True), _recording_lines(recorder.summary))
         raise
     return replace(run, recording=recorder.summary)
 
 
 def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None) -> CellRun:
-    console = stderr_console()
+    console = Console(stderr=True)
     with notice_of_compiling():
         source = _input_of(config, options, console)
         pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.console import Console
 from rich.table import Table
+from typer import Exit, Option
 
 from q2r2_control.cli.cell_report import CellCheck, check_cell
-from q2r2_control.cli.output import (
-    ConfigFile,
-    Json,
-    as_json_text,
-    counting,
-    figure_table,
-    print_report,
-)
+from q2r2_control.cli.output import ConfigFile, Json, as_json_text, counting, figure_table, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.model_srdf import model_srdfs
@@ -43,8 +36,7 @@ def write_pairs(
 ) -> PairsWritten:
     """Sample which pairs of a cell can meet, and write those that cannot as an SRDF to a new ``file``.
 
-    Raises :class:`ConfigError` for a clearance that is not above every distance in ``control``, and for a file that
-    exists.
+    Raises :class:`ConfigError` for a file that exists, and a clearance that is not above all distances in ``control``.
     """
     _check_clearance(config, clearance)
     if file.exists():
@@ -61,8 +53,7 @@ def write_model_pairs(
 ) -> dict[str, bool]:
     """Write the SRDF of each model of a cell to ``folder``; returns by path whether the file is new.
 
-    Raises :class:`ConfigError` as :func:`write_pairs` does, and before anything is written for a file that exists and
-    says something else.
+    Raises :class:`ConfigError` for such a clearance, and before it writes anything for a file that says something else.
     """
     _check_clearance(config, clearance)
     if not folder.is_dir():
@@ -92,18 +83,10 @@ def _write(files: Mapping[Path, str]) -> None:
 
 def check(
     config: ConfigFile,
-    pairs: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Find pairs that can never meet and write them as an SRDF for the key srdf."),
-    ] = None,
-    model_pairs: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Find such pairs of each arm and tool alone, and write ARM.srdf and so on."
-        ),
-    ] = None,
-    samples: Annotated[int, typer.Option(help="Random postures that --pairs and --model-pairs look at.")] = 20_000,
-    clearance: Annotated[float, typer.Option(help="Pairs that stay farther apart need no watching [m].")] = 0.05,
+    pairs: Annotated[Path | None, Option(metavar="FILE", help="Write pairs that can never meet as an SRDF.")] = None,
+    model_pairs: Annotated[Path | None, Option(metavar="FOLDER", help="The same of each arm and tool alone.")] = None,
+    samples: Annotated[int, Option(help="Random postures that --pairs and --model-pairs look at.")] = 20_000,
+    clearance: Annotated[float, Option(help="Pairs that stay farther apart need no watching [m].")] = 0.05,
     json: Json = False,
 ) -> None:
     """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
@@ -132,7 +115,7 @@ def check(
             print(as_json_text(result))
         else:
             _print_cell(result)
-        raise typer.Exit(1 if result.faults else 0)
+        raise Exit(1 if result.faults else 0)
 
 
 def _print_cell(cell: CellCheck) -> None:
@@ -156,7 +139,7 @@ def _cell_tables(cell: CellCheck) -> Iterator[Table]:
         yield figure_table(
             f"{arm.name} arm: {arm.model}{flange}, tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {at} m",
             ("joint", "min [rad]", "home [rad]", "max [rad]", "speed [rad/s]", "torque [Nm]"),
-            ((joint.name, *(f"{value:.3f}" for value in astuple(joint)[1:])) for joint in arm.joints),
+            ((name, *(f"{value:.3f}" for value in values)) for name, *values in map(dict.values, arm.joints)),
         )
     for stop in cell.stop_torques:
         yield figure_table(

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import fields
 from typing import Annotated, Any
 
-import typer
 from pydantic_core import to_json
 from rich import box
 from rich.console import Console
@@ -17,6 +16,7 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
+from typer import Argument, Option
 
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
@@ -30,20 +30,15 @@ from q2r2_control.wording import sentence
 _NOTICE_AFTER = 3.0  # [s]
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
-ConfigFile = Annotated[str, typer.Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
-Task = Annotated[str | None, typer.Option(help="With --record: what is done, noted in the recording.")]
-Operator = Annotated[str | None, typer.Option(help="With --record: whose hands, noted as well.")]
+ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
+Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
+Task = Annotated[str | None, Option(help="With --record: what is done, noted in the recording.")]
+Operator = Annotated[str | None, Option(help="With --record: whose hands, noted as well.")]
 
 
 def as_json_text(value: Any) -> str:
     """``value`` as strict JSON: dataclasses and mappings as objects, arrays as lists, what is not finite as null."""
     return to_json(value, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode()
-
-
-def stderr_console() -> Console:
-    """For what is not a command's result."""
-    return Console(stderr=True)
 
 
 def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:
@@ -58,16 +53,13 @@ def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:
 
 def say(line: str, console: Console | None = None, style: str = "") -> None:
     """Print one line as it is, however long, on stderr or ``console``."""
-    (console or stderr_console()).print(line, style=style, soft_wrap=True, highlight=False, markup=False)
+    (console or Console(stderr=True)).print(line, style=style, soft_wrap=True, highlight=False, markup=False)
 
 
 @contextmanager
 def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
-    """Show how far a long work has got, where stderr is a terminal.
-
-    The function that it yields takes what is counted (``what`` by default), how many are done, and how many there are.
-    """
-    console = stderr_console()
+    """Show how far a long work has got, where stderr is a terminal, by what it is told: what, how many done, of all."""
+    console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task(what, total=None)
         yield lambda of, done, total: progress.update(task, description=of or what, completed=done, total=total)
@@ -75,7 +67,7 @@ def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
 
 def print_progress(what: str) -> None:
     """Print a line on stderr, where that is a terminal; a live line would need a thread, which adds to times."""
-    console = stderr_console()
+    console = Console(stderr=True)
     if console.is_terminal:
         console.print(what, highlight=False)
 

@@ -7,9 +7,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.console import Console
 from rich.markup import escape
+from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_run import check_window, show_window
 from q2r2_control.cli.output import (
@@ -37,28 +37,16 @@ from q2r2_control.recording.replay import replay as replay_recording
 
 _SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
 
-Recordings = Annotated[
-    list[Path], typer.Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them, in this order.")
-]
-Thresholds = Annotated[
-    str | None, typer.Option(metavar="CONFIG", help="A cell's YAML whose thresholds to use, not the recorded cell's.")
-]
+Recordings = Annotated[list[Path], Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them.")]
+Thresholds = Annotated[str | None, Option(metavar="CONFIG", help="The cell whose thresholds to use instead.")]
 
 
 def replay(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="The .mcap of q2r2 run --record, or its folder.")],
-    compare: Annotated[
-        bool, typer.Option("--compare", help="Say whether all was identical, else what first was not; exit 0 or 1.")
-    ] = False,
-    config: Annotated[
-        str | None, typer.Option(metavar="CONFIG", help="Another cell's YAML than the recorded one.")
-    ] = None,
-    plant: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Let it move, and measure it; otherwise nothing moves.")
-    ] = None,
-    viewer: Annotated[
-        bool, typer.Option("--viewer", help="With --plant mujoco: open MuJoCo's window, at the speed of real time.")
-    ] = False,
+    file: Annotated[str, Argument(metavar="FILE", help="The .mcap of q2r2 run --record, or its folder.")],
+    compare: Annotated[bool, Option("--compare", help="Say what first differs, or identical; exit 1 or 0.")] = False,
+    config: Annotated[str | None, Option(metavar="CONFIG", help="Another cell than the recorded one.")] = None,
+    plant: Annotated[str | None, Option(metavar="NAME", help="Let it move, and measure it.")] = None,
+    viewer: Annotated[bool, Option("--viewer", help="With --plant mujoco: its window, in real time.")] = False,
     json: Json = False,
 ) -> None:
     """Give a recorded run's hand samples and measured states to the same loop again, tick by tick.
@@ -95,7 +83,7 @@ def replay(
             off = f"{arm.position_mm_rms:.3f} mm RMS, {arm.position_mm_max:.3f} mm and {arm.rotation_deg_max:.3f} deg"
             print(f"{name} arm: tool {off} at most from where it was when recorded")
     if compare and result.difference is not None:
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 def judge(recordings: Recordings, config: Thresholds = None, json: Json = False) -> None:
@@ -123,7 +111,7 @@ def judge(recordings: Recordings, config: Thresholds = None, json: Json = False)
 
 def report(
     recordings: Recordings,
-    output: Annotated[Path, typer.Option(metavar="HTML", help="The page to write; one that exists is replaced.")],
+    output: Annotated[Path, Option(metavar="HTML", help="The page to write; one that exists is replaced.")],
     config: Thresholds = None,
 ) -> None:
     """Write one HTML page of recorded episodes: verdicts, numbers and plots. It needs no network to be looked at."""
@@ -159,22 +147,14 @@ class Format(StrEnum):
 
 
 def export(
-    format: Annotated[
-        Format, typer.Argument(metavar="[lerobot|hdf5|csv]", help="csv: a line a frame, without pictures.")
-    ],
+    format: Annotated[Format, Argument(metavar="[lerobot|hdf5|csv]", help="What to make.")],
     recordings: Recordings,
-    output: Annotated[
-        Path, typer.Option(metavar="OUT", help="A new folder; csv of one recording: or a new file that ends in .csv.")
-    ],
-    fps: Annotated[int, typer.Option(help=f"Frames per second: 1 .. {FASTEST}.")] = 30,
-    trim: Annotated[
-        bool, typer.Option("--trim", help="Leave out what is before and after any arm is engaged or moving.")
-    ] = False,
-    workers: Annotated[int, typer.Option(min=1, help="Processes; the result is the same for any number.")] = 1,
-    skip_bad: Annotated[
-        bool, typer.Option("--skip-bad", help="Say which recordings are bad, and go on without them.")
-    ] = False,
-    no_pictures: Annotated[bool, typer.Option("--no-pictures", help="Leave out what cameras recorded.")] = False,
+    output: Annotated[Path, Option(metavar="OUT", help="A new folder, or for csv of one recording a new .csv file.")],
+    fps: Annotated[int, Option(help=f"Frames per second: 1 .. {FASTEST}.")] = 30,
+    trim: Annotated[bool, Option("--trim", help="Leave out times before and after motion.")] = False,
+    workers: Annotated[int, Option(min=1, help="Processes; the result is the same for any number.")] = 1,
+    skip_bad: Annotated[bool, Option("--skip-bad", help="Go on without bad recordings, and name them.")] = False,
+    no_pictures: Annotated[bool, Option("--no-pictures", help="Leave out what cameras recorded.")] = False,
 ) -> None:
     """Make a dataset to train on of recordings of q2r2 run --record, an episode each.
 

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
+from typer import Argument, Exit, Option
 
 from q2r2_control.cli.output import (
     DEMO_CONFIG,
@@ -25,7 +26,6 @@ from q2r2_control.cli.output import (
     notes_of,
     positive,
     say,
-    stderr_console,
 )
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
@@ -82,11 +82,9 @@ def _joined(names: tuple[str, ...]) -> str:
 
 
 def watch(
-    config: Annotated[str, typer.Argument(metavar="[CONFIG]", help="YAML of the cell that runs.")] = DEMO_CONFIG,
-    once: Annotated[bool, typer.Option("--once", help="Print one table after --duration, and end.")] = False,
-    duration: Annotated[
-        float | None, typer.Option(help=f"[s]; without it until Ctrl-C, with --once and --json {_ONCE:g} s.")
-    ] = None,
+    config: Annotated[str, Argument(metavar="[CONFIG]", help="YAML of the cell.")] = DEMO_CONFIG,
+    once: Annotated[bool, Option("--once", help="Print one table after --duration, and end.")] = False,
+    duration: Annotated[float | None, Option(help=f"[s]; {_ONCE:g} with --once or --json, else until Ctrl-C.")] = None,
     json: Json = False,
 ) -> None:
     """Show nodes, topics, rates and ages of a running set, the state of each arm, and why it does not move.
@@ -104,7 +102,7 @@ def watch(
         print(as_json_text({"domain": domain, **found}))
     else:
         Console().print(set_tables(view, domain))
-    raise typer.Exit(0 if view.nodes else 1)
+    raise Exit(0 if view.nodes else 1)
 
 
 def _watched(cell: Config, duration: float | None, show: Callable[[SetView], None] = lambda view: None) -> SetView:
@@ -116,7 +114,7 @@ def _watched(cell: Config, duration: float | None, show: Callable[[SetView], Non
 
 
 def _watch_live(cell: Config, domain: str, duration: float | None) -> SetView:
-    console = stderr_console()
+    console = Console(stderr=True)
     if not console.is_terminal:
         said: dict[str, str] = {}
 
@@ -133,10 +131,8 @@ def _watch_live(cell: Config, domain: str, duration: float | None) -> SetView:
 
 
 def doctor(
-    config: Annotated[
-        str, typer.Argument(metavar="[CONFIG]", help="YAML of the cell that runs, or is to.")
-    ] = DEMO_CONFIG,
-    duration: Annotated[float, typer.Option(help="How long to listen to what runs [s].")] = _TIME,
+    config: Annotated[str, Argument(metavar="[CONFIG]", help="YAML of the cell.")] = DEMO_CONFIG,
+    duration: Annotated[float, Option(help="How long to listen to what runs [s].")] = _TIME,
     json: Json = False,
 ) -> None:
     """Say what of ROS is missing, which domain and middleware are used, which nodes run and what is wrong with them.
@@ -160,7 +156,7 @@ def doctor(
         running = {"nodes": ", ".join(nodes) or "none of a set runs", "others": ", ".join(others) or "none"}
         _print({**facts, **running}, findings)
     sys.stdout.flush()
-    raise typer.Exit(int(stops))
+    raise Exit(int(stops))
 
 
 def _print(facts: dict[str, str], findings: list[Finding]) -> None:
@@ -190,7 +186,7 @@ class RobotSource(StrEnum):
 
 @app.command("build-interfaces", epilog="Example: q2r2 ros build-interfaces")
 def build_interfaces_command(
-    force: Annotated[bool, typer.Option("--force", help="Build again what this environment holds.")] = False,
+    force: Annotated[bool, Option("--force", help="Build again what this environment holds.")] = False,
 ) -> None:
     """Build the message packages that cannot be imported: quest2ros, and tf2_msgs and control_msgs where missing.
 
@@ -200,27 +196,16 @@ def build_interfaces_command(
         build_interfaces(lambda line: print(line, flush=True), force)
     except BuildError as error:
         print(f"q2r2: {error}", file=sys.stderr)
-        raise typer.Exit(1) from None
+        raise Exit(1) from None
 
 
 @app.command(epilog="Example: q2r2 ros up config/dual_iiwa7.yaml --input headset")
 def up(
-    config: Annotated[str, typer.Argument(metavar="CONFIG", help="YAML of the cell.")],
-    input: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="An installed input, or none: another node sends the hands."),
-    ] = None,
-    robot: Annotated[
-        RobotSource,
-        typer.Option(help="Simulated, or one that is there; auto: mujoco for controller: builtin."),
-    ] = RobotSource.AUTO,
-    record: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Record what the nodes publish to a new folder in DIR.")
-    ] = None,
-    separate: Annotated[
-        bool,
-        typer.Option("--separate", help="A process for each arm: a hand then stops and homes its own arm only."),
-    ] = False,
+    config: Annotated[str, Argument(metavar="CONFIG", help="YAML of the cell.")],
+    input: Annotated[str | None, Option(metavar="NAME", help="An installed input, or none for another node.")] = None,
+    robot: Annotated[RobotSource, Option(help="auto: mujoco for controller: builtin, else none.")] = RobotSource.AUTO,
+    record: Annotated[str | None, Option(metavar="DIR", help="Record all topics to a new folder in DIR.")] = None,
+    separate: Annotated[bool, Option("--separate", help="A process an arm, which its hand alone stops.")] = False,
     task: Task = None,
     operator: Operator = None,
 ) -> None:
@@ -233,4 +218,4 @@ def up(
     notes = notes_of(task, operator, record)
     recording = None if record is None else {"folder": record, **notes}
     nodes = nodes_of(config, input, robot.value, recording, separate)
-    raise typer.Exit(run_together(nodes, lambda line: print(line, flush=True)))
+    raise Exit(run_together(nodes, lambda line: print(line, flush=True)))

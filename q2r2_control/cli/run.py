@@ -9,20 +9,11 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from rich.console import Console
+from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_run import AnnouncedHeadset, RunOptions, print_summary, run_cell
-from q2r2_control.cli.output import (
-    DEMO_CONFIG,
-    ConfigFile,
-    Json,
-    Operator,
-    Task,
-    notes_of,
-    positive,
-    print_report,
-    stderr_console,
-)
+from q2r2_control.cli.output import DEMO_CONFIG, ConfigFile, Json, Operator, Task, notes_of, positive, print_report
 from q2r2_control.config.cell import Config, HeadsetConfig, load_config
 from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
 from q2r2_control.errors import ConfigError
@@ -34,40 +25,29 @@ from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
-_DEMO_TASKS = ["handover", "stack"]
+_TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
 
-Fast = Annotated[bool, typer.Option("--fast", help="Simulated time, as fast as it can, repeatable.")]
-Headless = Annotated[bool, typer.Option("--headless", help="No live table, no window.")]
-Viewer = Annotated[bool, typer.Option("--viewer", help="Open MuJoCo's window; closing it ends the run.")]
-Human = Annotated[bool, typer.Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
-Seed = Annotated[int, typer.Option(min=0, help="Of what --human adds.")]
-Record = Annotated[Path | None, typer.Option(metavar="DIR", help="Record the run to a new folder in DIR.")]
-RealTime = Annotated[
-    bool,
-    typer.Option("--rt", help="Lock memory and run under SCHED_FIFO; says what the system refuses, and runs anyway."),
-]
+Fast = Annotated[bool, Option("--fast", help="Simulated time, as fast as it can, repeatable.")]
+Headless = Annotated[bool, Option("--headless", help="No live table, no window.")]
+Viewer = Annotated[bool, Option("--viewer", help="Open MuJoCo's window; closing it ends the run.")]
+Human = Annotated[bool, Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
+Seed = Annotated[int, Option(min=0, help="Of what --human adds.")]
+Record = Annotated[Path | None, Option(metavar="DIR", help="Record the run to a new folder in DIR.")]
+RealTime = Annotated[bool, Option("--rt", help="Lock memory and run under SCHED_FIFO, as far as permitted.")]
 
-Host = Annotated[
-    str | None, typer.Option(help="Address to bind, instead of the config's; 0.0.0.0: every network, :: IPv6 too.")
-]
-Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
+Host = Annotated[str | None, Option(help="Address to bind, not the config's; 0.0.0.0: all, :: IPv6 too.")]
+Port = Annotated[int | None, Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
 
 
 def run(
     config: ConfigFile,
-    input: Annotated[
-        str | None, typer.Option(metavar="NAME", help="An installed input; without it, the cell's.")
-    ] = None,
-    plant: Annotated[
-        str | None, typer.Option(metavar="NAME", help="An installed plant; without it, the cell's.")
-    ] = None,
-    mode: Annotated[CommandMode, typer.Option(help="What the plant gets; torque: arms that yield.")] = (
-        CommandMode.POSITION
-    ),
-    duration: Annotated[float | None, typer.Option(help="[s]; without it, until Ctrl-C.")] = None,
+    input: Annotated[str | None, Option(metavar="NAME", help="An installed input; by default the cell's.")] = None,
+    plant: Annotated[str | None, Option(metavar="NAME", help="An installed plant; by default the cell's.")] = None,
+    mode: Annotated[CommandMode, Option(help="What the plant gets; torque: arms that yield.")] = (CommandMode.POSITION),
+    duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
     fast: Fast = False,
-    trajectory: Annotated[str | None, typer.Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
+    trajectory: Annotated[str | None, Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
     human: Human = False,
     seed: Seed = 0,
     host: Host = None,
@@ -78,7 +58,7 @@ def run(
     record: Record = None,
     task: Task = None,
     operator: Operator = None,
-    force: Annotated[bool, typer.Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
+    force: Annotated[bool, Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
     json: Json = False,
 ) -> None:
     """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
@@ -119,14 +99,9 @@ def run(
 
 
 def demo(
-    tasks: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar=f"[{'|'.join((*TASKS, ALL_TASKS))}]...", help=f"By default {' '.join(_DEMO_TASKS)}. {_ABOUT}."
-        ),
-    ] = None,
-    mode: Annotated[CommandMode, typer.Option(help="What the arms get; torque: arms that yield.")] = CommandMode.TORQUE,
-    duration: Annotated[float | None, typer.Option(help="Ends earlier [s].")] = None,
+    tasks: Annotated[list[str] | None, Argument(metavar=_TASKS, help=f"By default handover stack. {_ABOUT}.")] = None,
+    mode: Annotated[CommandMode, Option(help="What the arms get; torque: arms that yield.")] = CommandMode.TORQUE,
+    duration: Annotated[float | None, Option(help="Ends earlier [s].")] = None,
     fast: Fast = False,
     viewer: Viewer = False,
     headless: Headless = False,
@@ -142,7 +117,7 @@ def demo(
     With --record, whether all succeeded is in the recording, of which q2r2 report makes plots.
     """
     _check_times(fast, rt)
-    chosen = tasks_named(tasks or _DEMO_TASKS)
+    chosen = tasks_named(tasks or ("handover", "stack"))
     trajectory = "+".join(task.name for task in chosen)
     options = RunOptions(
         name="demo",
@@ -164,7 +139,7 @@ def demo(
     done = run_cell(load_config(DEMO_CONFIG), options)
     print_summary(done, json)
     if not all(task.succeeded for task in done.tasks):
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 def _check_times(fast: bool, rt: bool) -> None:
@@ -185,12 +160,10 @@ def with_address(config: Config, host: str | None, port: int | None) -> Config:
 
 
 def headset_check(
-    config: Annotated[str, typer.Argument(metavar="[CONFIG]", help="Whose address and teleop.axes to use.")] = (
-        DEMO_CONFIG
-    ),
+    config: Annotated[str, Argument(metavar="[CONFIG]", help="Whose address and teleop.axes to use.")] = (DEMO_CONFIG),
     host: Host = None,
     port: Port = None,
-    duration: Annotated[float | None, typer.Option(help="[s]; without it, until Ctrl-C.")] = None,
+    duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
     json: Json = False,
 ) -> None:
     """Show what a headset sends: connection, rates, ages, last values, and which way each hand moves.
@@ -198,7 +171,7 @@ def headset_check(
     Move a hand forwards, to the left, up: where the words do not agree, change teleop.axes in the config.
     Exit 1 unless poses and inputs came of every hand that leads an arm; without both, run has nothing to engage.
     """
-    cell, console = with_address(load_config(config), host, port), stderr_console()
+    cell, console = with_address(load_config(config), host, port), Console(stderr=True)
     positive("--duration", duration)
     server, stop = AnnouncedHeadset(cell, console), StopRequest()
     # From before the announcement on. KeyboardInterrupt would be lost where it comes in the middle of a finaliser.
@@ -210,4 +183,4 @@ def headset_check(
         finally:
             server.close()
     print_report(check.as_json(), (headset_table(check),), json)
-    raise typer.Exit(1 if check.missing else 0)
+    raise Exit(1 if check.missing else 0)

@@ -1,7 +1,4 @@
-"""Judges of work in simulation: they look at what happens to the parts, not at how hands or arms move.
-
-So an operator with a headset is judged like a script.
-"""
+"""Judges of work in simulation: they look at the parts alone, so an operator with a headset is judged like a script."""
 
 from __future__ import annotations
 

@@ -87,10 +87,7 @@ class Contract:
         self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # duration [s], duration times |a|^2
 
     def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
-        """The controller has accepted ``openings``: its fingers are others, and ``before_step`` its stop may be.
-
-        Who is told of references only, and so is late, leaves the stop as the last reference had it.
-        """
+        """The controller has accepted ``openings``. If only its references tell so, this is not ``before_step``."""
         if before_step:
             self._stop = self._controller.stop_deceleration
         self._measured.set_openings(openings)

@@ -1,4 +1,4 @@
-"""Input of a soak: segments of hostile targets, uneven ticks, hostile solvers and bad starts."""
+"""Input of a soak: segments of hostile targets, uneven ticks, solvers that fail or work against us, and bad starts."""
 
 from __future__ import annotations
 
@@ -103,7 +103,6 @@ class FaultySolver:
         self.q, self.kept = np.zeros(0), np.zeros(0)
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`."""
         if self.fault in ATTACKS and self._worst is not None:
             return QpSolution(self._worst.answer(self.fault, problem, self.q, self.kept), 0.0)
         v, nv = self._inner.solve(problem).v, len(problem.g)

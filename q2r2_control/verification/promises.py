@@ -1,4 +1,4 @@
-"""The promises of the Cartesian controller, and the worst value that was seen of each."""
+"""The promises of the Cartesian controller, the worst value seen of each, and distances as Coal measures them."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class MeasuredDistances:
     def compare(self, q: Array, report: StepReport) -> tuple[Array, list[float]]:
         """The margins (p,) [m], and by how much the least distance and margin of a report are wrong [m].
 
-        Not compared are penetrations, whose depth is another quantity for Coal, pairs of objects, and boxes that may be
+        Not compared are penetrations, whose depth Coal measures otherwise, pairs of objects, and boxes that may be
         touched, which are rounded for the controller.
         """
         values, margins = self._values(q), self.margins(q)

@@ -96,35 +96,28 @@ def run_soak(config: Config, ticks: int, seed: int, progress: Callable[[str], No
     worst = WorstSolver(robot, np.random.default_rng([seed, 6]))
     solver = FaultySolver(inner, np.random.default_rng([seed, 1]), worst)
     controller = CartesianController(robot, settings, solver=solver)
-    return Soak(config.name, controller, solver, seed, progress).run(ticks)
+    return Soak(config.name, controller, solver, seed).run(ticks, progress)
 
 
 class Soak:
     """Drives a controller through random segments and has every tick checked."""
 
-    def __init__(
-        self,
-        cell: str,
-        controller: CartesianController,
-        solver: FaultySolver,
-        seed: int,
-        progress: Callable[[str], None] = lambda what: None,
-    ) -> None:
+    def __init__(self, cell: str, controller: CartesianController, solver: FaultySolver, seed: int) -> None:
         self._cell, self._controller, self._solver, self._seed = cell, controller, solver, seed
-        self._progress, self._hostile = progress, HostileChanges(controller, seed)
+        self._hostile = HostileChanges(controller, seed)
         self._contract = Contract(controller, random=np.random.default_rng([seed, 2]))
         self._broken: dict[str, Violation] = {}
         self._counts = Counter(dict.fromkeys(COUNTED, 0))
         self._simulated = 0.0
 
-    def run(self, ticks: int) -> SoakReport:
+    def run(self, ticks: int, progress: Callable[[str], None] = lambda what: None) -> SoakReport:
         """Run ``ticks`` ticks."""
         before = None
         for tick, (segment, since) in enumerate(self._ticks(ticks)):
             if tick == int(_SETTLED * ticks):
                 before = _memory_mb()
             if tick % max(ticks // 20, 1) == 0:
-                self._progress(f"tick {tick} of {ticks}")
+                progress(f"tick {tick} of {ticks}")
             self._tick(tick, segment, since)
         after = _memory_mb()
         return SoakReport(
