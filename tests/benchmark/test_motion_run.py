@@ -43,8 +43,10 @@ class Standing:
 
     def reset(self, q: Array) -> None:
         self._q, self._tick = q, -1
+        self.given: list[pin.SE3] = []  # targets of the left tool
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
+        self.given.append(targets["left"])
         self._tick += 1
         if self._tick == self._failing and self._raises:
             raise RuntimeError("no solution")
@@ -126,22 +128,6 @@ def test_free_air_follows_what_the_pairs_forbid() -> None:
     assert figures.closest_pair == ("left_hand_e_finger_1_envelope_3", "table_0")
 
 
-class Listening:
-    """Keeps the targets that it is given."""
-
-    name, limitations = "listening", ""
-
-    def reset(self, q: Array) -> None:
-        self.given: list[pin.SE3] = []
-
-    def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        self.given.append(targets["left"])
-        return np.zeros(1), np.zeros(1)
-
-    def hold(self) -> tuple[Array, Array]:
-        return np.ones(1), np.zeros(1)
-
-
 @pytest.mark.slow
 def test_a_row_has_ours_in_free_air_and_near_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PEERS, "missing", "no_such_package_anywhere")
@@ -166,9 +152,9 @@ def test_a_row_has_ours_in_free_air_and_near_the_pairs(monkeypatch: pytest.Monke
 
 
 def test_a_peer_is_given_its_target_ahead_by_speed_over_gain() -> None:
-    peer = Listening()
+    peer = Standing()
     leading = Leading(peer, gain=8.0)
-    leading.reset(np.zeros(1))
+    leading.reset(np.ones(14))
     turn = np.array([0.0, 0.0, 0.001])
     for tick in range(3):
         pose = pin.SE3(pin.exp3(tick * turn), np.array([0.0004 * tick, 0.0, 0.1]))
@@ -177,7 +163,7 @@ def test_a_peer_is_given_its_target_ahead_by_speed_over_gain() -> None:
     # 0.4 m/s and 1 rad/s, an eighth of a second ahead.
     np.testing.assert_allclose(peer.given[2].translation, [0.0008 + 0.05, 0.0, 0.1], atol=1e-12)
     np.testing.assert_allclose(pin.log3(peer.given[2].rotation), [0.0, 0.0, 0.002 + 0.125], atol=1e-12)
-    assert leading.hold()[0] == 1.0
-    leading.reset(np.zeros(1))
+    assert (leading.hold()[0] == 1.0).all()
+    leading.reset(np.ones(14))
     leading.step({"left": pose}, 0.001)
     assert peer.given[0].isApprox(pose, 1e-15)

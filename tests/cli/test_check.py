@@ -60,9 +60,6 @@ def test_check_as_json_has_limits_and_distances_in_order() -> None:
     [
         pytest.param("home: [0.0204, 0.348,", "home: [0.0204, 1.0,", "left_hand_e_envelope_0 and table_0", id="table"),
         pytest.param("0.0204, 0.348,", "0.0204, 2.09,", "left_A2 = 2.09; allowed: -2.0844 .. 2.0844", id="limits"),
-        pytest.param(
-            "[0.0, 0.4, 0.0]", "[0.0, 0.4, -0.6]", "left_hand_e_finger_1_envelope_0 and floor_0 are", id="a low mount"
-        ),
     ],
 )
 def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old: str, new: str, fault: str) -> None:

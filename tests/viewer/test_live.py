@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pty
 import sys
@@ -50,10 +49,6 @@ def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Ro
     assert "left_A2 velocity" not in printed(table.render(), 120)
 
 
-def test_before_the_first_tick_it_says_that_the_run_is_starting() -> None:
-    assert "starting" in printed(LiveTable("demo", JOINTS, BindingSettings()).render(), 120)
-
-
 class Terminal:
     """A terminal, and what has come out of it, which a thread reads."""
 
@@ -93,14 +88,6 @@ def test_it_is_drawn_again_and_again_below_what_is_printed_and_wiped_away_at_the
         print("the end", file=sys.stderr, flush=True)
         terminal.wait_for("the end")
     assert "\x1b[2K" in terminal.text[before:], "lines are cleared"
-
-
-def test_a_console_that_is_no_terminal_is_left_alone() -> None:
-    console = Console(file=io.StringIO())
-    with LiveTable("demo", JOINTS, BindingSettings()).shown(console):
-        pass
-    assert isinstance(console.file, io.StringIO)
-    assert not console.file.getvalue()
 
 
 FAST = ActiveLimit(LimitKind.VELOCITY, ("left_A2",))
