@@ -15,14 +15,9 @@ INPUTS = "q2r2_control.inputs"
 PLANTS = "q2r2_control.plants"
 
 
-def installed(group: str) -> dict[str, EntryPoint]:
-    """All entry points of a group, by name."""
-    return {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
-
-
 def check_installed(group: str, name: str) -> EntryPoint:
     """The entry point called ``name``. Raises :class:`ConfigError` with the names that are installed."""
-    found = installed(group)
+    found = {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
     if name not in found:
         kind = group.rpartition(".")[2].removesuffix("s")
         raise ConfigError(f"{kind} {name!r:.60}: allowed are {', '.join(found)}; installed as entry points {group}")

@@ -1,8 +1,7 @@
 """Rotations as four floats, and poses as three and four, for what is done with them at every tick.
 
-A product of quaternions, or the rotation vector of one, written out in floats costs a third of what the same costs with
-matrices, where most of the time goes into making arrays. Quaternions are x y z w and of length 1, and q and -q are one
-rotation; rotation vectors are in the axes that the rotations are told in.
+Written out in floats they take a third of the time of matrices. Quaternions are x y z w and of length 1, and q and -q
+are one rotation; rotation vectors are in the axes that the rotations are told in.
 """
 
 from __future__ import annotations
@@ -72,17 +71,7 @@ def turn_between(start: Quaternion, end: Quaternion) -> Vector:
 
 def turned_by(q: Quaternion, vector: Vector) -> Quaternion:
     """First ``q``, then the rotation by a rotation vector."""
-    a, b, c = vector
-    half = 0.5 * math.hypot(a, b, c)
-    ratio = 0.5 * math.sin(half) / half if half > 0.0 else 0.5
-    a, b, c, d = ratio * a, ratio * b, ratio * c, math.cos(half)
-    x, y, z, w = q
-    return (
-        d * x + a * w + b * z - c * y,
-        d * y - a * z + b * w + c * x,
-        d * z + a * y - b * x + c * w,
-        d * w - a * x - b * y - c * z,
-    )
+    return product(rotation_of(vector), q)
 
 
 def rotation_of(vector: Vector) -> Quaternion:

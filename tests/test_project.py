@@ -1,70 +1,81 @@
-"""The project's lists of dependencies are those of its imports."""
+"""Imports are those of the project's rules and dependencies, and the documentation is current.
+
+Beyond the rules of ``lint-imports``: modules import each other in no circle, and light ones stay light.
+"""
 
 from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import cache
+from graphlib import TopologicalSorter
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-ROS = ROOT / "q2r2_control" / "ros"
+from tests.support.modules import ROOT, load_script
+
+PACKAGE = "q2r2_control"
+HEAVY = (f"{PACKAGE}.control.controller", "mujoco", "numba", "matplotlib")
+ROS = ROOT / PACKAGE / "ros"
 # Distributions whose import has another name.
 IMPORTS = {
     **{"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"},
     "pillow": "PIL",
 }
-WITH_OTHERS = {"coal", "glfw", "datasets"}  # come with pin, mujoco and lerobot
+WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core"}  # come with pin, mujoco, lerobot and pydantic
 NODES = set(ROS.rglob("*.py"))
-OTHERS = set((ROOT / "q2r2_control").rglob("*.py")) - NODES
-
-
-def project() -> dict[str, Any]:
-    table: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    return table
+OTHERS = set((ROOT / PACKAGE).rglob("*.py")) - NODES
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("q2r2_control/**/*.md")])
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def modules(*extras: str) -> set[str]:
     """What the dependencies, or these extras, bring."""
-    optional = project()["optional-dependencies"]
-    entries = [entry for extra in extras for entry in optional[extra]] if extras else project()["dependencies"]
+    optional = PROJECT["optional-dependencies"]
+    entries = [entry for extra in extras for entry in optional[extra]] if extras else PROJECT["dependencies"]
     names = [re.split(r"[<>=]", entry)[0].removeprefix("ros-jazzy-") for entry in entries]
     return {IMPORTS.get(name, name).replace("-", "_") for name in names}
 
 
+def names_imported(node: ast.AST) -> Iterator[str]:
+    """Names that are imported when a module runs, inside functions too, not for type checkers only."""
+    if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+        return
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        assert node.level == 0, "imports are absolute"
+        assert node.module is not None
+        yield node.module
+        yield from (f"{node.module}.{alias.name}" for alias in node.names)
+    for child in ast.iter_child_nodes(node):
+        yield from names_imported(child)
+
+
 @cache
 def imported_by(file: Path) -> frozenset[str]:
-    names = set()
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module.split(".")[0])
-    return frozenset(names - set(sys.stdlib_module_names) - {"q2r2_control"})
+    return frozenset(names_imported(ast.parse(file.read_text(encoding="utf-8"))))
 
 
 def imported(files: Iterable[Path]) -> set[str]:
-    return {name for file in files for name in imported_by(file)}
+    """Top-level packages, without the standard library and this package."""
+    names = {name.partition(".")[0] for file in files for name in imported_by(file)}
+    return names - set(sys.stdlib_module_names) - {PACKAGE}
 
 
-@pytest.mark.parametrize("dependency", sorted(modules()))
-def test_every_dependency_is_imported_by_the_package(dependency: str) -> None:
-    assert dependency in imported(OTHERS)
-
-
-def test_everything_that_is_imported_outside_ros_is_a_dependency() -> None:
+def test_every_dependency_is_imported_by_the_package_and_everything_that_is_imported_is_one() -> None:
     optional = modules("bench", "xacro", "export", "lerobot")
+    assert modules() <= imported(OTHERS)
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
-
-
-def test_everything_that_the_nodes_import_is_a_dependency_or_in_the_extra_ros() -> None:
     built = {file.parent.name for file in (ROS / "interfaces").glob("*/package.xml")}
     assert imported(NODES) - modules() - modules("ros") - built - WITH_OTHERS == set()
 
@@ -77,5 +88,57 @@ def test_peers_are_imported_by_their_own_modules_only() -> None:
 
 def test_the_ros_manifest_has_the_name_and_version_of_the_python_package() -> None:
     manifest = ElementTree.parse(ROOT / "package.xml").getroot()
-    assert manifest.findtext("name") == project()["name"]
-    assert manifest.findtext("version") == project()["version"]
+    assert manifest.findtext("name") == PROJECT["name"]
+    assert manifest.findtext("version") == PROJECT["version"]
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    files = [
+        file for file in OTHERS | NODES if file.name != "__init__.py"
+    ]  # an import of a module is its package's too
+    known = {".".join(file.relative_to(ROOT).with_suffix("").parts): file for file in files}
+    graph = {name: imported_by(file) & known.keys() for name, file in known.items()}
+    TopologicalSorter(graph).prepare()  # raises CycleError
+
+
+@pytest.mark.parametrize(
+    ("module", "forbidden"),
+    [
+        pytest.param("ros.bridge.parameters", HEAVY, id="parameters of the teleop nodes"),
+        pytest.param("ros.nodes.base_arm_controller", HEAVY, id="a teleop node"),
+        pytest.param("ros.nodes.tcp_endpoint", HEAVY, id="the headset's node"),
+        pytest.param("teleop", HEAVY, id="teleop"),
+        pytest.param("inputs", HEAVY, id="inputs"),
+        pytest.param("viewer.headset_table", HEAVY, id="a table of topics"),
+        pytest.param("plants", ("mujoco", "numba", "matplotlib"), id="plants"),
+        pytest.param("recording.writer", (*HEAVY, f"{PACKAGE}.pipeline"), id="the process that writes recordings"),
+        pytest.param("cli.app", ("matplotlib", "rclpy"), id="the command line"),
+    ],
+)
+def test_importing_a_light_module_imports_nothing_heavy(module: str, forbidden: tuple[str, ...]) -> None:
+    if module.startswith("ros.") and find_spec("rclpy") is None:
+        pytest.skip("rclpy is not installed")
+    code = f"import sys, {PACKAGE}.{module}; print(*(name for name in {forbidden!r} if name in sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == []
+
+
+@pytest.mark.parametrize("package", [PACKAGE, f"{PACKAGE}.ros"])
+def test_every_public_name_exists(package: str) -> None:
+    if package.endswith(".ros") and find_spec("rclpy") is None:
+        pytest.skip("rclpy is not installed")
+    found = import_module(package)
+    for name in found.__all__:
+        assert hasattr(found, name), name
+
+
+def test_the_configuration_reference_is_made_from_the_settings_of_now() -> None:
+    made = load_script("docs/make_reference.py")
+    assert made.FILE.read_text(encoding="utf-8") == made.reference(), "python docs/make_reference.py"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
+def test_every_file_that_a_page_links_to_exists(page: Path) -> None:
+    for link in re.findall(r"\]\((?!https?:|#|mailto:)([^)#\s]+)", page.read_text(encoding="utf-8")):
+        assert (page.parent / link).exists(), link

@@ -1,24 +1,34 @@
-"""One controller in one work motion, and the figures of it: the same for ours, for peers, and for tests."""
+"""One controller in one work motion, with its figures, and the bench of ours and peers, which take turns.
+
+All get the same cell, limits, targets and ticks, in one process. Peers run open loop as ours does, with targets ahead
+of time by what they would lag. Beside ours stands ours in free air: the difference is the cost of the pairs.
+"""
 
 from __future__ import annotations
 
 import gc
 import math
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.benchmark.peers.base import BenchController
+from q2r2_control.benchmark.peers.base import BenchController, Leading, PeerSettings, build_peers
 from q2r2_control.benchmark.work_motions import WorkMotion
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
+DT = 0.001  # [s]
+ARRIVED = 0.01  # from the goal [m]
+PATIENCE = 3.0  # with a controller: how many times the motion's own time it may take
+JOLT = 5.0  # change of a joint's acceleration from one tick to the next [rad/s^2]
+_TAIL = 0.5  # [s]
 _SHORTEST_DT = 1e-9  # a tick that moves nothing [s]
+_DISTANCE_TICKS = 4  # between postures whose distances are measured, but near the nearest
 
 
 class OwnController:
@@ -35,18 +45,16 @@ class OwnController:
         self.stopped: list[bool] = []  # of each tick since the reset: whether the certified stop was executed
 
     def reset(self, q: Array) -> None:
-        """See :class:`BenchController`."""
         self._controller.reset(q)
         self.stopped.clear()
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """See :class:`BenchController`."""
         reference = self._controller.step(targets, dt)
         self.stopped.append(reference.report.fallback)
         return reference.q, reference.v
 
     def hold(self) -> tuple[Array, Array]:
-        """See :class:`BenchController`; only called after a step that raised, which the contract forbids."""
+        """Only called after a step that raised, which the contract forbids."""
         reference = self._controller.step({}, _SHORTEST_DT)
         return reference.q, np.zeros_like(reference.v)
 
@@ -58,10 +66,6 @@ def without_pairs(config: Config) -> Robot:
     return robot
 
 
-JOLT = 5.0  # change of a joint's acceleration from one tick to the next [rad/s^2]
-_TAIL = 0.5  # [s]
-
-
 def rest_acceleration(v: Array, dt: float) -> float:
     """RMS over the last 0.5 s of velocities (n, nv) [rad/s], of the acceleration's norm over the joints [rad/s^2]."""
     a = np.diff(v, axis=0, prepend=0.0)[-round(_TAIL / dt) :] / dt
@@ -69,19 +73,10 @@ def rest_acceleration(v: Array, dt: float) -> float:
 
 
 def count_jolts(v: Array, dt: float, since: float) -> int:
-    """Ticks of velocities (n, nv) [rad/s] after which a joint's acceleration changes by more than :data:`JOLT`.
-
-    Counts from ``since`` [s] on.
-    """
+    """From ``since`` [s] on, ticks of velocities (n, nv) [rad/s] that change an acceleration by over :data:`JOLT`."""
     a = np.diff(v, axis=0, prepend=0.0) / dt
     changes = np.abs(np.diff(a, axis=0)).max(axis=1)
     return int((changes[round(since / dt) :] > JOLT).sum())
-
-
-DT = 0.001  # [s]
-ARRIVED = 0.01  # from the goal [m]
-PATIENCE = 3.0  # with a controller: how many times the motion's own time it may take
-_DISTANCE_TICKS = 4  # between postures whose distances are measured, but near the nearest
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +115,7 @@ def run_motion(
     controller: BenchController, robot: Robot, motion: WorkMotion, patience: float = math.inf, dt: float = DT
 ) -> MotionFigures:
     """Run ``motion`` from home in ticks of ``dt`` [s]; see :func:`play_motion` and :func:`figures_of`."""
-    run = play_motion(controller, robot, motion, patience, dt)
-    return figures_of(run, controller, robot, motion, dt)
+    return figures_of(play_motion(controller, robot, motion, patience, dt), controller, robot, motion, dt)
 
 
 def play_motion(controller: BenchController, robot: Robot, motion: WorkMotion, patience: float, dt: float) -> MotionRun:
@@ -219,3 +213,59 @@ def nearest_pair(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] 
     pairs = [min(robot.distances(q[tick]), key=lambda pair: pair.distance) for tick in fine]
     found = min(pairs, key=lambda pair: pair.distance)
     return 1e3 * found.distance, (found.name_a, found.name_b)
+
+
+@dataclass(frozen=True, slots=True)
+class BenchRow:
+    """One motion: our controller in free air, ours, and the peers."""
+
+    motion: str
+    about: str
+    reachable: bool  # whether both arms can be at all targets with every distance kept
+    free_air: MotionFigures
+    figures: list[MotionFigures]  # ours first
+
+
+@dataclass(frozen=True, slots=True)
+class BenchReport:
+    """All motions on one cell."""
+
+    cell: str
+    pairs: int
+    rounds: int
+    rows: list[BenchRow]
+    notes: list[str]  # limitations of the peers, and which are not installed
+
+
+def run_bench(
+    config: Config, motions: Sequence[WorkMotion], peers: Sequence[str], rounds: int, progress: Callable[[str], None]
+) -> BenchReport:
+    """Run ``motions``, which are made for ``config/dual_iiwa7.yaml``, with ours and with ``peers`` where installed.
+
+    All controllers take turns, ``rounds`` times, since a machine's speed varies. Figures are those of the last round,
+    and times the medians over the rounds.
+    """
+    robot = Robot.from_config(config)
+    free = OwnController(without_pairs(config), config, "free air")
+    others, notes = build_peers(peers, PeerSettings(robot, config, DT))
+    ahead = [Leading(peer, config.control.position_gain) for peer in others]
+    controllers: list[BenchController] = [free, OwnController(robot, config), *ahead]
+    rows = []
+    for number, motion in enumerate(motions, 1):
+        runs: dict[str, list[MotionFigures]] = {controller.name: [] for controller in controllers}
+        for turn in range(rounds):
+            for controller in controllers:
+                progress(f"{motion.name} ({number} of {len(motions)}), round {turn + 1}, {controller.name}")
+                runs[controller.name].append(run_motion(controller, robot, motion, PATIENCE))
+        figures = [_over_rounds(found) for found in runs.values()]
+        rows.append(BenchRow(motion.name, motion.about, motion.reachable, figures[0], figures[1:]))
+    return BenchReport(config.name, len(robot.collision_model.collisionPairs), rounds, rows, notes)
+
+
+def _over_rounds(runs: Sequence[MotionFigures]) -> MotionFigures:
+    """The last round's, with the medians of all times."""
+    times = [run.times_us for run in runs if run.times_us is not None]
+    if not times:
+        return runs[-1]
+    median, p99, longest = np.median(times, axis=0).tolist()
+    return replace(runs[-1], times_us=(median, p99, longest))

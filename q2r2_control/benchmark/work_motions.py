@@ -71,7 +71,7 @@ class WorkMotion:
         elif self.approach:
             stops = (home, *self.approach)
             leg = min(int(t / _LEG), len(stops) - 2)
-            places = _between(stops[leg], stops[leg + 1], t / _LEG - leg)
+            places = stops[leg] + minimum_jerk(t / _LEG - leg) * (stops[leg + 1] - stops[leg])
             turned = minimum_jerk(t / _LEG)
         else:
             places = home
@@ -82,10 +82,9 @@ class WorkMotion:
 
 
 def motions_named(names: Iterable[str]) -> tuple[WorkMotion, ...]:
-    """The motions of :data:`WORK_MOTIONS` of these names, in its order.
+    """The motions of :data:`WORK_MOTIONS` of these names, in its order; ``carry`` stands for all ``carry-...``.
 
-    ``carry`` stands for all motions whose names begin with ``carry-``, and so on. Raises :class:`ConfigError` for a
-    name that is neither.
+    Raises :class:`ConfigError` for a name that is neither.
     """
     chosen: set[str] = set()
     for name in names:
@@ -94,18 +93,6 @@ def motions_named(names: Iterable[str]) -> tuple[WorkMotion, ...]:
             raise ConfigError(f"motion {name!r:.60}: allowed: {', '.join(WORK_MOTIONS)}, or what names begin with")
         chosen |= found
     return tuple(motion for name, motion in WORK_MOTIONS.items() if name in chosen)
-
-
-def _places(left: tuple[float, float, float], right: tuple[float, float, float]) -> Array:
-    return np.array([left, right])
-
-
-def _between(first: Array, last: Array, fraction: float) -> Array:
-    return first + minimum_jerk(fraction) * (last - first)
-
-
-def _home(home: Array) -> Array:
-    return home
 
 
 def _to(
@@ -123,7 +110,7 @@ def _to(
         for seconds, stop in stops:
             there = stop(home) if callable(stop) else stop
             if t < seconds:
-                return _between(here, there, t / seconds)
+                return here + minimum_jerk(t / seconds) * (there - here)
             t, here = t - seconds, there
         return here
 
@@ -142,15 +129,12 @@ def _uniform(t: float, way: float, speed: float, ramp: float) -> float:
 
 
 _CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04  # x and z [m], of x, of z [m]
-_CARRY_RAMP, _CARRY_SHORTEST = 0.5, 3.0  # [s]
+_CARRY_RAMP = 0.5  # [s]
 _LEAST_GAP = 0.18  # between tools at one height, for wrists 20 mm apart [m]
 
 
-def carry(gap: float, speed: float, shortest: float = _CARRY_SHORTEST) -> WorkMotion:
-    """Both tools, ``gap`` [m] apart, go round at ``speed`` [m/s] as if they held one thing.
-
-    In whole laps that take at least the time ``shortest`` [s].
-    """
+def carry(gap: float, speed: float, shortest: float = 3.0) -> WorkMotion:
+    """Both tools, ``gap`` [m] apart, go round at ``speed`` [m/s], in whole laps of at least ``shortest`` [s] in all."""
     rate = speed / _CARRY_RADIUS
     turn = 2.0 * math.pi * max(1, math.ceil(shortest * rate / (2.0 * math.pi)))
 
@@ -158,7 +142,7 @@ def carry(gap: float, speed: float, shortest: float = _CARRY_SHORTEST) -> WorkMo
         phase = _uniform(t, turn, rate, _CARRY_RAMP)
         x = _CARRY_CENTRE[0] + _CARRY_RADIUS * math.sin(phase)
         z = _CARRY_CENTRE[1] + _CARRY_RISE * (1.0 - math.cos(phase))
-        return _places((x, 0.5 * gap, z), (x, -0.5 * gap, z))
+        return np.array([(x, 0.5 * gap, z), (x, -0.5 * gap, z)])
 
     return WorkMotion(
         name=f"carry-{gap:.2f}-{speed:.2f}",
@@ -175,6 +159,14 @@ def _between_tools(home: Array, gap: float) -> Array:
     return np.column_stack((home[:, 0], 0.5 * gap * np.sign(home[:, 1]), home[:, 2]))
 
 
+def _home(home: Array) -> Array:
+    return home
+
+
+def _swapped(home: Array) -> Array:
+    return home[::-1]
+
+
 def _ahead(home: Array) -> Array:
     """Straight ahead to 0.80 m; 0.73 m can be reached."""
     return np.column_stack((np.full(2, 0.80), home[:, 1:]))
@@ -186,23 +178,21 @@ def _met(home: Array) -> Array:
 
 
 # Side by side, and past each other: the left tool behind the right one's arm, above its elbow's way.
-_APART = _places((0.30, 0.25, 0.40), (0.58, -0.25, 0.26))
-_PAST = _places((0.30, -0.05, 0.40), (0.58, 0.05, 0.26))
+_APART = np.array([(0.30, 0.25, 0.40), (0.58, -0.25, 0.26)])
+_PAST = np.array([(0.30, -0.05, 0.40), (0.58, 0.05, 0.26)])
 # At one depth, where the tools cannot pass.
-_FACING = _places((0.44, 0.25, 0.33), (0.44, -0.25, 0.33))
-_CROSSED = _places((0.44, -0.05, 0.33), (0.44, 0.05, 0.33))
-_BEFORE_REACHING = _places((0.50, 0.05, 0.47), (0.50, -0.25, 0.30))
-_REACHED_UNDER = _places((0.50, 0.05, 0.47), (0.50, 0.08, 0.30))
+_FACING = np.array([(0.44, 0.25, 0.33), (0.44, -0.25, 0.33)])
+_CROSSED = np.array([(0.44, -0.05, 0.33), (0.44, 0.05, 0.33)])
+_BEFORE_REACHING = np.array([(0.50, 0.05, 0.47), (0.50, -0.25, 0.30)])
+_REACHED_UNDER = np.array([(0.50, 0.05, 0.47), (0.50, 0.08, 0.30)])
 _PASSING = 2.0  # [s]
-
-_OSCILLATION, _PERIODS = 0.5, 3  # [Hz]
-_LEAST_OSCILLATING_GAP = 0.06  # [m]
+_THROUGH = ((_PASSING, _CROSSED), (_PASSING, _PAST))
 
 
 def _oscillate(t: float, home: Array) -> Array:
-    """Sideways, from home until the targets are 0.06 m apart, and back."""
-    share = 0.5 * (1.0 - math.cos(2.0 * math.pi * _OSCILLATION * t))
-    return home + share * (_between_tools(home, _LEAST_OSCILLATING_GAP) - home)
+    """Sideways at 0.5 Hz, from home until the targets are 0.06 m apart, and back."""
+    share = 0.5 * (1.0 - math.cos(math.pi * t))
+    return home + share * (_between_tools(home, 0.06) - home)
 
 
 _SLIDING_HEIGHT = 0.2045  # 10 mm lower than the millimetre that fingers keep from the table allows [m]
@@ -214,36 +204,17 @@ _RIGHT_ASIDE = (0.50, -0.25, 0.38)
 def _slide(t: float, home: Array) -> Array:
     """The left tool sideways over the table; the right one stays aside."""
     y = _SLIDE_FROM[1] - _uniform(t, _SLIDE_WAY, _SLIDE_SPEED, _SLIDE_RAMP)
-    return _places((_SLIDE_FROM[0], y, _SLIDING_HEIGHT), _RIGHT_ASIDE)
+    return np.array([(_SLIDE_FROM[0], y, _SLIDING_HEIGHT), _RIGHT_ASIDE])
 
 
 _ALL = (
     *(carry(gap, speed) for gap in (0.40, 0.20, 0.16) for speed in (0.15, 0.30, 0.50)),
     carry(0.16, 0.04),
-    _to(
-        "meet",
-        "the tools meet, asked for 30 mm more than each can, stay 2 s and part",
-        *((1.5, _met), (2.0, _met), (1.5, _home)),
-    ),
-    _to(
-        "pass",
-        "the arms get past each other, at different depths and heights",
-        (_PASSING, _PAST),
-        approach=(_APART,),
-        reachable=True,
-    ),
+    _to("meet", "the tools meet 30 mm nearer than they can, stay 2 s and part", (1.5, _met), (2.0, _met), (1.5, _home)),
+    _to("pass", "the arms get past each other in depth", (_PASSING, _PAST), approach=(_APART,), reachable=True),
     _to("pass-back", "the same, back", (_PASSING, _APART), approach=(_APART, _PAST), reachable=True),
-    _to(
-        "cross",
-        "the tools change sides; the targets go through each other, a small detour leads there",
-        *((_PASSING, _CROSSED), (_PASSING, _PAST)),
-        approach=(_FACING,),
-    ),
-    _to(
-        "swap",
-        "each tool is asked for the other one's home, where neither arm reaches and both are in the way",
-        (_PASSING, lambda home: home[::-1]),
-    ),
+    _to("cross", "the tools change sides through each other", *_THROUGH, approach=(_FACING,)),
+    _to("swap", "each tool is asked for the other one's home, where neither arm reaches", (_PASSING, _swapped)),
     _to(
         "reach-under",
         "the right tool, tilted by 0.9 rad, reaches under the left one",
@@ -252,13 +223,7 @@ _ALL = (
         tilt=(0.0, 0.9),
         reachable=True,
     ),
-    WorkMotion(
-        name="oscillate",
-        about="the targets swing at 0.5 Hz, up to 0.06 m from each other",
-        duration=_PERIODS / _OSCILLATION,
-        path=_oscillate,
-        reachable=False,
-    ),
+    WorkMotion("oscillate", "the targets swing up to 0.06 m from each other", 6.0, _oscillate, reachable=False),
     WorkMotion(
         name="slide",
         about="the left tool slides 0.3 m over the table, asked to be 10 mm lower than it may",
@@ -267,11 +232,7 @@ _ALL = (
         approach=(_slide(0.0, np.empty((2, 3))),),
         reachable=False,
     ),
-    _to(
-        "stretch",
-        "both tools are asked for 70 mm more than they reach, and back",
-        *((2.0, _ahead), (0.5, _ahead), (2.0, _home)),
-    ),
+    _to("stretch", "both tools are asked for 70 mm more than they reach", (2.0, _ahead), (0.5, _ahead), (2.0, _home)),
 )
 WORK_MOTIONS: dict[str, WorkMotion] = {motion.name: motion for motion in _ALL}
 
@@ -285,11 +246,6 @@ def _circle(t: float, home: Array) -> Array:
 TIMED_MOTIONS = (
     WorkMotion("free motion", "circles of 0.1 m radius at 0.5 Hz in free space", 3.0, _circle, rest=0.0),
     WorkMotion(
-        "contact",
-        "each target jumps to where the other tool started: the arms block each other",
-        duration=3.0,
-        path=lambda t, home: home[::-1],
-        reachable=False,
-        rest=0.0,
+        "contact", "targets jump to the other tool's start", 3.0, lambda t, home: home[::-1], reachable=False, rest=0.0
     ),
 )

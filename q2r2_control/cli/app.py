@@ -13,16 +13,11 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from q2r2_control.cli.bench import bench
+from q2r2_control.cli.bench import bench, soak
 from q2r2_control.cli.check import check
-from q2r2_control.cli.demo import demo
-from q2r2_control.cli.export import app as export_app
-from q2r2_control.cli.headset_check import headset_check
-from q2r2_control.cli.judge import judge, report
-from q2r2_control.cli.replay import replay
+from q2r2_control.cli.recordings import export, judge, replay, report
 from q2r2_control.cli.ros import app as ros_app
-from q2r2_control.cli.run import run
-from q2r2_control.cli.soak import soak
+from q2r2_control.cli.run import demo, headset_check, run
 from q2r2_control.errors import Q2R2Error
 
 # typer raises its own copy of click's exceptions, or click's, depending on its version; this is the root of either.
@@ -37,21 +32,18 @@ class ErrorHandlingGroup(TyperGroup):
         extra["standalone_mode"] = False
         try:
             code = super().main(*args, **extra)
-        except Q2R2Error as error:
-            _fail(str(error))
+            sys.exit(code if isinstance(code, int) else 0)
         except (KeyboardInterrupt, typer.Abort):
             sys.exit(130)
+        except Q2R2Error as error:
+            message = str(error)
         except _BadUsage as error:
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "q2r2"
             message = error.format_message()  # type: ignore[attr-defined]
-            _fail(f"{message.rstrip('.')}; see {command} --help")
-        sys.exit(code if isinstance(code, int) else 0)
-
-
-def _fail(message: str) -> None:
-    print(f"q2r2: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(2)
+            message = f"{message.rstrip('.')}; see {command} --help"
+        print(f"q2r2: {' '.join(message.split())}", file=sys.stderr)
+        sys.exit(2)
 
 
 app = typer.Typer(
@@ -70,7 +62,7 @@ app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa
 app.command("headset-check", epilog="Example: q2r2 headset-check --host 0.0.0.0")(headset_check)
 app.command(epilog="Example: q2r2 bench --ticks 20000, or --work --motion meet")(bench)
 app.command(epilog="Example: q2r2 soak --ticks 100000 --contact")(soak)
-app.add_typer(export_app, name="export")
+app.command(epilog="Example: q2r2 export lerobot recordings --output datasets/circle --fps 30")(export)
 app.add_typer(ros_app, name="ros")
 
 

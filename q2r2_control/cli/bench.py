@@ -1,15 +1,16 @@
-"""``q2r2 bench``: the controller beside public ones, on this machine."""
+"""``q2r2 bench``: the controller beside public ones; ``q2r2 soak``: all its promises under hostile input."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Annotated
 
-import typer
 from rich.table import Table
+from rich.text import Text
+from typer import Exit, Option
 
-from q2r2_control.benchmark.bench import BenchReport, BenchRow, run_bench
-from q2r2_control.benchmark.motion_run import PATIENCE, MotionFigures
+from q2r2_control.benchmark.motion_run import PATIENCE, BenchReport, BenchRow, MotionFigures, run_bench
 from q2r2_control.benchmark.peers.base import PEERS, WITHOUT_ACCELERATION_LIMIT
 from q2r2_control.benchmark.work_motions import TIMED_MOTIONS, WORK_MOTIONS, motions_named
 from q2r2_control.cli.output import (
@@ -20,10 +21,11 @@ from q2r2_control.cli.output import (
     notice_of_compiling,
     print_progress,
     print_report,
-    stderr_console,
 )
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
+from q2r2_control.verification.fault_injection import FINGERS, with_contact
+from q2r2_control.verification.soak import COUNTED, MEMORY_ALLOWED, SoakReport, run_soak
 
 _ROUNDS = 3
 _NOTES = (
@@ -40,15 +42,10 @@ _NOTES = (
 
 
 def bench(
-    rounds: Annotated[int | None, typer.Option(min=1, help=f"How often: {_ROUNDS}, with --work 1.")] = None,
-    peers: Annotated[bool, typer.Option(help="Measure roboplan, mink and pink too, where they are installed.")] = True,
-    work: Annotated[
-        bool, typer.Option("--work", help="Two-armed work motions instead of a circle and a contact.")
-    ] = False,
-    motion: Annotated[
-        list[str] | None,
-        typer.Option(help="With --work: only this motion, or those that begin with it, such as carry; repeatable."),
-    ] = None,
+    rounds: Annotated[int | None, Option(min=1, help=f"How often: {_ROUNDS}, with --work 1.")] = None,
+    peers: Annotated[bool, Option(help="Measure roboplan, mink and pink too, where they are installed.")] = True,
+    work: Annotated[bool, Option("--work", help="Two-armed work motions instead of circle and contact.")] = False,
+    motion: Annotated[list[str] | None, Option(help="With --work: only this, or such as begin so; repeatable.")] = None,
     json: Json = False,
 ) -> None:
     """Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.
@@ -59,9 +56,9 @@ def bench(
         raise ConfigError("--motion needs --work")
     motions = motions_named(motion or WORK_MOTIONS) if work else TIMED_MOTIONS
     names = tuple(PEERS) if peers else ()
-    with notice_of_compiling(stderr_console()):
+    with notice_of_compiling():
         report = run_bench(load_config(DEMO_CONFIG), motions, names, rounds or (1 if work else _ROUNDS), print_progress)
-    print_report(report.as_json(), (bench_table(report),), json)
+    print_report(report, (bench_table(report),), json)
 
 
 def bench_table(report: BenchReport) -> Table:
@@ -72,12 +69,12 @@ def bench_table(report: BenchReport) -> Table:
             *("controller", "p50 [us]", "p99 [us]", "RMS [mm]", "free [mm]", "there [s]"),
             *("held [%]", "near [mm]", "|a| [s-2]", "rest [s-2]"),
         ),
-        _rows(report),
+        _bench_rows(report),
         [*(f"{row.motion}: {row.about}" for row in report.rows), *_NOTES, *report.notes],
     )
 
 
-def _rows(report: BenchReport) -> Iterator[tuple[Cell, ...]]:
+def _bench_rows(report: BenchReport) -> Iterator[tuple[Cell, ...]]:
     for row in report.rows:
         yield (f"{row.motion}{'' if row.reachable else ' (!)'}",)
         for figures in row.figures:
@@ -87,13 +84,12 @@ def _rows(report: BenchReport) -> Iterator[tuple[Cell, ...]]:
 
 
 def _cells(row: BenchRow, figures: MotionFigures) -> tuple[Cell, ...]:
-    unlimited = "*" if figures.controller in WITHOUT_ACCELERATION_LIMIT else ""
     held = figures.fallback_percent
     if held is None and figures.ticks:
         held = 100.0 * figures.failures / figures.ticks
     misses = figures.arrival_s is None and row.free_air.arrival_s is not None
     return (
-        f"  {figures.controller}{unlimited}",
+        f"  {figures.controller}{'*' if figures.controller in WITHOUT_ACCELERATION_LIMIT else ''}",
         *(figures.times_us or (None, None))[:2],
         figures.rms_error_mm,
         row.free_air.rms_error_mm if figures is row.figures[0] else "",
@@ -103,3 +99,49 @@ def _cells(row: BenchRow, figures: MotionFigures) -> tuple[Cell, ...]:
         figures.max_acceleration,
         figures.rest_acceleration,
     )
+
+
+def soak(
+    ticks: Annotated[int, Option(min=100, help="How many.")] = 1_000_000,
+    contact: Annotated[bool, Option("--contact", help="Fingers may touch table and fingers.")] = False,
+    seed: Annotated[int, Option(min=0, help="Of all that is drawn at random.")] = 0,
+    json: Json = False,
+) -> None:
+    """Check every promise of the controller in random hostile targets, ticks, starts and solver failures.
+
+    Prints the worst margin of each promise. Exit 1 if one was broken.
+    """
+    config = load_config(DEMO_CONFIG)
+    with notice_of_compiling():
+        report = run_soak(with_contact(config, FINGERS) if contact else config, ticks, seed, print_progress)
+    table = figure_table(
+        f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, seed {report.seed}",
+        ("promise", "worst", "allowed", "checked", "broken"),
+        _soak_rows(report),
+        list(_soak_notes(report, "--contact " if contact else "")),
+    )
+    print_report(report.as_json(), (table,), json)
+    raise Exit(0 if report.passed else 1)
+
+
+def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
+    """Worst margin of every promise, and how often it was broken."""
+    for margin in report.margins:
+        name = Text(margin.name, style="red" if margin.violations else "")
+        worst = "" if math.isinf(margin.worst) and not margin.violations else f"{margin.worst:.2g} {margin.unit}"
+        yield name, worst, f"{margin.sense} {margin.allowed:.2g}", margin.checked, margin.violations
+    if (grown := report.memory_growth_mb) is not None:
+        broken = int(grown > MEMORY_ALLOWED)
+        yield "memory growth after a tenth of it", f"{grown:.2f} MB", f"<= {MEMORY_ALLOWED:g}", 1, broken
+
+
+def _soak_notes(report: SoakReport, options: str) -> Iterator[str]:
+    """Counts, the first time of each broken promise, and the command with ``options`` that shows it again."""
+    yield ", ".join(f"{report.counts[name]} {what}" for name, what in COUNTED.items())
+    for found in report.broken:
+        error = f": {found.error}" if found.error else ""
+        where = f"tick {found.since_segment} of: {found.segment}; dt {found.dt}"
+        yield f"first broken at tick {found.tick}: {found.promise}{error} [{where}]"
+    if report.broken:
+        again = f"{options}--seed {report.seed} --ticks {report.broken[0].tick + 1}"
+        yield f"to see the first again: q2r2 soak {again}"

@@ -4,36 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from q2r2_control.config.arms import FlangeConfig, HeldObjectConfig
+from q2r2_control.cli.output import notice_of_compiling
+from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.plugins import INPUTS, PLANTS, check_installed, load_class
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.robot.stop_torque import StopTorque, stop_torques
 from q2r2_control.supervision.preflight import preflight_faults
 
 _NEAREST = 8
 
 
-@dataclass(frozen=True, slots=True)
-class JointCheck:
-    """One joint. Positions in rad (m for a sliding joint), velocity per second, torque in Nm (N)."""
-
-    name: str
-    lower: float
-    home: float
-    upper: float
-    velocity: float
-    torque: float
+# Positions in rad (m for a sliding joint), velocity per second, torque in Nm (N).
+_JOINT = ("name", "lower", "home", "upper", "velocity", "torque")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,18 +37,15 @@ class ArmCheck:
     flange: str | None  # model, or sizes
     tool_model: str | None
     tool_frame: str
-    tool_position: tuple[float, ...]
-    joints: tuple[JointCheck, ...]
-    object: str | None = None  # what its gripper is to hold, which is part of the tool then
+    tool_position: list[float]
+    joints: list[dict[str, Any]]  # the figures of _JOINT by name
+    object: str | None  # what its gripper is to hold, which is part of the tool then
 
 
 @dataclass(frozen=True, slots=True)
-class KeptPair:
+class KeptPair(PairDistance):
     """Distance of a monitored pair at home, and the one that it keeps [m]."""
 
-    name_a: str
-    name_b: str
-    distance: float
     kept: float
 
 
@@ -65,74 +54,64 @@ class CellCheck:
     """A cell as the controller sees it. Distances in metres, at home; ``faults`` are empty for a good cell."""
 
     name: str
-    arms: tuple[ArmCheck, ...]
+    arms: list[ArmCheck]
     obstacles: dict[str, ObstacleConfig]
     floor: float | None  # height [m]
     monitored_pairs: int
     ignored_pairs: tuple[tuple[str, str], ...]  # overlap by construction
     min_distance: float
     contacts: tuple[ContactPair, ...]  # that may touch, in torque mode
-    nearest: tuple[KeptPair, ...]  # nearest first
+    nearest: list[KeptPair]  # nearest first
     faults: tuple[str, ...]
     stop_torques: tuple[StopTorque, ...]  # by arm
     driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
     controls: dict[str, str]  # what those of each hand do
-
-    @property
-    def notes(self) -> list[str]:
-        """One line for each thing that a user should know of and that is no fault."""
-        notes = [f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in self.arms if arm.object]
-        for allowed in self.contacts:
-            inside = f"the reference gets inside by up to {1e3 * allowed.depth:g} mm at {1e3 * allowed.speed:g} mm/s"
-            notes.append(f"{' and '.join(allowed.pair)} may touch in torque mode: {inside}")
-        return notes + [_stop_note(stop) for stop in self.stop_torques if stop.stop.ratio > 1.0]
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain data and dataclasses for the JSON writer."""
-        data = {name: getattr(self, name) for name in self.__slots__} | {"notes": self.notes}
-        data["obstacles"] = {name: obstacle.model_dump(mode="json") for name, obstacle in self.obstacles.items()}
-        return data | {"contacts": [allowed.model_dump(mode="json") for allowed in self.contacts]}
+    notes: list[str]  # a line for each thing that a user should know of and that is no fault
 
 
-def check_cell(config: Config, compiling: AbstractContextManager[None] | None = None) -> CellCheck:
-    """Build the cell and look at it at home; ``compiling`` surrounds what may have to compile the controller first.
-
-    Raises :class:`Q2R2Error` where the cell cannot be built.
-    """
+def check_cell(config: Config) -> CellCheck:
+    """Build the cell and look at it at home. Raises :class:`Q2R2Error` where it cannot be built."""
     config.teleop.bindings.check_device(load_class(INPUTS, config.input).controls)
     check_installed(PLANTS, config.plant)
     robot = Robot.from_config(config)
-    with compiling or nullcontext():
+    with notice_of_compiling():
         # With what may touch too, so that every name and number is checked; what is kept is that of position mode.
         CartesianController(robot, config.control)
         settings = config.control.without_contact()
         controller = CartesianController(robot, settings)
     kept = kept_distances(robot, settings).values.tolist()
     distances = sorted(zip(robot.distances(robot.home), kept, strict=True), key=lambda found: found[0].distance)
+    arms = [_arm_check(config, robot, name) for name in robot.arms]
+    stops = stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit))
+    notes = [f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in arms if arm.object]
+    for allowed in config.control.contact_allowed:
+        inside = f"the reference gets inside by up to {1e3 * allowed.depth:g} mm at {1e3 * allowed.speed:g} mm/s"
+        notes.append(f"{' and '.join(allowed.pair)} may touch in torque mode: {inside}")
     return CellCheck(
         name=config.name,
-        arms=tuple(_arm_check(config, robot, name) for name in robot.arms),
+        arms=arms,
         obstacles=dict(config.obstacles),
         floor=config.floor,
         monitored_pairs=len(distances),
         ignored_pairs=robot.ignored_pairs,
         min_distance=settings.min_distance,
         contacts=tuple(config.control.contact_allowed),
-        nearest=tuple(KeptPair(pair.name_a, pair.name_b, pair.distance, least) for pair, least in distances[:_NEAREST]),
+        nearest=[KeptPair(pair.name_a, pair.name_b, pair.distance, least) for pair, least in distances[:_NEAREST]],
         faults=preflight_faults(robot, settings, controller),
-        stop_torques=stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit)),
+        stop_torques=stops,
         driven={} if config.external is None else describe(config.external),
         controls=config.teleop.bindings.meanings(),
+        notes=notes + [_stop_note(stop) for stop in stops if stop.stop.ratio > 1.0],
     )
 
 
 def _stop_note(stop: StopTorque) -> str:
     """Which joint of an arm is asked for more torque than it has, how often, and what helps."""
-    heavy = stop.gravity.ratio > 1.0
-    worst = stop.gravity if heavy else stop.stop
-    where = "at rest, by gravity alone" if heavy else "in a full stop from low speed, with the worst signs"
-    helps = "the model's torque limits, masses and position limits"
-    if not heavy:
+    if stop.gravity.ratio > 1.0:
+        worst, where = stop.gravity, "at rest, by gravity alone"
+        helps = "the model's torque limits, masses and position limits"
+    else:
+        worst, where = stop.stop, "in a full stop from low speed, with the worst signs"
         share = f"{math.floor(100 * stop.bearable) / 100:.2f}"
         helps = f"{share} times these limits in arms.{stop.arm}.acceleration_limit or control.acceleration_limit"
     return (
@@ -150,33 +129,29 @@ def _millimetres(*values: float) -> str:
     return _numbers(1e3 * value for value in values) + " mm"
 
 
-def _flange_of(config: FlangeConfig) -> str | None:
-    if config.thickness is None or config.radius is None:
-        return config.model
-    return f"{_millimetres(config.thickness)} thick, radius {_millimetres(config.radius)}"
-
-
-def _object_of(config: HeldObjectConfig | None) -> str | None:
-    if config is None:
-        return None
-    ball = config.box is None
-    shape = f"a ball of radius {_millimetres(config.radius)}" if ball else f"a box of {_millimetres(*config.box or ())}"
-    return f"{shape}, {config.mass:g} kg, at {_millimetres(*config.at)} in the tool frame"
+def _object_of(config: HeldObjectConfig) -> str:
+    sizes = f"a box of {_millimetres(*config.box)}" if config.box else f"a ball of radius {_millimetres(config.radius)}"
+    return f"{sizes}, {config.mass:g} kg, at {_millimetres(*config.at)} in the tool frame"
 
 
 def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
     arm, settings = robot.arms[name], next(arm for side, arm in config.arms.items() if side == name)
+    flange, held = settings.flange, settings.gripper.object
     columns = (
         *(np.array(robot.joint_names), robot.position_lower, robot.home, robot.position_upper),
         *(robot.velocity_limit, robot.torque_limit),
     )
+    rows = zip(*(column[list(arm.joints)].tolist() for column in columns), strict=True)
+    sizes = flange.model
+    if flange.thickness is not None and flange.radius is not None:
+        sizes = f"{_millimetres(flange.thickness)} thick, radius {_millimetres(flange.radius)}"
     return ArmCheck(
         name=name,
         model=config.model_of(name),
-        flange=_flange_of(settings.flange),
+        flange=sizes,
         tool_model=settings.tool.model,
         tool_frame=arm.tool_frame,
-        tool_position=tuple(robot.tool_pose(robot.home, name).translation.tolist()),
-        joints=tuple(map(JointCheck, *(column[list(arm.joints)].tolist() for column in columns))),
-        object=_object_of(settings.gripper.object),
+        tool_position=robot.tool_pose(robot.home, name).translation.tolist(),
+        joints=[dict(zip(_JOINT, row, strict=True)) for row in rows],
+        object=None if held is None else _object_of(held),
     )

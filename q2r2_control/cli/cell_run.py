@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, nullcontext
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from q2r2_control.cli.headset_check import AnnouncedHeadset
-from q2r2_control.cli.output import as_json_text, notice_of_compiling, say
-from q2r2_control.cli.summary_table import recording_line, summary_table, task_line, verdict_markup
+from q2r2_control.cli.output import (
+    as_json_text,
+    notice_of_compiling,
+    recording_line,
+    say,
+    summary_table,
+    task_line,
+    verdict_markup,
+)
 from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
+from q2r2_control.inputs.addresses import access_lines, written
 from q2r2_control.inputs.base import Input, make_input
+from q2r2_control.inputs.headset import HeadsetServer, watch_of
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
@@ -37,6 +45,20 @@ from q2r2_control.viewer.live import LiveTable
 _PERIOD = 1.0 / 30.0  # [s]
 
 
+class AnnouncedHeadset(HeadsetServer):
+    """A headset server that says where it listens, for scripts that asked for port 0, and who can drive, for people."""
+
+    def __init__(self, config: Config, console: Console) -> None:
+        headset = config.headset
+        super().__init__(headset.host, headset.port, allow=headset.networks, watch=watch_of(config))
+        self._headset, self._console = headset, console
+
+    def start(self) -> None:
+        super().start()
+        for line in (f"listening on {written(*self.address)}", *access_lines(*self.address, self._headset.networks)):
+            say(f"headset: {line}", self._console)
+
+
 def check_window(plant: str | None) -> None:
     """Raises :class:`ConfigError` for a plant without a window."""
     if plant != "mujoco":
@@ -50,29 +72,24 @@ def show_window(pipeline: Pipeline, *, paced: bool = False) -> None:
     ``paced``: simulated time passes no faster than that of the clock on the wall. Raises :class:`PlantError` where
     there is no display.
     """
-    if isinstance(pipeline.plant, MujocoPlant):
-        pipeline.plant.launch_viewer()
-        pipeline.listeners.append(_WindowListener(pipeline, pipeline.plant, paced))
+    plant, due, began = pipeline.plant, 0.0, -math.inf
+    if not isinstance(plant, MujocoPlant):
+        return
+    plant.launch_viewer()
 
-
-class _WindowListener:
-    """Shows the window some thirty times a second."""
-
-    def __init__(self, pipeline: Pipeline, plant: MujocoPlant, paced: bool) -> None:
-        self._pipeline, self._plant, self._paced = pipeline, plant, paced
-        self._due = 0.0
-        self._began: float | None = None
-
-    def __call__(self, tick: Tick) -> None:
-        if tick.t < self._due:
+    def show(tick: Tick) -> None:
+        nonlocal due, began
+        if tick.t < due:
             return
-        self._due = tick.t + _PERIOD
-        if self._paced:
+        due = tick.t + _PERIOD
+        if paced:
             now = time.monotonic()
-            self._began = now - tick.t if self._began is None else self._began
-            time.sleep(max(self._began + tick.t - now, 0.0))
-        if not self._plant.viewer_sync():
-            self._pipeline.stop()
+            began = now - tick.t if began == -math.inf else began
+            time.sleep(max(began + tick.t - now, 0.0))
+        if not plant.viewer_sync():
+            pipeline.stop()
+
+    pipeline.listeners.append(show)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +107,8 @@ class RunOptions:
     seed: int
     table: bool
     window: bool
-    force: bool  # run although q2r2 check finds faults
     real_time: bool  # ask the system for locked memory and SCHED_FIFO
+    force: bool = False  # run although q2r2 check finds faults
     tasks: tuple[AssemblyTask, ...] = ()  # to be judged
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
@@ -105,67 +122,71 @@ class CellRun:
     tasks: tuple[TaskResult, ...] = ()
     recording: RecordingSummary | None = None
 
-    def as_json(self) -> dict[str, Any]:
-        """The summary, and where there were tasks or a recording what became of them."""
-        data = self.summary.as_json()
-        if self.tasks:
-            data["tasks"] = [asdict(task) for task in self.tasks]
-        if self.recording is not None:
-            data["recording"] = asdict(self.recording)
-        return data
 
-
-def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
-    """Run a cell and tell ``console`` about it. Raises :class:`Q2R2Error` where that is not possible as asked."""
+def run_cell(config: Config, options: RunOptions) -> CellRun:
+    """Run a cell and tell about it on stderr. Raises :class:`Q2R2Error` where that is not possible as asked."""
     if config.controller is ControllerKind.EXTERNAL:
         builtin = "this command runs controller: builtin only"
         raise ConfigError(f"{config.name}: controller: external is driven by q2r2 ros up; {builtin}")
     if options.window:
         check_window(options.plant)
     if options.record is None:
-        return _run_cell(config, options, None, console)
+        return _run_cell(config, options, None)
     # Before the pipeline, which takes longer to build than the recorder's process to start.
     pictures = bool(config.simulated_cameras) and options.plant == "mujoco"
     recorder = Recorder(options.record, options.name, waits=options.fast, pictures=pictures)
     try:
-        return _run_cell(config, options, recorder, console)
+        with recorder:
+            run = _run_cell(config, options, recorder)
     except PlantError:
-        for line in _recording_lines(recorder.summary):
-            console.print(line, soft_wrap=True, highlight=False)
+        _print_lines(Console(stderr=True), _recording_lines(recorder.summary))
         raise
+    return replace(run, recording=recorder.summary)
 
 
-def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, console: Console) -> CellRun:
-    with recorder or nullcontext():
-        with notice_of_compiling(console):
-            source = _input_of(config, options, console)
-            pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
-            _refuse_faults(pipeline, options.force, console)
-        watch = None
-        if options.tasks and isinstance(pipeline.plant, MujocoPlant):
-            watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
-            pipeline.listeners.append(watch)
-        summary = _run(pipeline, options, recorder, console)
-        if recorder is not None and watch is not None:
-            recorder.success = all(task.succeeded for task in watch.results())
+def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None) -> CellRun:
+    console = Console(stderr=True)
+    with notice_of_compiling():
+        source = _input_of(config, options, console)
+        pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
+        faults = preflight_faults(pipeline.robot, config.control.without_contact(), pipeline.controller)
+    if faults and not options.force:
+        raise ConfigError(f"{config.name}: {'; '.join(faults)}; --force runs it all the same")
+    for fault in faults:
+        say(f"FAULT {fault}", console, "red")
+    watch = None
+    if options.tasks and isinstance(pipeline.plant, MujocoPlant):
+        watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
+        pipeline.listeners.append(watch)
+    summary = _run(pipeline, options, recorder, console)
     results = () if watch is None else watch.results()
-    return CellRun(summary, results, None if recorder is None else recorder.summary)
+    if recorder is not None and results:
+        recorder.success = all(task.succeeded for task in results)
+    return CellRun(summary, results)
 
 
 def print_summary(run: CellRun, json: bool) -> None:
     """Print the summary of a run on stdout, as a table or as one JSON object, and the verdict on its recording."""
     if json:
-        judged = _judge_recording(run.recording)
-        verdict = {"judge": [one.as_json() for one in judged]} if judged else {}
-        print(as_json_text({**run.as_json(), **verdict}))
+        data = run.summary.as_json()
+        if run.tasks:
+            data["tasks"] = run.tasks
+        if run.recording is not None:
+            data["recording"] = run.recording
+        if judged := _judge_recording(run.recording):
+            data["judge"] = [one.as_json() for one in judged]
+        print(as_json_text(data))
         return
     console = Console()
     console.print(summary_table(run.summary))
-    for task in run.tasks:
-        console.print(task_line(task), soft_wrap=True, highlight=False)
+    _print_lines(console, map(task_line, run.tasks))
     if run.recording is not None:
-        for line in _recording_lines(run.recording):
-            console.print(line, soft_wrap=True, highlight=False)
+        _print_lines(console, _recording_lines(run.recording))
+
+
+def _print_lines(console: Console, lines: Iterable[str]) -> None:
+    for line in lines:
+        console.print(line, soft_wrap=True, highlight=False)
 
 
 def _recording_lines(recording: RecordingSummary) -> Iterator[str]:
@@ -177,7 +198,7 @@ def _recording_lines(recording: RecordingSummary) -> Iterator[str]:
 
 
 def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
-    """Judge the file as it was written, and keep the verdicts beside it. Whatever fails is one line on stderr."""
+    """Judge the file as it was written, and keep the verdicts beside it. A failure is one line on stderr."""
     if recording is None or recording.file is None or not Path(recording.file).exists():
         return []
     try:
@@ -187,18 +208,6 @@ def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
         say(f"not judged: {error}")
         return []
     return judged
-
-
-def _refuse_faults(pipeline: Pipeline, force: bool, console: Console) -> None:
-    """Raises :class:`ConfigError` for a cell in which ``q2r2 check`` finds a fault; with ``force`` only prints them."""
-    config = pipeline.config
-    faults = preflight_faults(pipeline.robot, config.control.without_contact(), pipeline.controller)
-    if not faults:
-        return
-    if not force:
-        raise ConfigError(f"{config.name}: {'; '.join(faults)}; --force runs it all the same")
-    for fault in faults:
-        say(f"FAULT {fault}", console, "red")
 
 
 def _input_of(config: Config, options: RunOptions, console: Console) -> Input:
@@ -224,25 +233,21 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
         if options.real_time and (refused := stack.enter_context(real_time())):
             say(refused, console, "yellow")
         if recorder is not None:
-            cameras = pipeline.config.simulated_cameras
+            cameras = tuple(pipeline.config.simulated_cameras)
             if cameras and isinstance(pipeline.plant, MujocoPlant):
-                recorder.prepare(pipeline.plant, pipeline.robot, cameras)
+                recorder.prepare(pipeline.plant, pipeline.robot, pipeline.config.simulated_cameras)
             elif cameras:
                 none = f"no pictures are recorded: the {options.plant} plant has none; allowed: --plant mujoco"
                 say(none, console, "yellow")
+                cameras = ()
             recorder.record_outcome = pipeline.record_outcome
-            recorder.begin(_about(pipeline, options), pipeline.robot)
+            notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
+            if options.input == "scripted":
+                human = str(options.human).lower()
+                notes |= {"trajectory": options.trajectory, "human": human, "seed": str(options.seed)}
+            recorder.begin(About.of(pipeline, not options.fast, notes, cameras), pipeline.robot)
             pipeline.listeners.append(recorder)
             if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):
                 judge_now = EpisodeJudge(lambda: recorder.file, pipeline.record_outcome)
                 pipeline.listeners.append(stack.enter_context(judge_now))
         return pipeline.run(options.duration, realtime=not options.fast)
-
-
-def _about(pipeline: Pipeline, options: RunOptions) -> About:
-    """Facts that a recording states once, of a run that begins now."""
-    notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
-    if options.input == "scripted":
-        notes |= {"trajectory": options.trajectory, "human": str(options.human).lower(), "seed": str(options.seed)}
-    cameras = tuple(pipeline.config.simulated_cameras) if isinstance(pipeline.plant, MujocoPlant) else ()
-    return About.of(pipeline, not options.fast, notes, cameras)

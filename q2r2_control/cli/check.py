@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.console import Console
 from rich.table import Table
+from typer import Exit, Option
 
 from q2r2_control.cli.cell_report import CellCheck, check_cell
-from q2r2_control.cli.output import (
-    ConfigFile,
-    Json,
-    as_json_text,
-    counting,
-    figure_table,
-    notice_of_compiling,
-    print_report,
-    stderr_console,
-)
+from q2r2_control.cli.output import ConfigFile, Json, as_json_text, counting, figure_table, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.model_srdf import model_srdfs
@@ -45,8 +36,7 @@ def write_pairs(
 ) -> PairsWritten:
     """Sample which pairs of a cell can meet, and write those that cannot as an SRDF to a new ``file``.
 
-    Raises :class:`ConfigError` for a clearance that is not above every distance in ``control``, and for a file that
-    exists.
+    Raises :class:`ConfigError` for a file that exists, and a clearance that is not above all distances in ``control``.
     """
     _check_clearance(config, clearance)
     if file.exists():
@@ -63,8 +53,7 @@ def write_model_pairs(
 ) -> dict[str, bool]:
     """Write the SRDF of each model of a cell to ``folder``; returns by path whether the file is new.
 
-    Raises :class:`ConfigError` as :func:`write_pairs` does, and before anything is written for a file that exists and
-    says something else.
+    Raises :class:`ConfigError` for such a clearance, and before it writes anything for a file that says something else.
     """
     _check_clearance(config, clearance)
     if not folder.is_dir():
@@ -94,18 +83,10 @@ def _write(files: Mapping[Path, str]) -> None:
 
 def check(
     config: ConfigFile,
-    pairs: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Find pairs that can never meet and write them as an SRDF for the key srdf."),
-    ] = None,
-    model_pairs: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Find such pairs of each arm and tool alone, and write ARM.srdf and so on."
-        ),
-    ] = None,
-    samples: Annotated[int, typer.Option(help="Random postures that --pairs and --model-pairs look at.")] = 20_000,
-    clearance: Annotated[float, typer.Option(help="Pairs that stay farther apart need no watching [m].")] = 0.05,
+    pairs: Annotated[Path | None, Option(metavar="FILE", help="Write pairs that can never meet as an SRDF.")] = None,
+    model_pairs: Annotated[Path | None, Option(metavar="FOLDER", help="The same of each arm and tool alone.")] = None,
+    samples: Annotated[int, Option(help="Random postures that --pairs and --model-pairs look at.")] = 20_000,
+    clearance: Annotated[float, Option(help="Pairs that stay farther apart need no watching [m].")] = 0.05,
     json: Json = False,
 ) -> None:
     """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
@@ -115,32 +96,50 @@ def check(
     if pairs is not None:
         with counting() as progress:
             found = write_pairs(cell, pairs, samples, clearance, progress)
-        print_report(asdict(found), (_pair_table(found),), json)
-        return
-    if model_pairs is not None:
+        table = figure_table(
+            f"{pairs}: {len(found.never)} of {len(found.never) + len(found.watched)} pairs of links stay more than "
+            f"{1e3 * clearance:g} mm apart",
+            ("pair", "nearest found [mm]"),
+            ((f"{pair.link_a} | {pair.link_b}", 1e3 * pair.nearest) for pair in found.never),
+        )
+        print_report(found, (table,), json)
+    elif model_pairs is not None:
         with counting() as progress:
             files = write_model_pairs(cell, model_pairs, samples, clearance, progress)
         rows = ((file, "new" if new else "as it was") for file, new in files.items())
         title = "pairs of the models' links that need no watching"
         print_report(files, (figure_table(title, ("file", "is"), rows),), json)
-        return
-    result = check_cell(cell, notice_of_compiling(stderr_console()))
-    if json:
-        print(as_json_text(result.as_json()))
     else:
-        _print_cell(result)
-    raise typer.Exit(1 if result.faults else 0)
+        result = check_cell(cell)
+        if json:
+            print(as_json_text(result))
+        else:
+            _print_cell(result)
+        raise Exit(1 if result.faults else 0)
 
 
-def cell_tables(cell: CellCheck) -> Iterator[Table]:
+def _print_cell(cell: CellCheck) -> None:
     """Arms and what a stop asks of them, obstacles, the nearest pairs, and what the hands' controls do."""
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"cell {cell.name}")
+    for table in _cell_tables(cell):
+        console.print(table, soft_wrap=False)
+    for arm, line in (cell.driven or {"arms": "the built-in controller"}).items():
+        console.print(f"{arm} driven by {line}", markup=False)
+    for note in cell.notes:
+        console.print(f"NOTE {note}", markup=False)
+    for fault in cell.faults:
+        console.print(f"FAULT {fault}", style="red", markup=False)
+
+
+def _cell_tables(cell: CellCheck) -> Iterator[Table]:
     for arm in cell.arms:
         flange = "" if arm.flange is None else f", flange {arm.flange}"
         at = " ".join(f"{value:.3f}" for value in arm.tool_position)
         yield figure_table(
             f"{arm.name} arm: {arm.model}{flange}, tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {at} m",
             ("joint", "min [rad]", "home [rad]", "max [rad]", "speed [rad/s]", "torque [Nm]"),
-            ((joint.name, *(f"{value:.3f}" for value in astuple(joint)[1:])) for joint in arm.joints),
+            ((name, *(f"{value:.3f}" for value in values)) for name, *values in map(dict.values, arm.joints)),
         )
     for stop in cell.stop_torques:
         yield figure_table(
@@ -162,25 +161,3 @@ def cell_tables(cell: CellCheck) -> Iterator[Table]:
         ((f"{pair.name_a} | {pair.name_b}", 1e3 * pair.distance, 1e3 * pair.kept) for pair in cell.nearest),
     )
     yield figure_table("controls of each hand", ("control", "does"), cell.controls.items())
-
-
-def _print_cell(cell: CellCheck) -> None:
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(f"cell {cell.name}")
-    for table in cell_tables(cell):
-        console.print(table, soft_wrap=False)
-    for arm, line in (cell.driven or {"arms": "the built-in controller"}).items():
-        console.print(f"{arm} driven by {line}", markup=False)
-    for note in cell.notes:
-        console.print(f"NOTE {note}", markup=False)
-    for fault in cell.faults:
-        console.print(f"FAULT {fault}", style="red", markup=False)
-
-
-def _pair_table(pairs: PairsWritten) -> Table:
-    return figure_table(
-        f"{pairs.file}: {len(pairs.never)} of {len(pairs.never) + len(pairs.watched)} pairs of links stay more than "
-        f"{1e3 * pairs.clearance:g} mm apart",
-        ("pair", "nearest found [mm]"),
-        ((f"{pair.link_a} | {pair.link_b}", 1e3 * pair.nearest) for pair in pairs.never),
-    )

@@ -1,51 +1,44 @@
-"""Output of commands: JSON on stdout, and all else on stderr or as tables."""
+"""Output of commands: JSON on stdout, the summary of a run, and all else on stderr or as tables."""
 
 from __future__ import annotations
 
-import json
 import math
-import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields
 from typing import Annotated, Any
 
-import numpy as np
-import typer
+from pydantic_core import to_json
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
+from typer import Argument, Option
 
+from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import ReasonKind
+from q2r2_control.judging.verdict import Verdict
+from q2r2_control.recording.recorder import RecordingSummary
+from q2r2_control.summary.run_summary import ArmSummary, Percentiles, RunSummary, TorqueSummary
+from q2r2_control.teleop.arm_states import ArmState, is_fault
+from q2r2_control.wording import sentence
 
 _NOTICE_AFTER = 3.0  # [s]
+DEMO_CONFIG = "config/dual_iiwa7.yaml"
+
+ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
+Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
+Task = Annotated[str | None, Option(help="With --record: what is done, noted in the recording.")]
+Operator = Annotated[str | None, Option(help="With --record: whose hands, noted as well.")]
 
 
 def as_json_text(value: Any) -> str:
     """``value`` as strict JSON: dataclasses and mappings as objects, arrays as lists, what is not finite as null."""
-    return json.dumps(_jsonable(value), allow_nan=False)
-
-
-def _jsonable(value: Any) -> Any:
-    if is_dataclass(value) and not isinstance(value, type):
-        return _jsonable(asdict(value))
-    if isinstance(value, Mapping):
-        return {str(key): _jsonable(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_jsonable(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return _jsonable(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def stderr_console() -> Console:
-    """For what is not a command's result."""
-    return Console(stderr=True)
+    return to_json(value, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode()
 
 
 def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:
@@ -59,18 +52,14 @@ def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:
 
 
 def say(line: str, console: Console | None = None, style: str = "") -> None:
-    """Print one line on stderr as it is, however long."""
-    console = console or stderr_console()
-    console.print(line, style=style, soft_wrap=True, highlight=False, markup=False)
+    """Print one line as it is, however long, on stderr or ``console``."""
+    (console or Console(stderr=True)).print(line, style=style, soft_wrap=True, highlight=False, markup=False)
 
 
 @contextmanager
 def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
-    """Show how far a long work has got, where stderr is a terminal.
-
-    The function that it yields takes what is counted (``what`` by default), how many are done, and how many there are.
-    """
-    console = stderr_console()
+    """Show how far a long work has got, where stderr is a terminal, by what it is told: what, how many done, of all."""
+    console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task(what, total=None)
         yield lambda of, done, total: progress.update(task, description=of or what, completed=done, total=total)
@@ -78,16 +67,16 @@ def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
 
 def print_progress(what: str) -> None:
     """Print a line on stderr, where that is a terminal; a live line would need a thread, which adds to times."""
-    console = stderr_console()
+    console = Console(stderr=True)
     if console.is_terminal:
         console.print(what, highlight=False)
 
 
 @contextmanager
-def notice_of_compiling(console: Console) -> Iterator[None]:
+def notice_of_compiling() -> Iterator[None]:
     """Say what takes so long, where building the controller does."""
     text = "building the controller; where its code is new it is compiled for this machine first, 1-2 minutes"
-    timer = threading.Timer(_NOTICE_AFTER, lambda: console.print(text, soft_wrap=True, highlight=False))
+    timer = threading.Timer(_NOTICE_AFTER, say, [text])
     timer.daemon = True
     timer.start()
     try:
@@ -96,25 +85,7 @@ def notice_of_compiling(console: Console) -> Iterator[None]:
         timer.cancel()
 
 
-DEMO_CONFIG = "config/dual_iiwa7.yaml"
-
-ConfigFile = Annotated[str, typer.Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
-Headless = Annotated[bool, typer.Option("--headless", help="No live table, no window.")]
-Viewer = Annotated[bool, typer.Option("--viewer", help="Open MuJoCo's window; closing it ends the run.")]
-Human = Annotated[bool, typer.Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
-Seed = Annotated[int, typer.Option(min=0, help="Of what --human adds.")]
-Record = Annotated[str | None, typer.Option(metavar="DIR", help="Record the run to a new folder in DIR.")]
-RealTime = Annotated[
-    bool,
-    typer.Option("--rt", help="Lock memory and run under SCHED_FIFO; says what the system refuses, and runs anyway."),
-]
-
-Task = Annotated[str | None, typer.Option(help="With --record: what is done, noted in the recording.")]
-Operator = Annotated[str | None, typer.Option(help="With --record: whose hands, noted as well.")]
-
-
-def notes_of(task: str | None, operator: str | None, record: str | None) -> dict[str, str]:
+def notes_of(task: str | None, operator: str | None, record: object) -> dict[str, str]:
     """Notes for a recording. Raises :class:`ConfigError` where there is none."""
     notes = {name: text for name, text in (("task", task), ("operator", operator)) if text is not None}
     for name in notes:
@@ -123,18 +94,11 @@ def notes_of(task: str | None, operator: str | None, record: str | None) -> dict
     return notes
 
 
-def positive(option: str, value: float) -> float:
-    """``value`` [s] of ``option``. Raises :class:`ConfigError` unless it is positive and finite."""
-    if not (math.isfinite(value) and value > 0.0):
+def positive(option: str, value: float | None) -> float | None:
+    """``value`` [s] of ``option``, if one is given. Raises :class:`ConfigError` unless it is positive and finite."""
+    if value is not None and not (math.isfinite(value) and value > 0.0):
         raise ConfigError(f"{option} {value:g}: allowed: a positive number of seconds")
     return value
-
-
-def shows_table(headless: bool, viewer: bool) -> bool:
-    """Whether to show the live table. Raises :class:`ConfigError` where the options exclude each other."""
-    if headless and viewer:
-        raise ConfigError("--headless and --viewer exclude each other")
-    return not headless and sys.stderr.isatty()
 
 
 Cell = Text | str | float | None
@@ -195,3 +159,109 @@ def _shown(cell: Cell) -> Text:
 def _several(value: Any) -> Text:
     values = value if isinstance(value, tuple | list) else (value,)
     return Text(" ".join(_shown(each).plain for each in values))
+
+
+def summary_table(summary: RunSummary) -> Table:
+    """The figures of a run."""
+    table = Table(title="summary", title_justify="left", show_header=False)
+    for name, figures in _rows(summary):
+        table.add_row(name, figures)
+    return table
+
+
+def _rows(summary: RunSummary) -> Iterator[tuple[str, str]]:
+    yield "duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {summary.loop_rate_hz:.0f} Hz"
+    yield "tick", _percentiles(summary.tick_us, "us", 0)
+    if summary.lateness_us.max is not None:
+        late = _percentiles(summary.lateness_us, "us", 0)
+        yield "ticks late by", f"{late}; {summary.overruns} by more than a period"
+    yield "input to command", _percentiles(summary.input_to_command_ms, "ms", 2)
+    for name, arm in summary.arms.items():
+        yield f"{name} arm", ", ".join(_arm_figures(arm))
+        if arm.gripper_held_by is not None:
+            yield f"{name} gripper held for", f"{arm.gripper_held_s:.2f} s, by {' | '.join(arm.gripper_held_by)}"
+        if arm.object_held_s is not None:
+            yield f"{name} object part of the tool for", f"{arm.object_held_s:.2f} s"
+    if summary.min_distance_mm is not None and summary.closest_pair is not None:
+        yield "nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}"
+    velocity, acceleration = (100.0 * ratio for ratio in (summary.max_velocity_ratio, summary.max_acceleration_ratio))
+    yield "velocity, acceleration", f"{velocity:.0f} % of the limits at most, {acceleration:.0f} %"
+    yield "room to position limits", f"{summary.min_position_margin_rad:.3f} rad at least"
+    uncertified = f"{summary.uncertified_ticks} ticks without a certificate"
+    uncertified = f"[red]{uncertified}[/]" if summary.uncertified_ticks else uncertified
+    yield "certified stops executed", f"{summary.fallback_ticks} ticks; {uncertified}"
+    yield "targets rejected", str(summary.rejected_targets)
+    yield "ticks missed", f"{summary.missed_ticks}, which made the motion {summary.stretched_s:.2f} s late in all"
+    # The last event of each arm, if something else than its button paused it, or kept it from being engaged.
+    between = (ArmState.PAUSING, ArmState.ALIGNING)
+    last = {event.arm: event for event in summary.events if event.destination not in between}
+    for name, event in last.items():
+        if is_fault(event):
+            label = f"{name} arm" if event.kind is ReasonKind.NOT_ENGAGED else f"{name} arm paused by"
+            yield label, f"[yellow]{escape(sentence(event.reason))}[/], at {event.t:.2f} s"
+    if summary.torque is not None:
+        yield from _torque_rows(summary.torque)
+    yield "arms at the end", "at rest" if summary.at_rest else "[red]moving[/]"
+
+
+def _arm_figures(arm: ArmSummary) -> Iterator[str]:
+    yield f"engaged {arm.engaged_s:.2f} s"
+    if arm.position_error_mm_rms is not None and arm.rotation_error_deg_rms is not None:
+        yield f"error {arm.position_error_mm_rms:.2f} mm, {arm.rotation_error_deg_rms:.2f} deg RMS"
+    if arm.slip_mm_max > 0.0 or arm.slip_deg_max > 0.0:
+        yield f"target slipped {arm.slip_mm_max:.0f} mm, {arm.slip_deg_max:.0f} deg"
+    if arm.yielded_mm_max > 0.0 or arm.yielded_deg_max > 0.0:
+        yield f"yielded {arm.yielded_mm_max:.0f} mm, {arm.yielded_deg_max:.0f} deg"
+    yield f"gripper changes {arm.gripper_changes}"
+
+
+def task_line(task: TaskResult) -> str:
+    """One line of markup: whether a task succeeded, and what was measured of it."""
+    figures = ", ".join(
+        f"{what.rpartition('_')[0].replace('_', ' ')} {value:.1f} {what.rpartition('_')[2]}"
+        for what, value in task.measured.items()
+    )
+    verdict = "[green]succeeded[/]" if task.succeeded else f"[red]failed[/]: {escape(task.reason)}"
+    return f"{task.name} {verdict} ({figures})"
+
+
+def recording_line(recording: RecordingSummary) -> str:
+    """One line of markup: where a run was recorded, and what is missing of it."""
+    if recording.fault is not None:
+        ended = f"[red]recording ended[/]: {escape(recording.fault)}"
+        return f"{ended}; {recording.ticks} ticks recorded, {recording.lost_ticks} not"
+    found = [f"{recording.ticks} ticks"]
+    if recording.lost_ticks:
+        found.append(f"[red]{recording.lost_ticks} lost[/]: the queue was full")
+    if recording.pictures or recording.lost_pictures or recording.pictures_fault:
+        found.append(f"{recording.pictures} pictures")
+    if recording.lost_pictures:
+        why = recording.pictures_fault or "they could not be taken fast enough"
+        found.append(f"[red]{recording.lost_pictures} lost[/]: {escape(why)}")
+    return f"recording: {escape(str(recording.file))} ({', '.join(found)})"
+
+
+def verdict_markup(verdict: Verdict) -> str:
+    """One line of markup: whether an episode is kept, and why not."""
+    colour = "green" if verdict.keep else "red"
+    return f"[{colour}]{verdict.word}[/]{escape(verdict.line.removeprefix(verdict.word))}"
+
+
+def _torque_rows(torque: TorqueSummary) -> Iterator[tuple[str, str]]:
+    if torque.min_measured_distance_mm is not None and torque.measured_closest_pair is not None:
+        pair = " | ".join(torque.measured_closest_pair)
+        yield "nearest measured pair", f"{torque.min_measured_distance_mm:.1f} mm, {pair}"
+    pressed = ", ".join(" | ".join(pair) for pair in torque.pressed_pairs)
+    force = f": {torque.max_wall_force_n:.0f} N at most" if pressed else ""
+    yield "wall pressed by", f"{pressed or 'no pair'}{force}"
+    limits = f"{torque.saturated_ticks} ticks at a limit, {torque.rate_limited_ticks} at the rate limit"
+    yield "torque", f"{limits}, {torque.held_ticks} held without a measurement"
+    for arm, time in torque.off_reference_s.items():
+        if time > 0.0:
+            yield f"{arm} arm off its reference", f"[red]{time:.2f} s[/] beyond the impedance's error clip"
+
+
+def _percentiles(values: Percentiles, unit: str, digits: int) -> str:
+    if values.p50 is None or values.p99 is None or values.max is None:
+        return "-"
+    return f"median {values.p50:.{digits}f} {unit}, p99 {values.p99:.{digits}f}, max {values.max:.{digits}f}"

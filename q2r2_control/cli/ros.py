@@ -13,6 +13,7 @@ import typer
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
+from typer import Argument, Exit, Option
 
 from q2r2_control.cli.output import (
     DEMO_CONFIG,
@@ -24,7 +25,7 @@ from q2r2_control.cli.output import (
     figure_table,
     notes_of,
     positive,
-    stderr_console,
+    say,
 )
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
@@ -32,10 +33,11 @@ from q2r2_control.ros.launch.build import BuildError, build_interfaces
 from q2r2_control.ros.launch.processes import check_rclpy, nodes_of, run_together
 from q2r2_control.ros.watching.environment import examine_environment
 from q2r2_control.ros.watching.findings import Finding, examine_set
-from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView, TopicView
+from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
-_NOTE = "rates are what the senders say"
+_ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
+_TIME = 4.0  # in which a set is found, and a second publisher too [s]
 
 
 def set_tables(view: SetView, domain: str) -> Group:
@@ -47,13 +49,12 @@ def set_tables(view: SetView, domain: str) -> Group:
     others = (f"others in this domain: {', '.join(view.others)}",) if view.others else ()
     columns = ("node", "rate [Hz]", "age [s]", "level", "says")
     nodes = figure_table("nodes", columns, map(_node_cells, view.nodes), others)
-    topics = figure_table("topics", ("topic", "rate [Hz]", "from", "to"), map(_topic_cells, view.topics), (_NOTE,))
-    return Group(arms, nodes, topics)
-
-
-def arm_lines(view: SetView) -> list[str]:
-    """The same of the arms alone, in a line each."""
-    return [f"{arm.name}: {arm.state or 'no node'}: {arm.why}" for arm in view.arms]
+    rows = (
+        (topic.name, _rounded(topic.rate), _joined(topic.publishers), _joined(topic.subscribers))
+        for topic in view.topics
+    )
+    notes = ("rates are what the senders say",)
+    return Group(arms, nodes, figure_table("topics", ("topic", "rate [Hz]", "from", "to"), rows, notes))
 
 
 def _arm_cells(arm: ArmView) -> tuple[Cell, ...]:
@@ -62,35 +63,28 @@ def _arm_cells(arm: ArmView) -> tuple[Cell, ...]:
 
 
 def _node_cells(node: NodeView) -> tuple[Cell, ...]:
-    rate = node.values.get("loop_rate_hz")
     level = Text(node.level, style=_COLOURS.get(node.level, "default"))
     return (
         node.name.removeprefix("/"),
-        f"{rate:.0f}" if isinstance(rate, int | float) else "",
+        _rounded(node.values.get("loop_rate_hz")),
         f"{node.age:.1f}",
         Text("silent", style="red") if node.age > SILENT else level,
         node.message,
     )
 
 
-def _topic_cells(topic: TopicView) -> tuple[Cell, ...]:
-    rate = "" if topic.rate is None else f"{topic.rate:.0f}"
-    return topic.name, rate, _joined(topic.publishers), _joined(topic.subscribers)
+def _rounded(rate: object) -> str:
+    return f"{rate:.0f}" if isinstance(rate, int | float) else ""
 
 
 def _joined(names: tuple[str, ...]) -> str:
     return ", ".join(name.removeprefix("/") for name in names) or "nobody"
 
 
-_ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
-
-
 def watch(
-    config: Annotated[str, typer.Argument(metavar="[CONFIG]", help="YAML of the cell that runs.")] = DEMO_CONFIG,
-    once: Annotated[bool, typer.Option("--once", help="Print one table after --duration, and end.")] = False,
-    duration: Annotated[
-        float | None, typer.Option(help=f"[s]; without it until Ctrl-C, with --once and --json {_ONCE:g} s.")
-    ] = None,
+    config: Annotated[str, Argument(metavar="[CONFIG]", help="YAML of the cell.")] = DEMO_CONFIG,
+    once: Annotated[bool, Option("--once", help="Print one table after --duration, and end.")] = False,
+    duration: Annotated[float | None, Option(help=f"[s]; {_ONCE:g} with --once or --json, else until Ctrl-C.")] = None,
     json: Json = False,
 ) -> None:
     """Show nodes, topics, rates and ages of a running set, the state of each arm, and why it does not move.
@@ -99,56 +93,46 @@ def watch(
     for an arm whenever that changes. Exit 1 when no node of a set was heard.
     """
     cell = load_config(config)
-    if duration is not None:
-        positive("--duration", duration)
-    elif once or json:
-        duration = _ONCE
+    duration = positive("--duration", duration) or (_ONCE if once or json else None)
     check_rclpy()
-    from q2r2_control.ros.watching.set_listener import watch_set
-
-    domain, stop = os.environ.get("ROS_DOMAIN_ID") or "0", StopRequest()
-    with stop_on_signals(stop.ask):
-        if once or json:
-            view = watch_set(cell, duration, lambda view: None, lambda: stop.asked)
-        else:
-            view = _watch_live(cell, domain, duration, lambda: stop.asked)
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+    view = _watched(cell, duration) if once or json else _watch_live(cell, domain, duration)
     if json:
-        print(
-            as_json_text(
-                {"domain": domain, "arms": view.arms, "nodes": view.nodes, "topics": view.topics, "others": view.others}
-            )
-        )
+        found = {"arms": view.arms, "nodes": view.nodes, "topics": view.topics, "others": view.others}
+        print(as_json_text({"domain": domain, **found}))
     else:
         Console().print(set_tables(view, domain))
-    raise typer.Exit(0 if view.nodes else 1)
+    raise Exit(0 if view.nodes else 1)
 
 
-def _watch_live(cell: Config, domain: str, duration: float | None, stop: Callable[[], bool]) -> SetView:
+def _watched(cell: Config, duration: float | None, show: Callable[[SetView], None] = lambda view: None) -> SetView:
     from q2r2_control.ros.watching.set_listener import watch_set
 
-    console = stderr_console()
+    stop = StopRequest()
+    with stop_on_signals(stop.ask):
+        return watch_set(cell, duration, show, lambda: stop.asked)
+
+
+def _watch_live(cell: Config, domain: str, duration: float | None) -> SetView:
+    console = Console(stderr=True)
     if not console.is_terminal:
-        said: dict[int, str] = {}
+        said: dict[str, str] = {}
 
         def tell(view: SetView) -> None:
-            for index, line in enumerate(arm_lines(view)):
-                if said.get(index) != (words := re.sub(r"[\d.]+", "", line)):  # an age changes all the time
-                    said[index] = words
-                    console.print(line, soft_wrap=True, highlight=False, markup=False)
+            for arm in view.arms:
+                line = f"{arm.name}: {arm.state or 'no node'}: {arm.why}"
+                if said.get(arm.name) != (words := re.sub(r"[\d.]+", "", line)):  # an age changes all the time
+                    said[arm.name] = words
+                    say(line, console)
 
-        return watch_set(cell, duration, tell, stop)
+        return _watched(cell, duration, tell)
     with Live(console=console, auto_refresh=False, transient=True) as live:
-        return watch_set(cell, duration, lambda view: live.update(set_tables(view, domain), refresh=True), stop)
-
-
-_TIME = 4.0  # in which a set is found, and a second publisher too [s]
+        return _watched(cell, duration, lambda view: live.update(set_tables(view, domain), refresh=True))
 
 
 def doctor(
-    config: Annotated[
-        str, typer.Argument(metavar="[CONFIG]", help="YAML of the cell that runs, or is to.")
-    ] = DEMO_CONFIG,
-    duration: Annotated[float, typer.Option(help="How long to listen to what runs [s].")] = _TIME,
+    config: Annotated[str, Argument(metavar="[CONFIG]", help="YAML of the cell.")] = DEMO_CONFIG,
+    duration: Annotated[float, Option(help="How long to listen to what runs [s].")] = _TIME,
     json: Json = False,
 ) -> None:
     """Say what of ROS is missing, which domain and middleware are used, which nodes run and what is wrong with them.
@@ -160,25 +144,19 @@ def doctor(
     cell = load_config(config)
     expected = [node.name for node in nodes_of(config, "none", separate=True)]
     facts, findings = examine_environment(os.environ)
-    nodes: tuple[str, ...] = ()
-    others: tuple[str, ...] = ()
+    nodes, others = list[str](), tuple[str, ...]()
     if not any(finding.stops_arms for finding in findings):
-        from q2r2_control.ros.watching.set_listener import watch_set
-
-        stop = StopRequest()
-        with stop_on_signals(stop.ask):
-            view = watch_set(cell, duration, lambda view: None, lambda: stop.asked)
-        nodes, others = tuple(node.name for node in view.nodes), view.others
+        view = _watched(cell, duration)
+        nodes, others = [node.name for node in view.nodes], view.others
         findings += examine_set(view, expected)
     stops = any(finding.stops_arms for finding in findings)
     if json:
         print(as_json_text({**facts, "nodes": nodes, "others": others, "findings": findings, "stops_arms": stops}))
     else:
-        _print(
-            facts | {"nodes": ", ".join(nodes) or "none of a set runs", "others": ", ".join(others) or "none"}, findings
-        )
+        running = {"nodes": ", ".join(nodes) or "none of a set runs", "others": ", ".join(others) or "none"}
+        _print({**facts, **running}, findings)
     sys.stdout.flush()
-    raise typer.Exit(int(stops))
+    raise Exit(int(stops))
 
 
 def _print(facts: dict[str, str], findings: list[Finding]) -> None:
@@ -208,7 +186,7 @@ class RobotSource(StrEnum):
 
 @app.command("build-interfaces", epilog="Example: q2r2 ros build-interfaces")
 def build_interfaces_command(
-    force: Annotated[bool, typer.Option("--force", help="Build again what this environment holds.")] = False,
+    force: Annotated[bool, Option("--force", help="Build again what this environment holds.")] = False,
 ) -> None:
     """Build the message packages that cannot be imported: quest2ros, and tf2_msgs and control_msgs where missing.
 
@@ -218,27 +196,16 @@ def build_interfaces_command(
         build_interfaces(lambda line: print(line, flush=True), force)
     except BuildError as error:
         print(f"q2r2: {error}", file=sys.stderr)
-        raise typer.Exit(1) from None
+        raise Exit(1) from None
 
 
 @app.command(epilog="Example: q2r2 ros up config/dual_iiwa7.yaml --input headset")
 def up(
-    config: Annotated[str, typer.Argument(metavar="CONFIG", help="YAML of the cell.")],
-    input: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="An installed input, or none: another node sends the hands."),
-    ] = None,
-    robot: Annotated[
-        RobotSource,
-        typer.Option(help="Simulated, or one that is there; auto: mujoco for controller: builtin."),
-    ] = RobotSource.AUTO,
-    record: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Record what the nodes publish to a new folder in DIR.")
-    ] = None,
-    separate: Annotated[
-        bool,
-        typer.Option("--separate", help="A process for each arm: a hand then stops and homes its own arm only."),
-    ] = False,
+    config: Annotated[str, Argument(metavar="CONFIG", help="YAML of the cell.")],
+    input: Annotated[str | None, Option(metavar="NAME", help="An installed input, or none for another node.")] = None,
+    robot: Annotated[RobotSource, Option(help="auto: mujoco for controller: builtin, else none.")] = RobotSource.AUTO,
+    record: Annotated[str | None, Option(metavar="DIR", help="Record all topics to a new folder in DIR.")] = None,
+    separate: Annotated[bool, Option("--separate", help="A process an arm, which its hand alone stops.")] = False,
     task: Task = None,
     operator: Operator = None,
 ) -> None:
@@ -251,4 +218,4 @@ def up(
     notes = notes_of(task, operator, record)
     recording = None if record is None else {"folder": record, **notes}
     nodes = nodes_of(config, input, robot.value, recording, separate)
-    raise typer.Exit(run_together(nodes, lambda line: print(line, flush=True)))
+    raise Exit(run_together(nodes, lambda line: print(line, flush=True)))

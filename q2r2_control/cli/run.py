@@ -1,52 +1,53 @@
-"""``q2r2 run``: a cell with an input and a plant of the user's choice."""
+"""``q2r2 run``: a cell with an input and a plant of the user's choice.
+
+``q2r2 demo``: simulated assembly work; ``q2r2 headset-check``: what a headset sends.
+"""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from rich.console import Console
+from typer import Argument, Exit, Option
 
-from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
-from q2r2_control.cli.headset_check import Host, Port, with_address
-from q2r2_control.cli.output import (
-    ConfigFile,
-    Headless,
-    Human,
-    Json,
-    Operator,
-    RealTime,
-    Record,
-    Seed,
-    Task,
-    Viewer,
-    notes_of,
-    positive,
-    shows_table,
-    stderr_console,
-)
-from q2r2_control.config.cell import load_config
+from q2r2_control.cli.cell_run import AnnouncedHeadset, RunOptions, print_summary, run_cell
+from q2r2_control.cli.output import DEMO_CONFIG, ConfigFile, Json, Operator, Task, notes_of, positive, print_report
+from q2r2_control.config.cell import Config, HeadsetConfig, load_config
+from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
 from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import DEFAULT_TRAJECTORY
-from q2r2_control.inputs.trajectories import TRAJECTORIES
+from q2r2_control.inputs.trajectories import TRAJECTORIES, trajectory_named
 from q2r2_control.plugins import INPUTS, check_installed
+from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.types import CommandMode
+from q2r2_control.viewer.headset_table import headset_display, headset_table
+
+_TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
+_ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
+
+Fast = Annotated[bool, Option("--fast", help="Simulated time, as fast as it can, repeatable.")]
+Headless = Annotated[bool, Option("--headless", help="No live table, no window.")]
+Viewer = Annotated[bool, Option("--viewer", help="Open MuJoCo's window; closing it ends the run.")]
+Human = Annotated[bool, Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
+Seed = Annotated[int, Option(min=0, help="Of what --human adds.")]
+Record = Annotated[Path | None, Option(metavar="DIR", help="Record the run to a new folder in DIR.")]
+RealTime = Annotated[bool, Option("--rt", help="Lock memory and run under SCHED_FIFO, as far as permitted.")]
+
+Host = Annotated[str | None, Option(help="Address to bind, not the config's; 0.0.0.0: all, :: IPv6 too.")]
+Port = Annotated[int | None, Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
 
 
 def run(
     config: ConfigFile,
-    input: Annotated[
-        str | None, typer.Option(metavar="NAME", help="An installed input; without it, the cell's.")
-    ] = None,
-    plant: Annotated[
-        str | None, typer.Option(metavar="NAME", help="An installed plant; without it, the cell's.")
-    ] = None,
-    mode: Annotated[CommandMode, typer.Option(help="What the plant gets; torque: arms that yield.")] = (
-        CommandMode.POSITION
-    ),
-    duration: Annotated[float | None, typer.Option(help="[s]; without it, until Ctrl-C.")] = None,
-    fast: Annotated[bool, typer.Option("--fast", help="Simulated time, as fast as it can, repeatable.")] = False,
-    trajectory: Annotated[str | None, typer.Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
+    input: Annotated[str | None, Option(metavar="NAME", help="An installed input; by default the cell's.")] = None,
+    plant: Annotated[str | None, Option(metavar="NAME", help="An installed plant; by default the cell's.")] = None,
+    mode: Annotated[CommandMode, Option(help="What the plant gets; torque: arms that yield.")] = (CommandMode.POSITION),
+    duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
+    fast: Fast = False,
+    trajectory: Annotated[str | None, Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
     human: Human = False,
     seed: Seed = 0,
     host: Host = None,
@@ -57,7 +58,7 @@ def run(
     record: Record = None,
     task: Task = None,
     operator: Operator = None,
-    force: Annotated[bool, typer.Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
+    force: Annotated[bool, Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
     json: Json = False,
 ) -> None:
     """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
@@ -76,25 +77,110 @@ def run(
             raise ConfigError(f"{option} cannot be used with --input {source}")
     if fast and duration is None:
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
-    if fast and rt:
-        raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
-    notes = notes_of(task, operator, record)
-    cell = with_address(cell, host, port)
+    _check_times(fast, rt)
     options = RunOptions(
         name=cell.name,
         input=source,
         plant=plant or cell.plant,
         mode=mode.value,
-        duration=None if duration is None else positive("--duration", duration),
+        duration=positive("--duration", duration),
         fast=fast,
         trajectory=trajectory or DEFAULT_TRAJECTORY,
         human=human,
         seed=seed,
-        table=shows_table(headless, viewer),
+        table=_shows_table(headless, viewer),
         window=viewer,
         force=force,
         real_time=rt,
-        record=None if record is None else Path(record),
-        notes=notes,
+        record=record,
+        notes=notes_of(task, operator, record),
     )
-    print_summary(run_cell(cell, options, stderr_console()), json)
+    print_summary(run_cell(with_address(cell, host, port), options), json)
+
+
+def demo(
+    tasks: Annotated[list[str] | None, Argument(metavar=_TASKS, help=f"By default handover stack. {_ABOUT}.")] = None,
+    mode: Annotated[CommandMode, Option(help="What the arms get; torque: arms that yield.")] = CommandMode.TORQUE,
+    duration: Annotated[float | None, Option(help="Ends earlier [s].")] = None,
+    fast: Fast = False,
+    viewer: Viewer = False,
+    headless: Headless = False,
+    human: Human = False,
+    seed: Seed = 0,
+    record: Record = None,
+    rt: RealTime = False,
+    json: Json = False,
+) -> None:
+    """Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted hands.
+
+    Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
+    With --record, whether all succeeded is in the recording, of which q2r2 report makes plots.
+    """
+    _check_times(fast, rt)
+    chosen = tasks_named(tasks or ("handover", "stack"))
+    trajectory = "+".join(task.name for task in chosen)
+    options = RunOptions(
+        name="demo",
+        input="scripted",
+        plant="mujoco",
+        mode=mode.value,
+        duration=positive("--duration", duration) or trajectory_named(trajectory).duration,
+        fast=fast,
+        trajectory=trajectory,
+        human=human,
+        seed=seed,
+        table=_shows_table(headless, viewer),
+        window=viewer,
+        real_time=rt,
+        tasks=chosen,
+        record=record,
+        notes={"task": "; ".join(task.about for task in chosen)},
+    )
+    done = run_cell(load_config(DEMO_CONFIG), options)
+    print_summary(done, json)
+    if not all(task.succeeded for task in done.tasks):
+        raise Exit(1)
+
+
+def _check_times(fast: bool, rt: bool) -> None:
+    if fast and rt:
+        raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
+
+
+def _shows_table(headless: bool, viewer: bool) -> bool:
+    if headless and viewer:
+        raise ConfigError("--headless and --viewer exclude each other")
+    return not headless and sys.stderr.isatty()
+
+
+def with_address(config: Config, host: str | None, port: int | None) -> Config:
+    """The config with another address for the headset to connect to."""
+    given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
+    return config.model_copy(update={"headset": HeadsetConfig(**(config.headset.model_dump() | given))})
+
+
+def headset_check(
+    config: Annotated[str, Argument(metavar="[CONFIG]", help="Whose address and teleop.axes to use.")] = (DEMO_CONFIG),
+    host: Host = None,
+    port: Port = None,
+    duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
+    json: Json = False,
+) -> None:
+    """Show what a headset sends: connection, rates, ages, last values, and which way each hand moves.
+
+    Move a hand forwards, to the left, up: where the words do not agree, change teleop.axes in the config.
+    Exit 1 unless poses and inputs came of every hand that leads an arm; without both, run has nothing to engage.
+    """
+    cell, console = with_address(load_config(config), host, port), Console(stderr=True)
+    positive("--duration", duration)
+    server, stop = AnnouncedHeadset(cell, console), StopRequest()
+    # From before the announcement on. KeyboardInterrupt would be lost where it comes in the middle of a finaliser.
+    with stop_on_signals(stop.ask):
+        server.start()
+        try:
+            with headset_display(console) as show:
+                check = watch_headset(server, cell, duration, show, lambda: stop.asked)
+        finally:
+            server.close()
+    print_report(check.as_json(), (headset_table(check),), json)
+    raise Exit(1 if check.missing else 0)

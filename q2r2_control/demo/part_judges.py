@@ -1,22 +1,18 @@
-"""Judges of work in simulation: they look at what happens to the parts, not at how hands or arms move.
-
-So an operator with a headset is judged like a script.
-"""
+"""Judges of work in simulation: they look at the parts alone, so an operator with a headset is judged like a script."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntFlag
 from itertools import pairwise
 
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 
 
-class Toucher(IntFlag):
-    """Bodies that may touch a part."""
+class Toucher:
+    """Bodies that may touch a part, as flags."""
 
     NOTHING = 0
     SURROUNDINGS = 1  # table, floor, and whatever else stands still
@@ -37,24 +33,22 @@ class PartState:
 
     place: tuple[float, float, float]  # of its centre in the world [m]
     tilt: float  # of its own z axis from the world's [rad]
-    touched: int  # by what, as :class:`Toucher`
+    touched: int  # by what: flags of :class:`Toucher`
 
 
 class TouchWatch:
-    """Looks at loose parts of a simulated cell, and remembers every touch of an arm that is not a grasp.
-
-    Called at every tick of the control loop: plain numbers in Python cost less here than arrays.
-    """
+    """Looks at loose parts of a simulated cell, and remembers every touch of an arm that is not a grasp."""
 
     def __init__(self, plant: MujocoPlant, robot: Robot, parts: Sequence[str], objects: Sequence[str]) -> None:
         """``parts`` are looked at, ``objects`` are all that fingers may touch; names of ``mujoco.objects``."""
         self._model, self._data = plant.model, plant.data
         loose = {self._model.body(name).id for name in objects}
         self._parts = {name: int(self._model.body(name).id) for name in parts}
-        bodies: list[int] = self._model.geom_bodyid.tolist()
-        self._body = bodies
-        self._kinds = [int(Toucher.PART if body in loose else self._kind(body, robot)) for body in bodies]
-        self._is_grasp = [not both & _ROBOT or (both & ~FINGERS) == Toucher.PART for both in range(2 * max(Toucher))]
+        self._body: list[int] = self._model.geom_bodyid.tolist()
+        self._kinds = [Toucher.PART if body in loose else self._kind(body, robot) for body in self._body]
+        self._is_grasp = [
+            not both & _ROBOT or (both & ~FINGERS) == Toucher.PART for both in range(2 * Toucher.RIGHT_FINGER)
+        ]
         self.forbidden: dict[tuple[str, str], float] = {}  # names of two bodies -> when they touched first [s]
 
     def look(self, t: float) -> dict[str, PartState]:
@@ -75,7 +69,7 @@ class TouchWatch:
             for name, part in self._parts.items()
         }
 
-    def _kind(self, body: int, robot: Robot) -> Toucher:
+    def _kind(self, body: int, robot: Robot) -> int:
         """Of what is no part: by the joints that move it, from its own up to the world's."""
         above = body
         while above:
@@ -100,7 +94,6 @@ _FALL = 0.005  # without a finger on it, deeper than a part that is put down [m]
 _PUT_BACK = (0.01, 0.001)  # from where it was, sideways and in height [m]
 _STACKED = (0.01, 0.001)  # from the middle of the part below, sideways and in height [m]
 _UPRIGHT = math.radians(2.0)
-_FINGERS = int(FINGERS)  # an IntFlag takes ten times as long for an "and", and several judges ask at every tick
 
 
 class Judge:
@@ -115,7 +108,7 @@ class Judge:
         """Take the state of all parts, ``dt`` [s] after the last."""
         for name in self.parts:
             height = parts[name].place[2]
-            if parts[name].touched & _FINGERS:
+            if parts[name].touched & FINGERS:
                 self._held_at[name] = height
             self._fell[name] = max(self._fell[name], self._held_at.get(name, height) - height)
 
@@ -141,18 +134,17 @@ class LiftJudge(Judge):
         self._away = (0.0, 0.0)  # from the start, sideways and in height [m]
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
-        """See :meth:`Judge.see`."""
         if self._lain >= HELD_TIME:
             return
         super().see(dt, parts)
         part = parts[self.parts[0]]
         self._start = self._start or part.place
         self._away = math.dist(part.place[:2], self._start[:2]), part.place[2] - self._start[2]
-        up = part.touched and not part.touched & ~_FINGERS and self._away[1] >= _LIFT
+        up = part.touched and not part.touched & ~FINGERS and self._away[1] >= _LIFT
         self._held = self._held + dt if up else 0.0
         self._longest = max(self._longest, self._held)
         self._height = max(self._height, self._away[1])
-        back = self._longest >= HELD_TIME and self._is_back and not part.touched & _FINGERS
+        back = self._longest >= HELD_TIME and self._is_back and not part.touched & FINGERS
         self._lain = self._lain + dt if back else 0.0
 
     @property
@@ -160,13 +152,11 @@ class LiftJudge(Judge):
         return self._away[0] <= _PUT_BACK[0] and abs(self._away[1]) <= _PUT_BACK[1]
 
     def measured(self) -> dict[str, float]:
-        """See :meth:`Judge.measured`."""
         away = 1e3 * math.hypot(*self._away)
         found = {"lifted_mm": 1e3 * self._height, "held_s": self._longest, "put_back_mm": away}
         return found | super().measured()
 
     def faults(self) -> list[str]:
-        """See :meth:`Judge.faults`."""
         faults, part = super().faults(), self.parts[0]
         if self._longest < HELD_TIME:
             faults.append(f"{part}: held {1e3 * _LIFT:.0f} mm up for {self._longest:.1f} s, not {HELD_TIME:g} s")
@@ -185,7 +175,6 @@ class StackJudge(Judge):
         self._stood = self._sideways = self._tilt = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
-        """See :meth:`Judge.see`."""
         super().see(dt, parts)
         tower = [parts[name] for name in self.parts]
         self._tilt = max(part.tilt for part in tower)
@@ -193,16 +182,14 @@ class StackJudge(Judge):
         gaps = [upper.place[2] - lower.place[2] for lower, upper in pairwise(tower)]
         off = max(abs(gap - rest) for gap, rest in zip(gaps, self._rest, strict=True))
         stands = self._sideways <= _STACKED[0] and off <= _STACKED[1] and self._tilt <= _UPRIGHT
-        untouched = not any(part.touched & _FINGERS for part in tower)
+        untouched = not any(part.touched & FINGERS for part in tower)
         self._stood = self._stood + dt if stands and untouched else 0.0
 
     def measured(self) -> dict[str, float]:
-        """See :meth:`Judge.measured`."""
         tilt = math.degrees(self._tilt)
         return {"stood_s": self._stood, "off_centre_mm": 1e3 * self._sideways, "tilt_deg": tilt} | super().measured()
 
     def faults(self) -> list[str]:
-        """See :meth:`Judge.faults`."""
         faults = super().faults()
         if self._stood < HELD_TIME:
             tower = " on ".join(reversed(self.parts))
@@ -213,14 +200,13 @@ class StackJudge(Judge):
 class HandoverJudge(Judge):
     """One hand holds a part in the air, then both, then the other one alone, 100 mm away for a second."""
 
-    def __init__(self, part: str, giver: Toucher, taker: Toucher) -> None:
+    def __init__(self, part: str, giver: int, taker: int) -> None:
         super().__init__(part)
         self._giver, self._taker = giver, taker
         self._by_giver = self._by_both = self._alone = self._longest = self._farthest = 0.0
         self._given: tuple[float, float, float] | None = None  # where the giver let go
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
-        """See :meth:`Judge.see`."""
         super().see(dt, parts)
         part, away = parts[self.parts[0]], 0.0
         if part.touched == self._giver:
@@ -235,13 +221,11 @@ class HandoverJudge(Judge):
         self._longest = max(self._longest, self._alone)
 
     def measured(self) -> dict[str, float]:
-        """See :meth:`Judge.measured`."""
         held = {"held_by_giver_s": self._by_giver, "held_by_both_s": self._by_both}
         carried = {"carried_mm": 1e3 * self._farthest, "held_by_taker_s": self._longest}
         return held | carried | super().measured()
 
     def faults(self) -> list[str]:
-        """See :meth:`Judge.faults`."""
         faults = super().faults()
         if self._longest < HELD_TIME:
             held = f"held by the taker alone, {1e3 * _CARRY:.0f} mm away, for {self._longest:.1f} s"

@@ -1,1 +1,1 @@
-"""The process that runs a loop: signals, scheduling, and folders for its files."""
+"""The process that runs a loop."""

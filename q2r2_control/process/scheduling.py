@@ -1,6 +1,6 @@
-"""Real-time scheduling for a loop that must not be late: memory stays in RAM, and its threads go first.
+"""The process that runs a loop: real-time scheduling, signals, and folders for its files.
 
-Both need a permission. Without it a run goes on as it would have, so what was refused is a line and no error.
+Real time needs permissions. Without them a run goes on as it would have: a refusal is a line and no error.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def real_time() -> Iterator[str | None]:
     finally:
         if sys.platform == "linux":
             ctypes.CDLL(None).munlockall()
-        _schedule_as_others([0])
+            _schedule_as_others([0])
 
 
 def schedule_process_first(priority: int) -> str | None:
@@ -67,11 +67,9 @@ def _lock_memory() -> str | None:
         return "memory is not locked: only done on Linux"
     import resource  # not on every system
 
-    flags = _CURRENT
     # Under a limit, memory that is asked for later would be refused in mid-run instead of being left unlocked.
-    if os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY:
-        flags |= _FUTURE
-    if ctypes.CDLL(None, use_errno=True).mlockall(flags) == 0:
+    unlimited = os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+    if ctypes.CDLL(None, use_errno=True).mlockall(_CURRENT | _FUTURE if unlimited else _CURRENT) == 0:
         return None
     return f"memory is not locked: {os.strerror(ctypes.get_errno())}"
 
@@ -90,8 +88,6 @@ def _schedule_first(threads: Iterable[int], priority: int) -> str | None:
 
 
 def _schedule_as_others(threads: Iterable[int]) -> None:
-    if sys.platform != "linux":
-        return
     # Only a privileged process may take the flag back; others keep it, where it does nothing more.
     for thread in threads:
         for policy in (os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER):
@@ -108,21 +104,17 @@ def new_folder(parent: Path, name: str, what: str) -> Path:
         folder = parent / (name + suffix)
         try:
             folder.mkdir(parents=True)
-        except FileExistsError as error:
-            if not folder.exists():  # a parent is a file
-                raise ConfigError(f"{what} {folder}: {error.strerror}") from error
-            continue
+            return folder
         except OSError as error:
-            raise ConfigError(f"{what} {folder}: {error.strerror}") from error
-        return folder
+            if not (isinstance(error, FileExistsError) and folder.exists()):  # a parent may be a file
+                raise ConfigError(f"{what} {folder}: {error.strerror}") from error
     raise ConfigError(f"{what} {parent / name}: exists, and so do 98 numbered ones")
 
 
 class StopRequest:
     """A flag that a signal handler sets and a loop reads.
 
-    A plain attribute: the lock of a ``threading.Event`` is not reentrant, so a signal that comes in the middle of
-    another one's handler would wait for it for ever, and the process with it.
+    A plain attribute: with the lock of a ``threading.Event``, a signal in another one's handler would wait for ever.
     """
 
     asked = False
@@ -154,7 +146,7 @@ def how_it_ended(what: str, code: int) -> str:
 
 @contextmanager
 def few_garbage_collections() -> Iterator[None]:
-    """Exclude all existing objects from garbage collection, which would otherwise take several ticks each time."""
+    """Exclude all existing objects from garbage collection, which would take several ticks each time."""
     gc.collect()
     gc.freeze()
     try:

@@ -19,12 +19,11 @@ class Request(NamedTuple):
     """Targets of one tick."""
 
     targets: dict[str, Any]
-    unusable: frozenset[str]  # arms whose target has to be reported as rejected
+    unusable: frozenset[str] = frozenset()  # arms whose target has to be reported as rejected
 
 
 # From the tick within the segment and the last reference's joint positions (nv,) to the request.
 Stream = Callable[[int, Array], Request]
-_NONE: frozenset[str] = frozenset()
 _TABLE = 0.2  # height of the top that is pressed on, as in the shipped cells [m]
 _TICK = 0.001  # that motions at work are played at [s]
 # Of the settings at the start, what gains change to; arms that separation slows long before contact test little.
@@ -39,22 +38,8 @@ class Adversary:
     """Draws streams for the arms of one robot. Every name in :attr:`names` is a method that makes one."""
 
     names = (
-        "hold",
-        "stay_home",
-        "teleport",
-        "crossing",
-        "same_point",
-        "unreachable",
-        "into_the_table",
-        "random_walk",
-        "garbage",
-        "missing_arms",
-        "elbow",
-        "chatter",
-        "shaking",
-        "postures",
-        "work",
-        "pressing",
+        *("hold", "stay_home", "teleport", "crossing", "same_point", "unreachable", "into_the_table", "random_walk"),
+        *("garbage", "missing_arms", "elbow", "chatter", "shaking", "postures", "work", "pressing"),
     )
 
     def __init__(self, robot: Robot, random: np.random.Generator) -> None:
@@ -74,7 +59,7 @@ class Adversary:
         return pin.SE3(pin.exp3(self._random.normal(size=3) * 1.5), self._random.uniform(*_WORKSPACE))
 
     def _constant(self, targets: dict[str, Any]) -> Stream:
-        request = Request(targets, _NONE)
+        request = Request(targets)
         return lambda tick, q: request
 
     def _poses(self) -> dict[str, Any]:
@@ -105,12 +90,12 @@ class Adversary:
         return self._renewed(int(self._random.integers(100, 1500)), poses)
 
     def _renewed(self, period: int, poses: Callable[[], dict[str, Any]]) -> Stream:
-        request = Request({}, _NONE)
+        request = Request({})
 
         def stream(tick: int, q: Array) -> Request:
             nonlocal request
             if tick % period == 0:
-                request = Request(poses(), _NONE)
+                request = Request(poses())
             return request
 
         return stream
@@ -142,7 +127,7 @@ class Adversary:
                 back = 0.002 * (self._home[arm].translation - pose.translation)
                 rotation = pin.exp3(turn * self._random.normal(size=3)) @ pose.rotation
                 poses[arm] = pin.SE3(rotation, pose.translation + back + speed * self._random.normal(size=3))
-            return Request(dict(poses), _NONE)
+            return Request(dict(poses))
 
         return stream
 
@@ -183,7 +168,7 @@ class Adversary:
 
         def stream(tick: int, q: Array) -> Request:
             present = {arm: pose for arm, pose in poses.items() if self._random.random() < 0.7}
-            return Request(present | {arm: None for arm in self._arms if self._random.random() < 0.2}, _NONE)
+            return Request(present | {arm: None for arm in self._arms if self._random.random() < 0.2})
 
         return stream
 
@@ -191,7 +176,7 @@ class Adversary:
         """One tool reaches for the elbow or wrist of another arm, which moves elsewhere."""
         chaser = str(self._random.choice(self._arms))
         joint = int(self._robot.arms[self._others[chaser]].joints[3 if self._random.random() < 0.5 else 5]) + 1
-        request = Request({}, _NONE)
+        request = Request({})
         elsewhere = self._poses()
 
         def stream(tick: int, q: Array) -> Request:
@@ -199,14 +184,14 @@ class Adversary:
             if tick % 10 == 0:
                 pin.forwardKinematics(self._robot.model, self._data, q)
                 there = pin.SE3(self._home[chaser].rotation, self._data.oMi[joint].translation.copy())
-                request = Request(elsewhere | {chaser: there}, _NONE)
+                request = Request(elsewhere | {chaser: there})
             return request
 
         return stream
 
     def _chatter(self) -> Stream:
         """Back and forth at every tick."""
-        pair = [Request(self._poses(), _NONE), Request(self._poses(), _NONE)]
+        pair = [Request(self._poses()) for _ in range(2)]
         return lambda tick, q: pair[tick % 2]
 
     def _shaking(self) -> Stream:
@@ -216,7 +201,7 @@ class Adversary:
 
         def stream(tick: int, q: Array) -> Request:
             by = size * np.sin(rate * tick) * along
-            return Request(self._moved(lambda: by), _NONE)
+            return Request(self._moved(lambda: by))
 
         return stream
 
@@ -226,7 +211,7 @@ class Adversary:
             return self._shaking()
         motion = tuple(WORK_MOTIONS.values())[int(self._random.integers(len(WORK_MOTIONS)))]
         begins, speed = self._random.uniform(0.0, motion.rests), self._random.uniform(0.3, 3.0) * _TICK
-        return lambda tick, q: Request(dict(motion.targets(begins + speed * tick, self._home)), _NONE)
+        return lambda tick, q: Request(dict(motion.targets(begins + speed * tick, self._home)))
 
     def _pressing(self) -> Stream:
         """Down onto the table, or hand against hand, sliding about meanwhile."""
@@ -239,7 +224,7 @@ class Adversary:
             for arm, pose in self._home.items():
                 goal = [*pose.translation[:2], _TABLE - depth] if down else place
                 poses[arm] = pin.SE3(pose.rotation, np.array(goal) + slide)
-            return Request(poses, _NONE)
+            return Request(poses)
 
         return stream
 

@@ -1,7 +1,6 @@
 """The contract of the Cartesian controller, checked at every tick from its references alone.
 
-One checker for tests, soaks and live runs: :meth:`Contract.check` raises at the first promise that is broken,
-:meth:`Contract.observe` only keeps the worst margin of each.
+:meth:`Contract.check` raises at the first promise that is broken, :meth:`Contract.observe` keeps the worst margins.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport
-from q2r2_control.verification.measured_distances import MeasuredDistances
-from q2r2_control.verification.promises import PROMISES, RELATIVE, Margin
+from q2r2_control.verification.promises import PROMISES, RELATIVE, Margin, MeasuredDistances
 
 _NEWEST = 5000  # ticks whose accelerations are kept
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the numbers
@@ -59,8 +57,8 @@ class Contract:
         self._broken: dict[str, float] = {}
         robot, settings = controller.robot, controller.settings
         self._controller = controller
-        self._robot, self._random = robot, np.random.default_rng(0) if random is None else random
-        self._sample_all = sample_all
+        self._robot, self._sample_all = robot, sample_all
+        self._random = np.random.default_rng(0) if random is None else random
         self._a = robot.capped_acceleration(settings.acceleration_limit)
         self._v_max = robot.velocity_limit * settings.velocity_scale
         self._lower = robot.position_lower + settings.position_margin
@@ -89,10 +87,7 @@ class Contract:
         self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # duration [s], duration times |a|^2
 
     def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
-        """The controller has accepted ``openings``: its fingers are others, and ``before_step`` its stop may be.
-
-        Who is told of references only, and so is late, leaves the stop as the last reference had it.
-        """
+        """The controller has accepted ``openings``. If only its references tell so, this is not ``before_step``."""
         if before_step:
             self._stop = self._controller.stop_deceleration
         self._measured.set_openings(openings)
@@ -124,8 +119,7 @@ class Contract:
         self, reference: Reference, dt: Any, unusable: frozenset[str] | None = None, failed: bool = False
     ) -> None:
         """Like :meth:`observe`. Raises :class:`AssertionError` with the broken promises and the values seen."""
-        broken = self.observe(reference, dt, unusable, failed)
-        if broken:
+        if broken := self.observe(reference, dt, unusable, failed):
             found = "; ".join(self.margins[key].described(value) for key, value in broken.items())
             raise AssertionError(f"tick {self.ticks - 1}: {found}")
 
@@ -152,14 +146,17 @@ class Contract:
             else:
                 self._check_motion(q, v, reference.a, h)
                 if failed:
-                    self._check_stopped(q, v, h, report.fallback)
+                    self._note("not_stopped", self._off_the_stop(q, v, h))
+                    self._note("unsaid", float(not report.fallback))
             self._check_limits(q, v)
             self._check_distance(self._measured.reported_margin(report), report.certified)
             stop = self._controller.stop_deceleration
             self._note("deceleration", float((stop / self._a).max()))
             self._note_objects()
             self._sample(q, v, stop, h, report)
-            self._count(reference, h)
+            self.fallbacks += report.fallback
+            self.uncertified += not report.certified
+            self._newest.append((h, h * float(reference.a @ reference.a)))
             self._q, self._v, self._stop = q, v, stop
         self.ticks += 1
         return self._broken
@@ -183,11 +180,6 @@ class Contract:
         """Share of ticks that did not execute the solver's solution."""
         return self.fallbacks / max(self.ticks, 1)
 
-    def _count(self, reference: Reference, h: float) -> None:
-        self.fallbacks += reference.report.fallback
-        self.uncertified += not reference.report.certified
-        self._newest.append((h, h * float(reference.a @ reference.a)))
-
     def _note(self, key: str, value: float) -> None:
         if not self.margins[key].note(value, self.ticks):
             self._broken[key] = value
@@ -201,10 +193,6 @@ class Contract:
         if h <= self._substep:
             self._parabola = bool(np.abs(self._q + 0.5 * h * (self._v + v) - q).max() <= 1e-11)
             self._note("parabola", 0.0 if self._parabola else self._off_the_stop(q, v, h))
-
-    def _check_stopped(self, q: Array, v: Array, h: float, fallback: bool) -> None:
-        self._note("not_stopped", self._off_the_stop(q, v, h))
-        self._note("unsaid", float(not fallback))
 
     def _off_the_stop(self, q: Array, v: Array, h: float) -> float:
         """How far a tick of ``h`` [s] was from the stop that was known before it."""
@@ -269,7 +257,11 @@ class Contract:
             if not self._certain and self._apart.any():
                 self._note("bystanders", float(margins[self._apart].min()))
             if self._certain and 0.0 < h <= self._substep:
-                self._note("between", self._least_between(v, h))
+                times = h * self._random.random((_BETWEEN_SAMPLES, 1))
+                between = self._braked(self._q, self._v, self._stop, times)[0]
+                if self._parabola:
+                    between = self._q + times * self._v + 0.5 * times**2 / h * (v - self._v)
+                self._note("between", self._measured.least_of(between))
         if draw < _STOP_SHARE and self._certain:
             duration = float(np.max(np.abs(v) / stop))
             times = duration * (np.arange(_STOP_SAMPLES) + self._random.random()) / _STOP_SAMPLES
@@ -277,9 +269,3 @@ class Contract:
         if draw < _STOP_SHARE and self._can_stop.all():
             end = q + v * np.abs(v) / (2.0 * stop)
             self._note("stop_position", float(np.minimum(end - self._lower, self._upper - end).min()))
-
-    def _least_between(self, v: Array, h: float) -> float:
-        times = h * self._random.random((_BETWEEN_SAMPLES, 1))
-        if self._parabola:
-            return self._measured.least_of(self._q + times * self._v + 0.5 * times**2 / h * (v - self._v))
-        return self._measured.least_of(self._braked(self._q, self._v, self._stop, times)[0])

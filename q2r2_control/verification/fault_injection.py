@@ -1,4 +1,4 @@
-"""Input of a soak: segments of hostile targets, uneven ticks, hostile solvers and bad starts."""
+"""Input of a soak: segments of hostile targets, uneven ticks, solvers that fail or work against us, and bad starts."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ContactPair
@@ -15,22 +16,71 @@ from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.adversary import Adversary, Stream
-from q2r2_control.verification.worst_solver import ATTACKS, WorstSolver
+
+# "towards_nearest": the vertex of the box that brings the pair with the least margin together fastest.
+# "corner": a random vertex, for a while. "again": the last answer, whatever the box is now.
+ATTACKS = ("towards_nearest", "corner", "again")
+_PATIENCE = 200  # ticks that one pair or one corner is pursued for, at most
+_CANDIDATES = 4  # the pairs with the least margins, of which one is pursued
+
+
+class WorstSolver:
+    """Makes the answers of one attack after another. Distances and their gradients are Coal's and Pinocchio's."""
+
+    def __init__(self, robot: Robot, random: np.random.Generator) -> None:
+        self._robot, self._random = robot, random
+        self._data = robot.model.createData()
+        self._geometry: pin.GeometryData = robot.collision_model.createData()
+        self._signs = np.ones(robot.model.nv)
+        self._last = np.zeros(robot.model.nv)
+        self._left = 0
+        self._rank = 0
+
+    def answer(self, attack: str, problem: QpProblem, q: Array, kept: Array) -> Array:
+        """Next velocities (nv,) [rad/s] at the posture ``q`` (nv,), where pairs keep ``kept`` (p,) [m]."""
+        if attack == "again":
+            return self._last
+        self._left -= 1
+        renewed = self._left <= 0
+        if renewed:
+            self._left = int(self._random.integers(1, _PATIENCE))
+            self._rank = int(self._random.geometric(0.6)) - 1
+        if attack == "towards_nearest":
+            self._signs = -np.sign(self._gradient(q, kept))
+        elif renewed:
+            self._signs = self._random.choice([-1.0, 1.0], size=len(self._signs))
+        self._last = np.where(self._signs > 0.0, problem.upper, problem.lower)
+        return self._last
+
+    def _gradient(self, q: Array, kept: Array) -> Array:
+        """Of the distance of a pair with one of the least margins, with respect to ``q`` (nv,) [m/rad]."""
+        model, data, geometries = self._robot.model, self._data, self._robot.collision_model
+        pin.computeJointJacobians(model, data, q)
+        pin.updateGeometryPlacements(model, data, geometries, self._geometry)
+        pin.computeDistances(geometries, self._geometry)
+        results = self._geometry.distanceResults
+        margins = np.array([result.min_distance for result in results]) - kept
+        nearest = int(np.argsort(margins)[min(self._rank, len(margins) - 1, _CANDIDATES - 1)])
+        result, pair = results[nearest], geometries.collisionPairs[nearest]
+        points = result.getNearestPoint1(), result.getNearestPoint2()
+        normal = points[1] - points[0]
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-12) * (1.0 if result.min_distance >= 0.0 else -1.0)
+        gradient = np.zeros(model.nv)
+        for side, geometry, point in ((-1.0, pair.first, points[0]), (1.0, pair.second, points[1])):
+            joint = geometries.geometryObjects[geometry].parentJoint
+            jacobian = pin.getJointJacobian(model, data, joint, pin.LOCAL_WORLD_ALIGNED)
+            lever = point - data.oMi[joint].translation
+            gradient += side * normal @ (jacobian[:3] - pin.skew(lever) @ jacobian[3:])
+        return gradient
+
 
 # Solver failures after which the certified stop is due. A solution of absurd numbers is cut to the limits instead.
 STOPPING_FAULTS = ("none", "nan", "one_nan", "infinite", "late")
 FAULTS = (*STOPPING_FAULTS, "absurd", "noise")
 _ATTACK_SHARES = (0.7, 0.2, 0.1)
 _FAULTY, _ATTACKED = 0.2, 0.3  # share of the segments whose solver fails, or works against the arms
-_TIMINGS = {  # share of the segments
-    "1 ms": 0.42,
-    "1 ms, jittering": 0.20,
-    "a few ms": 0.15,
-    "any": 0.08,
-    "tiny": 0.05,
-    "long": 0.04,
-    "partly invalid": 0.06,
-}
+_TIMINGS = ("1 ms", "1 ms, jittering", "a few ms", "any", "tiny", "long", "partly invalid")
+_TIMING_SHARES = (0.42, 0.20, 0.15, 0.08, 0.05, 0.04, 0.06)  # of the segments
 _INVALID_DT: tuple[Any, ...] = (0.0, -0.001, math.nan, math.inf, -math.inf, None, "soon", 0.2, 5.0)
 _STARTS = ("home", "apart", "anywhere", "outside", "at limits", "moving", "too fast", "in penetration")
 LATE = 1.0  # [s]
@@ -53,7 +103,6 @@ class FaultySolver:
         self.q, self.kept = np.zeros(0), np.zeros(0)
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`."""
         if self.fault in ATTACKS and self._worst is not None:
             return QpSolution(self._worst.answer(self.fault, problem, self.q, self.kept), 0.0)
         v, nv = self._inner.solve(problem).v, len(problem.g)
@@ -111,7 +160,7 @@ def segments(robot: Robot, kept: Array, random: np.random.Generator) -> Iterator
     adversary, starts = Adversary(robot, random), Starts(robot, kept, random)
     start: Start | None = starts.draw("home")
     while True:
-        timing = str(random.choice(list(_TIMINGS), p=list(_TIMINGS.values())))
+        timing = str(random.choice(_TIMINGS, p=_TIMING_SHARES))
         name = str(random.choice(Adversary.names))
         longest = 60 if timing == "long" else 300 if timing == "any" else 2500
         yield Segment(
@@ -135,20 +184,16 @@ def _fault(random: np.random.Generator) -> str | None:
 
 
 def _ticks(timing: str, random: np.random.Generator) -> Callable[[], Any]:
-    if timing == "1 ms":
-        return lambda: 0.001
-    if timing == "1 ms, jittering":
-        return lambda: 0.001 * random.uniform(0.2, 2.5)
-    if timing == "a few ms":
-        middle = float(random.choice([0.002, 0.004, 0.005, 0.01]))
-        return lambda: middle * random.uniform(0.8, 1.2)
-    if timing == "any":
-        return lambda: 10.0 ** random.uniform(-6.0, -1.0)
-    if timing == "tiny":
-        return lambda: 10.0 ** random.uniform(-6.0, -4.0)
-    if timing == "long":
-        return lambda: random.uniform(0.02, 0.1)
-    return lambda: _INVALID_DT[random.integers(len(_INVALID_DT))] if random.random() < 0.1 else 0.001
+    middle = float(random.choice([0.002, 0.004, 0.005, 0.01])) if timing == "a few ms" else 0.001
+    return {
+        "1 ms": lambda: middle,
+        "1 ms, jittering": lambda: middle * random.uniform(0.2, 2.5),
+        "a few ms": lambda: middle * random.uniform(0.8, 1.2),
+        "any": lambda: 10.0 ** random.uniform(-6.0, -1.0),
+        "tiny": lambda: 10.0 ** random.uniform(-6.0, -4.0),
+        "long": lambda: random.uniform(0.02, 0.1),
+        "partly invalid": lambda: _INVALID_DT[random.integers(len(_INVALID_DT))] if random.random() < 0.1 else middle,
+    }[timing]
 
 
 class Starts:
@@ -159,17 +204,9 @@ class Starts:
 
     def draw(self, name: str) -> Start:
         """A start of one of the kinds; at rest but for "moving" and "too fast"."""
-        robot, random = self._robot, self._random
-        nv = robot.model.nv
-        v = np.zeros(nv)
-        if name == "home":
-            q = robot.home.copy()
-        elif name == "anywhere":
-            q = self._posture()
-        elif name == "in penetration":
-            q = self._in_penetration()
-        else:
-            q = self._apart()
+        robot, random, nv = self._robot, self._random, self._robot.model.nv
+        kinds = {"home": robot.home.copy, "anywhere": self._posture, "in penetration": self._in_penetration}
+        q, v = kinds.get(name, self._apart)(), np.zeros(nv)
         if name == "outside":
             joints = random.random(nv) < 0.2
             beyond = random.uniform(-0.01, 0.1, size=nv)
@@ -185,15 +222,11 @@ class Starts:
     def _posture(self) -> Array:
         return self._random.uniform(self._robot.position_lower, self._robot.position_upper)
 
-    def _margin(self, q: Array) -> float:
-        """Least distance beyond what a pair keeps [m]."""
-        return float((self._robot.distance_values(q) - self._kept).min(initial=np.inf))
-
     def _apart(self) -> Array:
         """A random posture with all pairs apart; home where none is found soon."""
         for _ in range(50):
             q = self._posture()
-            if self._margin(q) >= 0.0:
+            if (self._robot.distance_values(q) >= self._kept).all():
                 return q
         return self._robot.home.copy()
 
@@ -201,7 +234,7 @@ class Starts:
         """A posture between home and a random one in penetration, where the distance has just become too small."""
         far = self._posture()
         for _ in range(50):
-            if self._robot.distance_values(far).min(initial=np.inf) < 0.0:
+            if (self._robot.distance_values(far) < 0.0).any():
                 break
             far = self._posture()
         wanted = self._random.uniform(_DEEPEST - self._kept.max(initial=0.0), 0.0)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 
-import numpy as np
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -16,6 +17,8 @@ from q2r2_control.inputs.headset_check import HeadsetCheck
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist
 from q2r2_control.inputs.session import TopicStatistics
 
+_REFRESH_RATE = 6.0  # [Hz]
+
 
 def topic_table(title: str, topics: Mapping[str, TopicStatistics | None], silent: Collection[str] = ()) -> Table:
     """One row a topic, in the order given; None where nothing has come yet. Those in ``silent`` are marked."""
@@ -25,13 +28,11 @@ def topic_table(title: str, topics: Mapping[str, TopicStatistics | None], silent
         table.add_column(Text(column), justify="right")
     table.add_column("last value")
     for name, topic in topics.items():
-        if topic is None:
-            row = ("0", "", "", "nothing yet")
-        else:
-            row = (str(topic.count), f"{topic.rate:.0f}", f"{topic.age:.2f}", short_text(topic.last))
-        table.add_row(name, *row[:3], Text(f"timeout  {row[3]}" if name in silent else row[3]))
-        if name in silent:
-            table.rows[-1].style = "red"
+        figures, last = ("0", "", ""), "nothing yet"
+        if topic is not None:
+            figures, last = (str(topic.count), f"{topic.rate:.0f}", f"{topic.age:.2f}"), short_text(topic.last)
+        late = name in silent
+        table.add_row(name, *figures, Text(f"timeout  {last}" if late else last), style="red" if late else None)
     return table
 
 
@@ -59,9 +60,6 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)  # without minus zero
 
 
-_REFRESH_RATE = 6.0  # [Hz]
-
-
 def headset_table(check: HeadsetCheck) -> Table:
     """Connection, topics, and where the hands move."""
     statistics = check.statistics
@@ -83,31 +81,26 @@ def headset_table(check: HeadsetCheck) -> Table:
     return table
 
 
-class HeadsetDisplay:
-    """Shows the state of a headset: as a live table on a terminal; elsewhere only advice, when it changes."""
+@contextmanager
+def headset_display(console: Console) -> Iterator[Callable[[HeadsetCheck], None]]:
+    """Show the state of a headset: as a live table on a terminal; elsewhere only advice, when it changes."""
+    drawn, advised = -math.inf, tuple[str, ...]()
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-        self._drawn = -np.inf
-        self._advised: tuple[str, ...] = ()
+    def advise(check: HeadsetCheck) -> None:
+        nonlocal advised
+        if check.advice != advised:
+            for line in check.advice:
+                console.print(line, soft_wrap=True, highlight=False, markup=False)
+        advised = check.advice
 
-    def __enter__(self) -> HeadsetDisplay:
-        if self._live is not None:
-            self._live.start()
-        return self
+    def draw(check: HeadsetCheck) -> None:
+        nonlocal drawn
+        if time.monotonic() - drawn >= 1.0 / _REFRESH_RATE:
+            drawn = time.monotonic()
+            live.update(headset_table(check), refresh=True)
 
-    def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def show(self, check: HeadsetCheck) -> None:
-        """Show the newest state."""
-        if self._live is None:
-            if check.advice != self._advised:
-                for line in check.advice:
-                    self._console.print(line, soft_wrap=True, highlight=False, markup=False)
-            self._advised = check.advice
-        elif time.monotonic() - self._drawn >= 1.0 / _REFRESH_RATE:
-            self._drawn = time.monotonic()
-            self._live.update(headset_table(check), refresh=True)
+    if not console.is_terminal:
+        yield advise
+        return
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        yield draw

@@ -23,6 +23,11 @@ from q2r2_control.wording import limit_name, sentence
 # A tool nearer to its target than this follows; what holds it back beyond that is said [m], [rad].
 _FOLLOWS, _TURNED = 0.005, 0.05
 _HELD_BY = {LimitKind.POSITION: "at its limit", LimitKind.VELOCITY: "as fast as it may turn"}
+_REFRESH_RATE = 6.0  # [Hz]
+# The loop gets the interpreter back within this time from drawing, which takes milliseconds of Python at a time [s].
+_SWITCH_INTERVAL = 2e-5
+_LIMITS_SHOWN = 4
+_NEAR = 0.01  # a pair with less to spare is coloured [m]
 
 
 def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[ActiveLimit], last: Event | None) -> str:
@@ -82,14 +87,6 @@ def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[
     return None
 
 
-_REFRESH_RATE = 6.0  # [Hz]
-# Drawing takes milliseconds of Python at a time. The loop gets the interpreter back within this time, as it has to
-# after each kernel of a tick [s].
-_SWITCH_INTERVAL = 2e-5
-_LIMITS_SHOWN = 4
-_NEAR = 0.01  # a pair with less to spare is coloured [m]
-
-
 class LiveTable:
     """Shows the newest tick of a run."""
 
@@ -107,9 +104,8 @@ class LiveTable:
         """Store one tick."""
         self._newest = tick
         self._count += 1
-        if tick.reference.report.binding:
-            self._binding.update(dict.fromkeys(tick.reference.report.binding))
-        if tick.impedance is not None and tick.impedance.repelled:
+        self._binding.update(dict.fromkeys(tick.reference.report.binding))
+        if tick.impedance is not None:
             self._repelled.update(dict.fromkeys(tick.impedance.repelled))
         for event in tick.events:
             self._last[event.arm] = event
@@ -148,7 +144,9 @@ class LiveTable:
 
     def render(self) -> Table:
         """The table at this moment."""
-        tick, rate = self._newest, self._rate()
+        tick, (then, counted), now = self._newest, self._drawn, time.monotonic()
+        self._drawn = now, self._count
+        rate = (self._drawn[1] - counted) / max(now - then, 1e-9)
         table = Table(title=self._title, title_justify="left", min_width=76)
         table.add_column("", style="dim")
         if tick is None:
@@ -167,24 +165,20 @@ class LiveTable:
         table.add_section()
         report = tick.reference.report
         names = [*map(limit_name, binding), *(f"{joint} pushed off its limit" for joint in repelled)]
+        more = f" and {len(names) - _LIMITS_SHOWN} more" if len(names) > _LIMITS_SHOWN else ""
         colour = "yellow" if report.margin < _NEAR else "default"
         rows = {
             "time, loop": (f"{tick.t:.1f} s", f"{rate:.0f} Hz, {1e6 * tick.compute_time:.0f} us a tick"),
             "nearest pair": (f"{1e3 * report.closest_distance:.1f} mm", " | ".join(report.closest_pair)),
             "tightest pair": (f"[{colour}]{1e3 * report.margin:.1f} mm to spare[/]", " | ".join(report.tightest_pair)),
             "status": (str(report.status), "a stop is certified" if report.certified else "[red]no certified stop[/]"),
-            "limits at work": (str(len(names)), _some(names)),
+            "limits at work": (str(len(names)), ", ".join(names[:_LIMITS_SHOWN]) + more or "-"),
         }
         for arm, pair in tick.held_grippers.items():
             rows[f"{arm} gripper"] = ("[yellow]held[/]", " | ".join(pair))
         for name, (first, second) in rows.items():
             table.add_row(name, first, second)
         return table
-
-    def _rate(self) -> float:
-        (then, counted), now = self._drawn, time.monotonic()
-        self._drawn = now, self._count
-        return (self._drawn[1] - counted) / max(now - then, 1e-9)
 
 
 def _arm_rows(tick: Tick, arms: list[str]) -> list[tuple[str, list[str]]]:
@@ -200,8 +194,3 @@ def _arm_rows(tick: Tick, arms: list[str]) -> list[tuple[str, list[str]]]:
 
 def _figure(value: float, unit: str, digits: int) -> str:
     return f"{value:.{digits}f} {unit}" if np.isfinite(value) else "-"
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _LIMITS_SHOWN} more" if len(names) > _LIMITS_SHOWN else ""
-    return ", ".join(names[:_LIMITS_SHOWN]) + more if names else "-"

@@ -1,4 +1,4 @@
-"""Figures of a work motion are those of the controller's motion, whoever it is."""
+"""Figures of a work motion are those of the motion, of ours and of peers; the bench has all go through the same."""
 
 from __future__ import annotations
 
@@ -9,8 +9,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.benchmark.motion_run import DT, MotionFigures, OwnController, play_motion, run_motion, without_pairs
-from q2r2_control.benchmark.work_motions import WORK_MOTIONS
+from q2r2_control.benchmark.motion_run import (
+    DT,
+    MotionFigures,
+    OwnController,
+    play_motion,
+    run_bench,
+    run_motion,
+    without_pairs,
+)
+from q2r2_control.benchmark.peers.base import INSTALL, PEERS, Leading
+from q2r2_control.benchmark.work_motions import WORK_MOTIONS, motions_named
 from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -34,8 +43,10 @@ class Standing:
 
     def reset(self, q: Array) -> None:
         self._q, self._tick = q, -1
+        self.given: list[pin.SE3] = []  # targets of the left tool
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
+        self.given.append(targets["left"])
         self._tick += 1
         if self._tick == self._failing and self._raises:
             raise RuntimeError("no solution")
@@ -75,7 +86,7 @@ def test_figures_of_a_controller_that_stands_still_are_those_of_the_targets(robo
 def test_the_arms_stand_still_in_a_tick_without_a_solution(robot: Robot, raises: bool) -> None:
     run = play_motion(Standing(failing=3, raises=raises), robot, SHORT, np.inf, DT)
     assert np.flatnonzero(run.failed).tolist() == [3]
-    np.testing.assert_array_equal(run.q[3], run.q[2])
+    assert (run.q[3] == run.q[2]).all()
     assert not run.v[3].any()
 
 
@@ -93,9 +104,8 @@ def test_who_is_within_10_mm_of_the_goal_has_arrived(robot: Robot, goal: float, 
 
 
 def test_who_leaves_the_goal_has_arrived_when_it_is_back_for_good(robot: Robot) -> None:
-    there_and_back = replace(
-        SHORT, path=lambda t, home: home + 0.2 * min(t, 0.2 - t) * np.array([[1.0, 0, 0], [0, 0, 0]])
-    )
+    way = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    there_and_back = replace(SHORT, path=lambda t, home: home + 0.2 * min(t, 0.2 - t) * way)
     figures = run_motion(OwnController(robot, CONFIG), robot, there_and_back)
     assert figures.max_error_mm is not None
     assert figures.arrival_s is not None
@@ -116,3 +126,44 @@ def test_free_air_follows_what_the_pairs_forbid() -> None:
     # The slide asks for 10 mm less than the millimetre that fingers keep.
     assert figures.min_distance_mm == pytest.approx(-9.0, abs=0.6)
     assert figures.closest_pair == ("left_hand_e_finger_1_envelope_3", "table_0")
+
+
+@pytest.mark.slow
+def test_a_row_has_ours_in_free_air_and_near_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PEERS, "missing", "no_such_package_anywhere")
+    monkeypatch.setitem(PEERS, "broken", "json")
+    said: list[str] = []
+    report = run_bench(CONFIG, motions_named(["slide"]), ("missing", "broken"), 2, said.append)
+    (row,) = report.rows
+    (ours,) = row.figures
+    turns = [(turn, name) for turn in (1, 2) for name in ("free air", "q2r2_control")]
+    assert said == [f"slide (1 of 1), round {turn}, {name}" for turn, name in turns]
+    assert report.notes[0] == f"missing: not installed; {INSTALL}"
+    assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
+    assert ours.min_distance_mm is not None
+    assert ours.min_distance_mm >= 1.0  # fingers and obstacles
+    assert row.free_air.rms_error_mm is not None
+    assert ours.rms_error_mm is not None
+    # It is asked for 10 mm that the table does not allow.
+    assert row.free_air.rms_error_mm < 2.0 < 9.0 < ours.rms_error_mm
+    assert ours.times_us is not None
+    assert list(ours.times_us) == sorted(ours.times_us)
+    assert (ours.motion, ours.controller) == ("slide", "q2r2_control")
+
+
+def test_a_peer_is_given_its_target_ahead_by_speed_over_gain() -> None:
+    peer = Standing()
+    leading = Leading(peer, gain=8.0)
+    leading.reset(np.ones(14))
+    turn = np.array([0.0, 0.0, 0.001])
+    for tick in range(3):
+        pose = pin.SE3(pin.exp3(tick * turn), np.array([0.0004 * tick, 0.0, 0.1]))
+        leading.step({"left": pose}, 0.001)
+    assert peer.given[0].isApprox(pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.1])), 1e-15)
+    # 0.4 m/s and 1 rad/s, an eighth of a second ahead.
+    np.testing.assert_allclose(peer.given[2].translation, [0.0008 + 0.05, 0.0, 0.1], atol=1e-12)
+    np.testing.assert_allclose(pin.log3(peer.given[2].rotation), [0.0, 0.0, 0.002 + 0.125], atol=1e-12)
+    assert (leading.hold()[0] == 1.0).all()
+    leading.reset(np.ones(14))
+    leading.step({"left": pose}, 0.001)
+    assert peer.given[0].isApprox(pose, 1e-15)

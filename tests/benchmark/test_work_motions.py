@@ -22,18 +22,14 @@ def start() -> dict[str, pin.SE3]:
     return {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
 
 
-@pytest.fixture(params=WORK_MOTIONS)
-def motion(request: pytest.FixtureRequest) -> WorkMotion:
-    return WORK_MOTIONS[request.param]
-
-
 def ways(motion: WorkMotion, start: dict[str, pin.SE3]) -> Array:
     """Positions (n, arms, 3) of the targets at every tick."""
     ticks = range(round(motion.ends / DT))
     return np.array([[pose.translation for pose in motion.targets(tick * DT, start).values()] for tick in ticks])
 
 
-def test_targets_begin_at_home_and_move_smoothly_at_bounded_speed(
+@pytest.mark.parametrize("motion", WORK_MOTIONS.values(), ids=WORK_MOTIONS)
+def test_targets_begin_at_home_move_smoothly_at_bounded_speed_and_end_still(
     motion: WorkMotion, start: dict[str, pin.SE3]
 ) -> None:
     way = ways(motion, start)
@@ -42,11 +38,6 @@ def test_targets_begin_at_home_and_move_smoothly_at_bounded_speed(
     np.testing.assert_allclose(way[0], [start[arm].translation for arm in ARMS], atol=1e-12)
     assert np.linalg.norm(v, axis=2).max() <= FASTEST
     assert np.linalg.norm(a, axis=2).max() <= STRONGEST
-
-
-def test_targets_are_still_before_the_motion_and_at_its_end(motion: WorkMotion, start: dict[str, pin.SE3]) -> None:
-    way = ways(motion, start)
-    v = np.diff(way, axis=0) / DT
     still = np.arange(len(way)) * DT >= motion.ends - REST
     np.testing.assert_array_equal(way[still], np.broadcast_to(way[-1], way[still].shape))
     began = round(motion.begins / DT)
@@ -72,9 +63,6 @@ def test_motions_are_found_by_their_names_and_by_what_these_begin_with() -> None
         f"carry-0.16-{speed}" for speed in ("0.04", "0.15", "0.30", "0.50")
     }
     assert motions_named(WORK_MOTIONS) == tuple(WORK_MOTIONS.values())
-
-
-@pytest.mark.parametrize("name", ["carr", "", "Meet"])
-def test_an_unknown_name_is_an_error_that_lists_what_there_is(name: str) -> None:
-    with pytest.raises(ConfigError, match=f"motion '{name}': allowed: carry-0.40-0.15, .*stretch"):
-        motions_named(["meet", name])
+    for name in ("carr", "", "Meet"):
+        with pytest.raises(ConfigError, match=f"motion '{name}': allowed: carry-0.40-0.15, .*stretch"):
+            motions_named(["meet", name])

@@ -50,28 +50,12 @@ def test_headset_check_shows_a_headset_in_a_process_of_its_own() -> None:
         stdout, _ = running.communicate(timeout=30)
     assert running.returncode == 0
     check = one_object(stdout)
-    assert check["dialect"] == "ROS2"
-    assert check["connections"] == 1
+    assert (check["dialect"], check["connections"]) == ("ROS2", 1)
     assert check["last_disconnect"] == "closed by the headset"
     assert set(check["topics"]) == {
         f"q2r_{hand}_hand_{kind}" for hand in ("left", "right") for kind in ("pose", "inputs")
     }
     assert check["topics"]["q2r_left_hand_pose"]["count"] == 112
-
-
-def test_headset_check_of_a_headset_without_buttons_says_so_and_fails() -> None:
-    with (
-        process("headset-check", "--port", "0", "--json") as running,
-        FakeHeadset(("127.0.0.1", bound_port(running))) as headset,
-    ):
-        headset.send(headset.pose("left", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, -1.0)) + headset.registrations())
-        headset.read_until("__topic_list")
-        running.send_signal(signal.SIGINT)
-        stdout, _ = running.communicate(timeout=30)
-    assert running.returncode == 1
-    check = one_object(stdout)
-    assert "q2r_left_hand_inputs" in check["missing"]
-    assert "left hand: no inputs" in "\n".join(check["advice"])
 
 
 def test_a_headset_server_on_every_network_says_what_to_enter_in_the_app_and_who_can_drive() -> None:

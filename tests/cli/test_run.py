@@ -18,19 +18,10 @@ OPTIONS = (*FAST[2:], "--duration", "0.1")
 def test_what_check_refuses_is_refused_in_one_line_that_says_the_same(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "home: [0.0204, 0.348,", "home: [0.0204, 1.0,")
     refused = q2r2("run", file, *OPTIONS)
-    assert (refused.exit_code, refused.stdout) == (2, "")
-    assert refused.stderr.count("\n") == 1
+    assert (refused.exit_code, refused.stdout, refused.stderr.count("\n")) == (2, "", 1)
     faults = one_object(q2r2("check", file, "--json").stdout)["faults"]
     assert faults
     assert all(line in refused.stderr for line in (*faults, "--force"))
-
-
-def test_a_home_without_a_certified_stop_is_refused_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fault = "home: the controller knows no certified stop from here"
-    monkeypatch.setattr("q2r2_control.cli.cell_run.preflight_faults", lambda *_: (fault,))
-    refused = q2r2("run", changed_cell(tmp_path, "", ""), *OPTIONS)
-    assert refused.exit_code == 2
-    assert refused.stderr == f"q2r2: dual_iiwa7: {fault}; --force runs it all the same\n"
 
 
 def test_with_force_it_says_what_is_wrong_and_runs(tmp_path: Path) -> None:
@@ -43,24 +34,17 @@ def test_with_force_it_says_what_is_wrong_and_runs(tmp_path: Path) -> None:
 
 def test_rt_says_in_one_line_what_the_system_refuses_and_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     refusal = "real time: no SCHED_FIFO: Operation not permitted; the run goes on without"
-    entered = []
 
     @contextmanager
     def refused() -> Iterator[str]:
-        entered.append("in")
         yield refusal
-        entered.append("out")
 
     monkeypatch.setattr("q2r2_control.cli.cell_run.real_time", refused)
     options = ("run", FAST[1], "--plant", "kinematic", "--headless", "--json", "--duration", "0.1")
     result = q2r2(*options, "--rt")
     assert result.exit_code == 0
     assert [line for line in result.stderr.splitlines() if "real time" in line] == [refusal]
-    assert entered == ["in", "out"]
-    figures = one_object(result.stdout)
-    assert set(figures["lateness_us"]) == {"p50", "p99", "max"}
-    assert figures["lateness_us"]["max"] is not None
-    assert figures["overruns"] <= figures["ticks"]
+    assert one_object(result.stdout)["lateness_us"]["max"] is not None
     assert "real time" not in q2r2(*options).stderr
 
 

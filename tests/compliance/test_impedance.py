@@ -15,9 +15,7 @@ from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState
-from tests.support.arm_dynamics import left_arm
-from tests.support.poses import pose_error
-from tests.support.torque_loop import reference
+from tests.support.torque_loop import left_arm, pose_error, reference
 
 DT = 0.001
 SETTINGS = ImpedanceSettings(torque_rate_limit=1000.0)  # 1 Nm a tick

@@ -20,9 +20,7 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState
-from tests.support.arm_dynamics import left_arm
-from tests.support.poses import pose_error
-from tests.support.torque_loop import reference
+from tests.support.torque_loop import left_arm, pose_error, reference
 
 STRETCHED = np.zeros(14)
 STIFFNESS = np.array([2000.0] * 3 + [200.0] * 3)

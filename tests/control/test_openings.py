@@ -10,9 +10,9 @@ from q2r2_control.errors import RobotError
 from q2r2_control.robot.finger_bodies import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.types import ALL_OF_THE_WAY, Array
-from tests.support.block_cell import ABOVE, BESIDE, CELL, SETTINGS, at
 from tests.support.coal_distances import coal_distances
 from tests.support.driven import Driven
+from tests.support.object_cell import ABOVE, BESIDE, CELL, SETTINGS, tips_at
 
 DT = 0.002
 
@@ -92,11 +92,11 @@ def test_an_arm_at_speed_may_not_open_where_there_is_room_but_none_to_stop(contr
     run = Driven(controller)
     run.set_opening("left", 0.0, 0.0)
     run.drive(1.2, {"left": BESIDE})
-    run = Driven(controller, run.drive(1.2, {"left": at(0.05, 0.006)}).q)
+    run = Driven(controller, run.drive(1.2, {"left": tips_at(0.05, 0.006)}).q)
     run.set_opening("left", 0.0, 0.0)
     answers = []
     for _ in range(150):
-        reference = run.drive(DT, {"left": at(0.4, 0.006)})
+        reference = run.drive(DT, {"left": tips_at(0.4, 0.006)})
         q, v = reference.q, reference.v
         room = bool((robot.distance_values(q) >= kept).all())
         accepted = run.set_opening("left", *ALL_OF_THE_WAY) is None

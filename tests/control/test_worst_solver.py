@@ -13,7 +13,7 @@ from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, StepStatus
 from q2r2_control.verification.contract import Contract
-from q2r2_control.verification.worst_solver import WorstSolver
+from q2r2_control.verification.fault_injection import WorstSolver
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 DTS = (0.001, 0.004, 0.0005, 0.01, 0.03)

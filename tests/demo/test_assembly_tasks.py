@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from q2r2_control.config.cell import Config, load_config
-from q2r2_control.demo.assembly_tasks import TASKS, TaskResult, TaskWatch, tasks_named
+from q2r2_control.demo.assembly_tasks import TASKS, TaskWatch, tasks_named
 from q2r2_control.demo.part_judges import TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput
@@ -17,8 +17,6 @@ from q2r2_control.inputs.trajectories import trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.summary.run_summary import RunSummary
-from q2r2_control.summary.tick import Tick
 from q2r2_control.types import CommandMode, HandSample
 from tests.support.processes import Watch, assert_torque_bounds
 
@@ -44,32 +42,25 @@ class Gripless(ScriptedInput):
         return [replace(sample, inputs=replace(sample.inputs, button_upper=False)) for sample in super().poll(now)]
 
 
-@dataclass
 class Played:
-    mode: CommandMode
-    pipeline: Pipeline
-    ticks: list[Tick]
-    summary: RunSummary
-    results: dict[str, TaskResult]
-
-
-def play(
-    names: str, mode: CommandMode, source: type[ScriptedInput] = ScriptedInput, duration: float | None = None
-) -> Played:
     """Tasks in simulated time, for as long as they last, with the contract checked at every tick."""
-    config = coarse(mode)
-    robot = Robot.from_config(config)
-    plant = MujocoPlant(robot, config)
-    pipeline = Pipeline(config, robot, source(names), plant, mode)
-    watch, tasks = Watch(pipeline), TaskWatch(tasks_named(names.split("+")), plant, robot, config)
-    pipeline.listeners.append(tasks)
-    summary = pipeline.run(duration or trajectory_named(names).duration, realtime=False)
-    return Played(mode, pipeline, watch.ticks, summary, {result.name: result for result in tasks.results()})
+
+    def __init__(
+        self, names: str, mode: CommandMode, source: type[ScriptedInput] = ScriptedInput, duration: float | None = None
+    ) -> None:
+        config, self.mode = coarse(mode), mode
+        robot = Robot.from_config(config)
+        plant = MujocoPlant(robot, config)
+        self.pipeline = Pipeline(config, robot, source(names), plant, mode)
+        watch, tasks = Watch(self.pipeline), TaskWatch(tasks_named(names.split("+")), plant, robot, config)
+        self.pipeline.listeners.append(tasks)
+        self.summary = self.pipeline.run(duration or trajectory_named(names).duration, realtime=False)
+        self.ticks, self.results = watch.ticks, {result.name: result for result in tasks.results()}
 
 
 @pytest.fixture(scope="module", params=list(SHOWN), ids=["by position", "by torque"])
 def played(request: pytest.FixtureRequest) -> Played:
-    return play(SHOWN[request.param], request.param)
+    return Played(SHOWN[request.param], request.param)
 
 
 def test_every_task_succeeds_without_a_touch_that_is_no_grasp(played: Played) -> None:
@@ -95,9 +86,7 @@ def test_the_arms_follow_the_hands_within_a_millimetre_and_need_no_fallback(play
         assert arm.position_error_mm_rms < 1.0
     if played.mode is CommandMode.TORQUE:
         assert_torque_bounds(played.pipeline, played.ticks)
-
-
-def test_fingers_work_within_3_mm_of_the_table_and_tools_within_90_mm_of_each_other(played: Played) -> None:
+    # Fingers work within 3 mm of the table, and tools within 90 mm of each other.
     assert played.summary.min_distance_mm is not None
     assert played.summary.min_distance_mm < 3.0
     gaps = [np.linalg.norm(tick.tools["left"].translation - tick.tools["right"].translation) for tick in played.ticks]
@@ -106,7 +95,7 @@ def test_fingers_work_within_3_mm_of_the_table_and_tools_within_90_mm_of_each_ot
 
 def test_hands_that_never_grip_lift_nothing_and_the_measure_says_so() -> None:
     held_up_at = 7.0
-    result = play("grasp", CommandMode.POSITION, Gripless, held_up_at).results["grasp"]
+    result = Played("grasp", CommandMode.POSITION, Gripless, held_up_at).results["grasp"]
     assert not result.succeeded
     assert result.measured["lifted_mm"] < 1.0
     assert result.reason == "flat_block: held 95 mm up for 0.0 s, not 1 s"

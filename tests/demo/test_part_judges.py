@@ -13,7 +13,7 @@ DT = 0.1
 LEFT, RIGHT, TABLE = Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER, Toucher.SURROUNDINGS
 
 # Time [s], y, z [m], and what touches the part meanwhile.
-Phase = tuple[float, float, float, Toucher]
+Phase = tuple[float, float, float, int]
 
 
 def play(judge: Judge, phases: Iterable[Phase]) -> Judge:
@@ -27,67 +27,68 @@ LIES, GRIPPED = (1.0, 0.0, 0.2, TABLE), (0.5, 0.0, 0.2, TABLE | LEFT)
 HELD, BACK = (1.5, 0.0, 0.3, LEFT), (1.0, 0.0, 0.2, TABLE)
 
 
-class TestLift:
-    def test_a_part_that_is_held_up_for_a_second_and_put_back_succeeds(self) -> None:
-        judge = play(LiftJudge("part"), [LIES, GRIPPED, HELD, GRIPPED, BACK])
-        assert judge.faults() == []
-        assert judge.measured() == pytest.approx(
-            {"lifted_mm": 100.0, "held_s": 1.5, "put_back_mm": 0.0, "fall_mm": 0.0}
-        )
+def test_a_part_that_is_held_up_for_a_second_and_put_back_succeeds() -> None:
+    judge = play(LiftJudge("part"), [LIES, GRIPPED, HELD, GRIPPED, BACK])
+    assert judge.faults() == []
+    measured = {"lifted_mm": 100.0, "held_s": 1.5, "put_back_mm": 0.0, "fall_mm": 0.0}
+    assert judge.measured() == pytest.approx(measured)
 
-    def test_a_part_that_lay_back_for_a_second_may_be_taken_elsewhere(self) -> None:
-        lain = [LIES, GRIPPED, HELD, GRIPPED, BACK, BACK]
-        elsewhere = (1.0, 0.3, 0.2, TABLE)
-        assert play(LiftJudge("part"), [*lain, HELD, elsewhere]).faults() == []
-        assert play(LiftJudge("part"), [LIES, GRIPPED, HELD, (0.5, 0.0, 0.2, TABLE), elsewhere]).faults() != []
 
-    @pytest.mark.parametrize(
-        ("phases", "fault"),
-        [
-            pytest.param([LIES], "held 95 mm up for 0.0 s", id="never lifted"),
-            pytest.param([LIES, GRIPPED, (1.5, 0.0, 0.29, LEFT), BACK], "for 0.0 s", id="not high enough"),
-            pytest.param([LIES, GRIPPED, (0.5, 0.0, 0.3, LEFT), GRIPPED, BACK], "for 0.5 s", id="not long enough"),
-            pytest.param([LIES, (1.5, 0.0, 0.3, TABLE | LEFT), BACK], "for 0.0 s", id="standing on something"),
-            pytest.param([LIES, GRIPPED, HELD, (0.1, 0.0, 0.25, Toucher.NOTHING), BACK], "fell 100 mm", id="dropped"),
-            pytest.param([LIES, GRIPPED, HELD, GRIPPED, (1.0, 0.02, 0.2, TABLE)], "20 mm from", id="put elsewhere"),
-            pytest.param([LIES, GRIPPED, HELD], "100 mm from", id="not put back"),
-        ],
-    )
-    def test_whatever_else_fails_and_is_named(self, phases: list[Phase], fault: str) -> None:
-        assert any(fault in line for line in play(LiftJudge("part"), phases).faults())
+def test_a_part_that_lay_back_for_a_second_may_be_taken_elsewhere() -> None:
+    lain = [LIES, GRIPPED, HELD, GRIPPED, BACK, BACK]
+    elsewhere = (1.0, 0.3, 0.2, TABLE)
+    assert play(LiftJudge("part"), [*lain, HELD, elsewhere]).faults() == []
+    assert play(LiftJudge("part"), [LIES, GRIPPED, HELD, (0.5, 0.0, 0.2, TABLE), elsewhere]).faults() != []
+
+
+@pytest.mark.parametrize(
+    ("phases", "fault"),
+    [
+        ([LIES], "held 95 mm up for 0.0 s"),
+        ([LIES, GRIPPED, (1.5, 0.0, 0.29, LEFT), BACK], "for 0.0 s"),  # not high enough
+        ([LIES, GRIPPED, (0.5, 0.0, 0.3, LEFT), GRIPPED, BACK], "for 0.5 s"),  # not long enough
+        ([LIES, (1.5, 0.0, 0.3, TABLE | LEFT), BACK], "for 0.0 s"),  # standing on something
+        ([LIES, GRIPPED, HELD, (0.1, 0.0, 0.25, Toucher.NOTHING), BACK], "fell 100 mm"),
+        ([LIES, GRIPPED, HELD, GRIPPED, (1.0, 0.02, 0.2, TABLE)], "20 mm from"),
+        ([LIES, GRIPPED, HELD], "100 mm from"),
+    ],
+)
+def test_what_is_not_lifted_held_and_put_back_fails_and_is_named(phases: list[Phase], fault: str) -> None:
+    assert any(fault in line for line in play(LiftJudge("part"), phases).faults())
 
 
 GIVER, BOTH, TAKER = (1.0, 0.0, 0.4, LEFT), (0.5, 0.0, 0.4, FINGERS), (0.5, 0.0, 0.4, RIGHT)
 AWAY = (1.2, -0.12, 0.4, RIGHT)
 
 
-class TestHandover:
-    def test_a_part_that_both_held_and_the_taker_carries_away_succeeds(self) -> None:
-        judge = play(HandoverJudge("part", LEFT, RIGHT), [LIES, GIVER, BOTH, TAKER, AWAY])
-        assert judge.faults() == []
-        assert judge.measured()["carried_mm"] == pytest.approx(120.0)
-
-    @pytest.mark.parametrize(
-        "phases",
-        [
-            pytest.param([LIES, GIVER, BOTH, TAKER], id="not carried away"),
-            pytest.param([LIES, GIVER, BOTH, (0.5, -0.12, 0.4, RIGHT)], id="not for a second"),
-            pytest.param([LIES, GIVER, BOTH, (1.2, -0.12, 0.4, FINGERS)], id="the giver does not let go"),
-            pytest.param([LIES, BOTH, AWAY], id="the giver never held it alone"),
-            pytest.param([LIES, GIVER, TAKER, AWAY], id="never held by both"),
-            pytest.param([LIES, GIVER, BOTH, (1.2, -0.12, 0.2, RIGHT | TABLE)], id="pushed over the table"),
-        ],
-    )
-    def test_whatever_else_fails(self, phases: list[Phase]) -> None:
-        faults = play(HandoverJudge("part", LEFT, RIGHT), phases).faults()
-        assert any("held by the taker alone" in fault for fault in faults)
-
-    def test_a_part_that_falls_between_the_hands_fails(self) -> None:
-        phases = [LIES, GIVER, BOTH, (0.1, 0.0, 0.39, Toucher.NOTHING), TAKER, AWAY]
-        assert play(HandoverJudge("part", LEFT, RIGHT), phases).faults() == ["part: fell 10 mm"]
+def test_a_part_that_both_held_and_the_taker_carries_away_succeeds() -> None:
+    judge = play(HandoverJudge("part", LEFT, RIGHT), [LIES, GIVER, BOTH, TAKER, AWAY])
+    assert judge.faults() == []
+    assert judge.measured()["carried_mm"] == pytest.approx(120.0)
 
 
-def stack(offset: float = 0.0, height: float = 0.06, tilt: float = 0.0, touched: Toucher = Toucher.PART) -> Judge:
+@pytest.mark.parametrize(
+    "phases",
+    [
+        pytest.param([LIES, GIVER, BOTH, TAKER], id="not carried away"),
+        pytest.param([LIES, GIVER, BOTH, (0.5, -0.12, 0.4, RIGHT)], id="not for a second"),
+        pytest.param([LIES, GIVER, BOTH, (1.2, -0.12, 0.4, FINGERS)], id="the giver does not let go"),
+        pytest.param([LIES, BOTH, AWAY], id="the giver never held it alone"),
+        pytest.param([LIES, GIVER, TAKER, AWAY], id="never held by both"),
+        pytest.param([LIES, GIVER, BOTH, (1.2, -0.12, 0.2, RIGHT | TABLE)], id="pushed over the table"),
+    ],
+)
+def test_what_is_not_handed_over_fails(phases: list[Phase]) -> None:
+    faults = play(HandoverJudge("part", LEFT, RIGHT), phases).faults()
+    assert any("held by the taker alone" in fault for fault in faults)
+
+
+def test_a_part_that_falls_between_the_hands_fails() -> None:
+    phases = [LIES, GIVER, BOTH, (0.1, 0.0, 0.39, Toucher.NOTHING), TAKER, AWAY]
+    assert play(HandoverJudge("part", LEFT, RIGHT), phases).faults() == ["part: fell 10 mm"]
+
+
+def stack(offset: float = 0.0, height: float = 0.06, tilt: float = 0.0, touched: int = Toucher.PART) -> Judge:
     judge = StackJudge({"low": 0.06, "high": 0.06})
     for _ in range(12):
         lower = PartState((0.5, 0.0, 0.23), 0.0, Toucher.PART | TABLE)
@@ -95,20 +96,20 @@ def stack(offset: float = 0.0, height: float = 0.06, tilt: float = 0.0, touched:
     return judge
 
 
-class TestStack:
-    def test_a_part_that_rests_on_another_one_for_a_second_succeeds(self) -> None:
-        assert stack(offset=0.002, height=0.0598).faults() == []
-        assert stack().measured()["stood_s"] == pytest.approx(1.2)
+def test_a_part_that_rests_on_another_one_for_a_second_succeeds() -> None:
+    assert stack(offset=0.002, height=0.0598).faults() == []
+    assert stack().measured()["stood_s"] == pytest.approx(1.2)
 
-    @pytest.mark.parametrize(
-        "judge",
-        [
-            pytest.param(stack(offset=0.015), id="too far off"),
-            pytest.param(stack(height=0.0), id="beside it"),
-            pytest.param(stack(height=0.065), id="in the air"),
-            pytest.param(stack(tilt=math.radians(5.0)), id="inclined"),
-            pytest.param(stack(touched=Toucher.PART | LEFT), id="still held"),
-        ],
-    )
-    def test_whatever_else_fails(self, judge: Judge) -> None:
-        assert judge.faults() == ["high on low for the last 0.0 s, not 1 s"]
+
+@pytest.mark.parametrize(
+    "judge",
+    [
+        pytest.param(stack(offset=0.015), id="too far off"),
+        pytest.param(stack(height=0.0), id="beside it"),
+        pytest.param(stack(height=0.065), id="in the air"),
+        pytest.param(stack(tilt=math.radians(5.0)), id="inclined"),
+        pytest.param(stack(touched=Toucher.PART | LEFT), id="still held"),
+    ],
+)
+def test_what_does_not_stand_fails(judge: Judge) -> None:
+    assert judge.faults() == ["high on low for the last 0.0 s, not 1 s"]

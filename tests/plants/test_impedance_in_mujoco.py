@@ -14,9 +14,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.plants.conftest import tool_motion
-from tests.support.arm_dynamics import left_arm
-from tests.support.poses import pose_error
-from tests.support.torque_loop import DT, TorqueLoop, reference
+from tests.support.torque_loop import DT, TorqueLoop, left_arm, pose_error, reference
 
 POSTURES = {
     "home": None,

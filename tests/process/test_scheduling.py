@@ -30,9 +30,8 @@ class FakeSystem:
         ctypes.set_errno(0 if self._grants_memory else errno.ENOMEM)
         return 0 if self._grants_memory else -1
 
-    def munlockall(self) -> int:
+    def munlockall(self) -> None:
         self.calls.append(("munlockall",))
-        return 0
 
     def _sched_setscheduler(self, thread: int, policy: int, parameters: os.sched_param) -> None:
         self.calls.append(("sched", thread, policy, parameters.sched_priority))
@@ -91,35 +90,23 @@ def test_the_real_system_is_left_as_it_was_and_other_threads_are_not_put_first()
     assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == before
 
 
-def test_all_threads_of_a_process_are_scheduled_first_and_none_that_begins_later(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
-    ended = threading.Event()
-    threads = [threading.Thread(target=ended.wait) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    assert schedule_process_first(38) is None
-    ended.set()
-    scheduled = {call[1] for call in system.calls}
-    assert {threading.get_native_id(), *(thread.native_id for thread in threads)} <= scheduled
-    assert {call[2:] for call in system.calls} == {(os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 38)}
-    FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=False)
-    assert (schedule_process_first(38) or "").startswith("no SCHED_FIFO: Operation not permitted; to permit it")
-
-
-def test_a_process_that_was_scheduled_first_is_scheduled_as_others_with_all_its_threads(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_all_threads_of_a_process_are_scheduled_first_and_as_others_again(monkeypatch: pytest.MonkeyPatch) -> None:
     system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
     ended = threading.Event()
     thread = threading.Thread(target=ended.wait)
     thread.start()
+    own = {threading.get_native_id(), thread.native_id}
+    assert schedule_process_first(38) is None
+    assert own <= {call[1] for call in system.calls}
+    assert {call[2:] for call in system.calls} == {(os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 38)}
+    system.calls.clear()
     schedule_process_as_others()
     ended.set()
     last = {call[1]: call[2:] for call in system.calls}
-    assert {threading.get_native_id(), thread.native_id} <= last.keys()
+    assert own <= last.keys()
     assert set(last.values()) == {(os.SCHED_OTHER, 0)}
+    FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=False)
+    assert (schedule_process_first(38) or "").startswith("no SCHED_FIFO: Operation not permitted; to permit it")
 
 
 # Sends a signal at every line that the first signal's handler runs, so each of them is interrupted by another handler.

@@ -14,8 +14,8 @@ from q2r2_control import Robot
 from q2r2_control.config.external import GripperSettings
 from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
-from tests.support.block_cell import ABOVE, BESIDE
-from tests.support.block_cell import CELL as BLOCK_CELL
+from tests.support.object_cell import ABOVE, BESIDE
+from tests.support.object_cell import CELL as BLOCK_CELL
 
 need_ros()
 

@@ -14,7 +14,7 @@ from q2r2_control.plants.base import GripperMotion
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.supervision.gripper_limiter import TOLERANCE, GripperLimiter
 from q2r2_control.types import ALL_OF_THE_WAY
-from tests.support.block_cell import ABOVE, BESIDE, CELL, SETTINGS
+from tests.support.object_cell import ABOVE, BESIDE, CELL, SETTINGS
 from tests.support.turning_hand import RealHands, above_table, turning_cell
 
 DT = 0.002

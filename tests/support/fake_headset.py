@@ -16,14 +16,18 @@ import struct
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
-from tests.support.operator_script import HANDS, SCRIPTS, START, Quaternion, Reading, Script, Vector
+from q2r2_control.quaternions import Quaternion, Vector
+from tests.support.operator_script import HANDS, SCRIPTS, START, Reading, Script
 
 RATE_HZ = 75.0
 DIALECTS = ("ros1", "ros2")
 KEEPALIVE = b"\0\0\0\0\0\0\0\0"
+TOPICS = {"pose": "geometry_msgs/PoseStamped", "twist": "geometry_msgs/Twist", "inputs": "quest2ros/OVR2ROSInputs"}
 NOISE = 1e-6  # of a position, too little for anything but telling a hand at rest from a frozen pose [m]
 
 
@@ -41,7 +45,15 @@ class FakeHeadset:
         self.dialect = dialect
         self._slash = "/" if slash else ""
         self._received = bytearray()
-        self.socket = _connect(address, connect_timeout, source)
+        deadline, here = time.monotonic() + connect_timeout, (source, 0) if source else None
+        while True:  # tries again while nobody listens, as the app does
+            try:
+                self.socket = socket.create_connection(address, timeout=None, source_address=here)
+                break
+            except ConnectionRefusedError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.05)
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def frame(self, destination: str, payload: bytes) -> bytes:
@@ -61,40 +73,23 @@ class FakeHeadset:
         """What the app says right after connecting: a keepalive, its topics, and a question for the server's."""
         parts = [KEEPALIVE]
         for hand in HANDS:
-            for suffix, kind in (
-                ("pose", "geometry_msgs/PoseStamped"),
-                ("twist", "geometry_msgs/Twist"),
-                ("inputs", "quest2ros/OVR2ROSInputs"),
-            ):
+            for suffix, kind in TOPICS.items():
                 topic = self.topic(hand, suffix)
                 parts.append(self.command("__publish", topic=topic, message_name=kind, queue_size=10, latch=False))
-            parts.append(
-                self.command(
-                    "__subscribe",
-                    topic=self.topic(hand, "haptic_feedback"),
-                    message_name="quest2ros/OVR2ROSHapticFeedback",
-                )
-            )
+            haptic = {"topic": self.topic(hand, "haptic_feedback"), "message_name": "quest2ros/OVR2ROSHapticFeedback"}
+            parts.append(self.command("__subscribe", **haptic))
         return b"".join([*parts, self.command("__topic_list")])
 
-    def pose(
-        self,
-        hand: str,
-        position: Vector,
-        quaternion: Quaternion,
-        frame_id: str = "",
-        stamp: tuple[int, int] = (12, 500),
-    ) -> bytes:
-        """``stamp``: of the headset's own clock [s], [ns]."""
-        return self.frame(self.topic(hand, "pose"), pack_pose(self.dialect, position, quaternion, frame_id, stamp))
+    def pose(self, hand: str, *values: Any, **options: Any) -> bytes:
+        """See :func:`pack_pose`."""
+        return self.frame(self.topic(hand, "pose"), pack_pose(self.dialect, *values, **options))
 
     def twist(self, hand: str, linear: Vector, angular: Vector) -> bytes:
         return self.frame(self.topic(hand, "twist"), pack_twist(self.dialect, linear, angular))
 
-    def inputs(
-        self, hand: str, upper: bool = False, lower: bool = False, analog: tuple[float, ...] = (0.0,) * 4
-    ) -> bytes:
-        return self.frame(self.topic(hand, "inputs"), pack_inputs(self.dialect, upper, lower, analog))
+    def inputs(self, hand: str, *values: Any, **options: Any) -> bytes:
+        """See :func:`pack_inputs`."""
+        return self.frame(self.topic(hand, "inputs"), pack_inputs(self.dialect, *values, **options))
 
     def send(self, data: bytes) -> None:
         self.socket.sendall(data)
@@ -130,11 +125,9 @@ class FakeHeadset:
     def discard_received(self) -> None:
         """Throw away what the server has sent so far."""
         self._received.clear()
-        try:
+        with suppress(BlockingIOError):
             while self.socket.recv(1 << 16, socket.MSG_DONTWAIT):
                 pass
-        except BlockingIOError:
-            pass
 
     def reset(self) -> None:
         """End the connection by a TCP reset instead of closing it."""
@@ -151,35 +144,23 @@ class FakeHeadset:
         self.close()
 
     def _cut_frame(self) -> tuple[str, bytes] | None:
-        buffer = self._received
-        if len(buffer) < 8:
+        buffer, starts = self._received, 8
+        if len(buffer) >= starts:
+            starts += struct.unpack_from("<I", buffer)[0]
+        if len(buffer) < starts:
             return None
-        name_size = struct.unpack_from("<I", buffer)[0]
-        if len(buffer) < 8 + name_size:
-            return None
-        size = struct.unpack_from("<I", buffer, 4 + name_size)[0]
-        end = 8 + name_size + size
+        end = starts + struct.unpack_from("<I", buffer, starts - 4)[0]
         if len(buffer) < end:
             return None
-        frame = (buffer[4 : 4 + name_size].decode(), bytes(buffer[8 + name_size : end]))
+        frame = (buffer[4 : starts - 4].decode(), bytes(buffer[starts:end]))
         del buffer[:end]
         return frame
-
-
-class Sensor:
-    """Measures positions: never twice the same, as of a real hand at rest."""
-
-    def __init__(self, seed: int = 0) -> None:
-        self._random = random.Random(seed)
-
-    def measured(self, position: Vector) -> Vector:
-        x, y, z = (value + self._random.gauss(0.0, NOISE) for value in position)
-        return x, y, z
 
 
 def pack_pose(
     dialect: str, position: Vector, quaternion: Quaternion, frame_id: str = "", stamp: tuple[int, int] = (12, 500)
 ) -> bytes:
+    """``stamp``: of the headset's own clock [s], [ns]."""
     numbers = struct.pack("<7d", *position, *quaternion)
     name = frame_id.encode()
     if dialect == "ros1":
@@ -192,61 +173,45 @@ def pack_twist(dialect: str, linear: Vector, angular: Vector) -> bytes:
     return (b"\0\1\0\0" if dialect == "ros2" else b"") + struct.pack("<6d", *linear, *angular)
 
 
-def pack_inputs(dialect: str, upper: bool, lower: bool, analog: tuple[float, ...]) -> bytes:
+def pack_inputs(
+    dialect: str, upper: bool = False, lower: bool = False, analog: tuple[float, ...] = (0.0,) * 4
+) -> bytes:
     if dialect == "ros1":
         return struct.pack("<??4f", upper, lower, *analog)
     return b"\0\1\0\0" + struct.pack("<??2x4f", upper, lower, *analog)
 
 
-def _connect(address: tuple[str, int], timeout: float, source: str) -> socket.socket:
-    """Connect, trying again while nobody listens, as the app does."""
-    deadline = time.monotonic() + timeout
-    while True:
-        try:
-            return socket.create_connection(address, timeout=None, source_address=(source, 0) if source else None)
-        except ConnectionRefusedError:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.05)
-
-
 def play(headset: FakeHeadset, script: Script, duration: float) -> Iterator[tuple[float, Reading]]:
     """Send the script at RATE_HZ in real time; yields what was sent with its time on ``time.monotonic``."""
-    start, sensor = time.monotonic(), Sensor()
+    start, noise = time.monotonic(), random.Random(0)
     for index in range(int(duration * RATE_HZ)):
         due = start + index / RATE_HZ
         time.sleep(max(due - time.monotonic(), 0.0))
-        ideal = [script.reading(hand, index / RATE_HZ) for hand in HANDS]
-        readings = [replace(reading, position=sensor.measured(reading.position)) for reading in ideal]
         headset.discard_received()
-        for reading in readings:
+        for reading in (script.reading(hand, index / RATE_HZ) for hand in HANDS):
+            x, y, z = (value + noise.gauss(0.0, NOISE) for value in reading.position)
+            reading = replace(reading, position=(x, y, z))
             headset.send(headset.pose(reading.hand, reading.position, reading.quaternion))
             headset.send(headset.inputs(reading.hand, reading.upper, reading.lower))
             yield time.monotonic(), reading
 
 
 def main() -> int:
-    """Play a script against a server; 0 also when the server closes first, as it does at the end of its run."""
+    """Play a script against a server, which may close first. SIGTERM ends it inside a frame."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--dialect", choices=DIALECTS, default="ros2")
     parser.add_argument("--script", choices=sorted(SCRIPTS), default="acceptance")
     parser.add_argument("--duration", type=float, default=20.0, help="[s]")
-    parser.add_argument("--end", choices=("close", "stall"), default="close", help="SIGTERM ends it inside a frame")
-    parser.add_argument("--connect-timeout", type=float, default=30.0, help="waits for the server this long [s]")
     parser.add_argument("--log", type=Path, help="writes what was sent, a JSON line each")
     arguments = parser.parse_args()
     sent: list[tuple[float, Reading]] = []
-    address = (arguments.host, arguments.port)
-    headset = FakeHeadset(address, arguments.dialect, connect_timeout=arguments.connect_timeout)
+    headset = FakeHeadset(("127.0.0.1", arguments.port), arguments.dialect, connect_timeout=30.0)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         headset.send(headset.registrations())
         for time_and_reading in play(headset, SCRIPTS[arguments.script](arguments.duration), arguments.duration):
             sent.append(time_and_reading)
-        if arguments.end == "stall":
-            time.sleep(3.0)
     except KeyboardInterrupt:
         headset.send(headset.pose("left", START["left"], (0.0, 0.0, 0.0, -1.0))[:30])
     except ConnectionError:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from q2r2_control.quaternions import rotation_of
 from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, HandInputs, HandSample, HapticFeedback
 
 PERIOD = 1.0 / 75.0  # [s]
@@ -38,9 +39,8 @@ class HandsInput:
 
     def _sample(self, hand: str, inputs: HandInputs, now: float) -> HandSample:
         path = self._paths[hand](now) if hand in self._paths else np.zeros(6)
-        angle = float(np.linalg.norm(path[3:]))
-        axis = path[3:] / angle if angle > 0.0 else np.zeros(3)
-        quaternion = np.append(np.sin(0.5 * angle) * axis, np.cos(0.5 * angle))
+        x, y, z = path[3:].tolist()
+        quaternion = np.array(rotation_of((x, y, z)))
         return HandSample(hand, path[:3].copy(), quaternion, now, inputs, now)
 
     def send_haptic(self, feedback: HapticFeedback) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.events import Event
+from q2r2_control.inputs.assembly import minimum_jerk
 from q2r2_control.inputs.headset import HeadsetServer, watch_of
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
@@ -77,11 +78,8 @@ class Operator:
             seen = self.frame * self.hands[hand]
             position = seen.translation + self._random.normal(0.0, self.noise, 3)
             frames.append(self.send_pose(hand, position, pin.Quaternion(seen.rotation).coeffs()) or b"")
-            frames.append(
-                self.headset.inputs(
-                    hand, hand in self.upper, hand in self.lower, (0.0, 0.0, 0.0, float(hand in self.grip))
-                )
-            )
+            analog = (0.0, 0.0, 0.0, float(hand in self.grip))
+            frames.append(self.headset.inputs(hand, hand in self.upper, hand in self.lower, analog))
         self._backlog += frames
         if not self.held_up:
             self.headset.send(b"".join(self._backlog))
@@ -101,8 +99,6 @@ class Operator:
         self.headset.send(self.headset.command("__topic_list"))
         self.headset.read_until("__topic_list", _PATIENCE)
 
-    # Scripts -----------------------------------------------------------------------------------------------------
-
     def press(self, *hands: str) -> Iterator[float]:
         """The lower buttons, which engage and pause."""
         self.lower |= set(hands)
@@ -121,8 +117,7 @@ class Operator:
         steps, starts = max(round(seconds / PERIOD), 1), dict(self.hands)
         whole = pin.Motion(np.array(list(way)), np.array(list(turn)))
         for index in range(1, steps + 1):
-            s = index / steps
-            done = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)  # least jerk (Flash and Hogan 1985)
+            done = minimum_jerk(index / steps)
             for hand, share in (("left", done), ("right", 0.9 * done)):
                 rotation = pin.exp3(share * whole.angular) @ starts[hand].rotation
                 self.hands[hand] = pin.SE3(rotation, starts[hand].translation + share * whole.linear)

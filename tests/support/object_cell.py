@@ -1,4 +1,7 @@
-"""The shipped cell with objects that its grippers hold."""
+"""The shipped cell with objects that its grippers hold.
+
+Or, as ``CELL``, with a block on the table, so near beside the left tool that its gripper opens about half there.
+"""
 
 from __future__ import annotations
 
@@ -27,3 +30,21 @@ def cell(left: dict[str, Any] | None, right: dict[str, Any] | None = None) -> Co
 def at(z: float, y: float = 0.25, x: float = 0.5) -> pin.SE3:
     """A tool that points down."""
     return pin.SE3(_DOWN, np.array([x, y, z]))
+
+
+_FRAME_TO_TIPS = 0.013  # [m]
+
+# The face nearest to the tool is 35 mm from its middle; a finger's outside is at 22 mm when closed and 47 mm when open.
+_BLOCK = {"shape": "box", "size": (0.1, 0.04, 0.015), "position": (0.5, 0.25 + 0.055, TABLE + 0.0075)}
+_DATA = load_config("config/dual_iiwa7.yaml").model_dump()
+_DATA["obstacles"]["block"] = _BLOCK
+CELL = Config.model_validate(_DATA)
+SETTINGS = CELL.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
+
+
+def tips_at(y: float, tips: float) -> pin.SE3:
+    """The left tool pointing down with its tips this far above the table [m]."""
+    return at(TABLE + _FRAME_TO_TIPS + tips, y)
+
+
+BESIDE, ABOVE = tips_at(0.25, 0.006), tips_at(0.25, 0.06)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-HANDS = ("left", "right")
+from q2r2_control.inputs.assembly import minimum_jerk
+from q2r2_control.quaternions import Quaternion, Vector, rotation_of, turned_by
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+HANDS = ("left", "right")
 
 HOLD = 0.12  # a button press [s]
 SECOND_HAND_LATER = 0.06  # no operator presses both hands at once [s]
@@ -42,10 +42,8 @@ class Script:
         phase = sum(2.0 * math.pi * _smooth(t, *circle) for circle in self.circles)
         y, z = RADIUS * math.sin(phase), RADIUS * (1.0 - math.cos(phase))
         x0, y0, z0 = START[hand]
-        rotation = _about("z", SWAY * math.sin(phase))
-        if hand == "left" and self.turn is not None:
-            rotation = _multiply(rotation, _about("x", TURN * _smooth(t, *self.turn)))
-        qx, qy, qz, qw = rotation
+        turned = TURN * _smooth(t, *self.turn) if hand == "left" and self.turn is not None else 0.0
+        qx, qy, qz, qw = turned_by(rotation_of((turned, 0.0, 0.0)), (0.0, 0.0, SWAY * math.sin(phase)))
         delay = 0.0 if hand == "left" else SECOND_HAND_LATER
         return Reading(
             hand=hand,
@@ -78,22 +76,4 @@ SCRIPTS = {"acceptance": acceptance_script, "circle": circle_script}
 
 
 def _smooth(t: float, start: float, end: float) -> float:
-    """0 before ``start``, 1 after ``end``, between them the polynomial of least jerk (Flash and Hogan 1985)."""
-    s = min(max((t - start) / (end - start), 0.0), 1.0)
-    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-
-
-def _about(axis: str, angle: float) -> Quaternion:
-    s = math.sin(0.5 * angle)
-    return (s if axis == "x" else 0.0, 0.0, s if axis == "z" else 0.0, math.cos(0.5 * angle))
-
-
-def _multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
+    return minimum_jerk((t - start) / (end - start))

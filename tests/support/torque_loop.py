@@ -12,7 +12,12 @@ from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, Reference, StepReport, StepStatus
-from tests.support.poses import pose_error
+
+
+def pose_error(wanted: pin.SE3, pose: pin.SE3) -> Array:
+    """Way from ``pose`` to ``wanted`` (6,): difference of positions [m], rotation vector [rad], in world axes."""
+    return np.concatenate([wanted.translation - pose.translation, pin.log3(wanted.rotation @ pose.rotation.T)])
+
 
 DT = 0.001
 _ROUNDING = 1e-9  # [Nm]
@@ -75,3 +80,11 @@ class TorqueLoop:
     def displacement(self, arm: str = "left") -> Array:
         """Way (6,) [m, rad] that the tool is away from where the run started, world axes."""
         return pose_error(self.robot.tool_pose(self.state.q, arm), self.start[arm])
+
+
+def left_arm(robot: Robot, q: Array) -> tuple[Array, Array]:
+    """Jacobian (6, 7) and inertia (7, 7) of the left arm."""
+    data, arm = robot.model.createData(), robot.arms["left"]
+    pin.computeJointJacobians(robot.model, data, q)
+    J = pin.getFrameJacobian(robot.model, data, arm.frame_id, pin.LOCAL_WORLD_ALIGNED)[:, arm.joints]
+    return J, pin.crba(robot.model, data, q)[np.ix_(arm.joints, arm.joints)]

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.inputs.assembly import minimum_jerk
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.played import HeadsetSampling
 from q2r2_control.types import SIDES, Array
@@ -62,8 +63,7 @@ def hand_pose(pose: pin.SE3) -> HandPose:
 def carry(t: float) -> pin.SE3:
     """To and fro by 0.35 m and 20 degrees, 1.2 s each way, with rests of 0.4 s."""
     stroke, phase = divmod(t, 1.6)
-    s = min(phase / 1.2, 1.0)
-    share = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    share = minimum_jerk(phase / 1.2)
     share = share if stroke % 2 == 0 else 1.0 - share
     way: Array = share * np.array([0.15, 0.3, 0.1])
     return pin.SE3(pin.exp3(np.array([0.0, 0.0, share * math.radians(20.0)])), way)

@@ -14,21 +14,15 @@ POSE = HandPose(np.array([0.1, -0.001, 2.0]), np.array([0.0, 0.0, 0.0, -1.0]), 0
 TOPIC = TopicStatistics(count=12, rate=75.0, age=0.25, last=POSE)
 
 
-def test_values_are_rounded_and_zero_has_no_sign() -> None:
-    assert short_text(POSE) == "0.10 0.00 2.00 m, quaternion 0.00 0.00 0.00 -1.00"
+def test_a_line_says_count_rate_age_and_rounded_values_or_that_nothing_came() -> None:
+    pose = "0.10 0.00 2.00 m, quaternion 0.00 0.00 0.00 -1.00"
+    assert topic_line("pose", TOPIC, False) == f"pose: 12 messages, 75 Hz, 0.25 s old: {pose}"
+    assert topic_line("pose", TOPIC, True).startswith("pose: timeout, 12 messages")
+    assert topic_line("pose", None, True) == "pose: timeout, nothing yet"
     assert short_text(HandTwist(np.array([1.0, 2.0, 3.0]), np.zeros(3))) == "1.00 2.00 3.00 m/s, 0.00 0.00 0.00 rad/s"
-
-
-def test_inputs_say_which_buttons_are_held() -> None:
     inputs = HandInputs(button_upper=True, button_lower=True, press_middle=1.0, thumb_stick_vertical=-0.5)
     assert short_text(inputs) == "held: upper lower, triggers 0.0 1.0, stick 0.0 -0.5"
     assert short_text(HandInputs()).startswith("held: none")
-
-
-def test_a_line_says_count_rate_and_age_or_that_nothing_came() -> None:
-    assert topic_line("pose", TOPIC, False).startswith("pose: 12 messages, 75 Hz, 0.25 s old: 0.10 0.00 2.00 m")
-    assert topic_line("pose", TOPIC, True).startswith("pose: timeout, 12 messages")
-    assert topic_line("pose", None, True) == "pose: timeout, nothing yet"
 
 
 def test_a_table_has_a_row_for_each_topic_and_marks_those_that_stopped() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pty
 import sys
@@ -15,37 +14,29 @@ import pytest
 from rich.console import Console
 
 from q2r2_control.config.bindings import BindingSettings
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import ActiveLimit, LimitKind
-from q2r2_control.viewer.live import LiveTable
-from tests.viewer.ticks import tick_at
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import ActiveLimit, ArmTarget, LimitKind
+from q2r2_control.viewer.live import LiveTable, next_press, why
+from q2r2_control.wording import SENTENCES
+from tests.cli.test_output import printed
+from tests.viewer.conftest import tick_at
 
 JOINTS = {side: [f"{side}_A{number}" for number in range(1, 8)] for side in ("left", "right")}
-
-
-def drawn(table: LiveTable) -> str:
-    console = Console(file=io.StringIO(), width=120)
-    console.print(table.render())
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
 
 
 def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot: Robot) -> None:
     table = LiveTable("demo", JOINTS, BindingSettings())
     table(tick_at(robot, 1.0, engaged=False))
-    table(tick_at(robot, 2.0, distance=0.0234))
-    text = drawn(table)
-    for expected in ("demo", "engaged", "3.0 mm", "5.73 deg", "50 %", "23.4 mm", "left_hand_0 | table_0", "2.0 s"):
+    table(replace(tick_at(robot, 2.0, distance=0.0234), held_grippers={"left": ("left_finger_0", "block_0")}))
+    text = printed(table.render(), 120)
+    for expected in (
+        *("demo", "engaged", "3.0 mm", "5.73 deg", "50 %", "23.4 mm", "left_hand_0 | table_0", "2.0 s"),
+        *("5.4 mm to spare", "left_link_5_0 | right_link_5_0", "left_finger_0 | block_0"),
+    ):
         assert expected in text
-    assert "5.4 mm to spare" in text
-    assert "left_link_5_0 | right_link_5_0" in text
     assert "paused" not in text
-
-
-def test_it_names_what_holds_a_gripper(robot: Robot) -> None:
-    table = LiveTable("demo", JOINTS, BindingSettings())
-    table(replace(tick_at(robot, 1.0), held_grippers={"left": ("left_finger_0", "block_0")}))
-    assert "left_finger_0 | block_0" in drawn(table)
 
 
 def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
@@ -54,12 +45,8 @@ def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Ro
     report = replace(tick.reference.report, binding=(ActiveLimit(LimitKind.VELOCITY, ("left_A2",)),))
     table(replace(tick, reference=replace(tick.reference, report=report)))
     table(tick)
-    assert "left_A2 velocity" in drawn(table)
-    assert "left_A2 velocity" not in drawn(table)
-
-
-def test_before_the_first_tick_it_says_that_the_run_is_starting() -> None:
-    assert "starting" in drawn(LiveTable("demo", JOINTS, BindingSettings()))
+    assert "left_A2 velocity" in printed(table.render(), 120)
+    assert "left_A2 velocity" not in printed(table.render(), 120)
 
 
 class Terminal:
@@ -103,9 +90,80 @@ def test_it_is_drawn_again_and_again_below_what_is_printed_and_wiped_away_at_the
     assert "\x1b[2K" in terminal.text[before:], "lines are cleared"
 
 
-def test_a_console_that_is_no_terminal_is_left_alone() -> None:
-    console = Console(file=io.StringIO())
-    with LiveTable("demo", JOINTS, BindingSettings()).shown(console):
-        pass
-    assert isinstance(console.file, io.StringIO)
-    assert not console.file.getvalue()
+FAST = ActiveLimit(LimitKind.VELOCITY, ("left_A2",))
+AT_LIMIT = ActiveLimit(LimitKind.POSITION, ("left_A4",))
+NEAR_TABLE = ActiveLimit(LimitKind.SEPARATION, ("left_hand_0", "table_0"))
+NEAR_ARM = ActiveLimit(LimitKind.SEPARATION, ("left_link_5_0", "right_link_5_0"))
+OTHER_ARM = ActiveLimit(LimitKind.SEPARATION, ("right_link_1_0", "right_link_5_0"))
+
+
+def words(tick: Tick, *binding: ActiveLimit, last: Event | None = None) -> str:
+    return why(tick, "left", JOINTS["left"], binding, last)
+
+
+@pytest.mark.parametrize(
+    ("binding", "expected"),
+    [
+        ((ActiveLimit(LimitKind.POSITION, ("right_A4",)), OTHER_ARM), "catches up"),
+        ((ActiveLimit(LimitKind.ACCELERATION, ("left_A4",)),), "catches up"),
+        ((AT_LIMIT, FAST), "left_A4 at its limit"),
+        ((FAST,), "left_A2 as fast as it may turn"),
+        ((FAST, NEAR_TABLE), "held by left_hand_0 | table_0"),
+        ((NEAR_TABLE, NEAR_ARM), "held by left_link_5_0 | right_link_5_0, 82 mm to spare"),
+    ],
+)
+def test_an_arm_that_is_away_from_its_target_is_held_by_what_is_at_work_on_it(
+    robot: Robot, binding: tuple[ActiveLimit, ...], expected: str
+) -> None:
+    assert words(tick_at(robot, 1.0), *binding) == expected
+
+
+def test_an_arm_that_is_at_its_target_follows_whatever_is_at_work(robot: Robot) -> None:
+    tick = tick_at(robot, 1.0)
+    targets = {arm: ArmTarget(pose, 1.0) for arm, pose in tick.tools.items()}
+    assert words(replace(tick, targets=targets), FAST) == "follows the hand"
+
+
+@pytest.mark.parametrize(
+    ("source", "destination", "kind", "expected"),
+    [
+        ("engaged", "lost", ReasonKind.CONNECTION_LOST, "lost: connection lost"),
+        ("aligning", "engaged", ReasonKind.ALIGNED, "engaged: aligned anew"),
+        ("paused", "paused", ReasonKind.NO_RECORDING, SENTENCES[ReasonKind.NO_RECORDING]),
+    ],
+)
+def test_an_arm_that_is_not_engaged_says_what_stopped_it(
+    robot: Robot, source: str, destination: str, kind: ReasonKind, expected: str
+) -> None:
+    paused = replace(tick_at(robot, 1.0, engaged=False), states={"left": destination, "right": "idle"})
+    assert words(paused, last=Event(0.5, "left", source, destination, Reason(kind))) == expected
+
+
+def test_before_its_first_event_and_while_aligning_it_says_so_too(robot: Robot) -> None:
+    paused = tick_at(robot, 1.0, engaged=False)
+    assert words(paused) == "not engaged yet"
+    aligning = replace(paused, states={"left": "aligning", "right": "aligning"})
+    chord = Event(0.5, "left", "engaged", "aligning", Reason(ReasonKind.ALIGNMENT_CHORD))
+    assert words(aligning, last=chord) == "aligning"
+    assert words(replace(paused, following=False)) == "the run ends"
+    assert press(aligning) == "release both buttons to go on"
+
+
+def press(tick: Tick, **bindings: str) -> str:
+    return next_press(tick, "left", BindingSettings.model_validate(bindings))
+
+
+def test_the_next_press_is_told_by_state_and_gripper(robot: Robot) -> None:
+    engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
+    assert press(engaged) == "lower pauses, upper closes the gripper"
+    closed = {arm: ArmTarget(None, 0.0) for arm in paused.targets}
+    assert press(replace(paused, targets=closed)) == "lower engages, upper opens the gripper"
+    assert press(replace(paused, connected=False)) == "nothing: no input is connected"
+
+
+def test_the_next_press_is_that_of_the_control_that_is_bound(robot: Robot) -> None:
+    engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
+    assert press(paused, lower="gripper_toggle", upper="pause_toggle") == "upper engages, lower closes the gripper"
+    dead_man = {"lower": "none", "upper": "none", "grip": "dead_man", "trigger": "precision"}
+    assert press(paused, **dead_man) == "grip held engages"
+    assert press(engaged, **dead_man) == "grip let go pauses"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import pinocchio as pin
@@ -16,13 +15,8 @@ from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# Peer -> the package that it needs, which is the name of its module here too.
-PEERS = {
-    "roboplan": "roboplan",
-    "roboplan, 10 nearest": "roboplan",
-    "mink": "mink",
-    "pink, 10 nearest": "pink",
-}
+# Peer -> the package that it needs, whose name its module and its class have here.
+PEERS = {"roboplan": "roboplan", "roboplan, 10 nearest": "roboplan", "mink": "mink", "pink, 10 nearest": "pink"}
 WITHOUT_ACCELERATION_LIMIT = ("mink",)
 INSTALL = "pip install 'q2r2_control[bench]'"
 NEAREST_ROWS = 10  # separation rows of a peer that is given the nearest pairs only
@@ -45,66 +39,30 @@ class BenchController(Protocol):
         """The tick after a failure: the same positions, at rest."""
 
 
-@dataclass(frozen=True, slots=True)
 class PeerSettings:
-    """Our settings in the units of the peers: gains per tick, limits with our margins."""
+    """Our settings in the units of the peers, for ticks of ``dt`` [s]: gains per tick, limits with our margins."""
 
-    robot: Robot
-    config: Config
-    dt: float  # [s]
-
-    @property
-    def position_gain(self) -> float:
-        """Part of the tool's position error that a tick removes."""
-        return self.config.control.position_gain * self.dt
-
-    @property
-    def posture_gain(self) -> float:
-        """Part of the posture error that a tick removes."""
-        return self.config.control.posture_gain * self.dt
-
-    @property
-    def posture_cost(self) -> float:
-        """Square root of the posture's weight against the tool's 1."""
-        return float(self.config.control.posture_weight**0.5)
-
-    @property
-    def velocity(self) -> Array:
-        """(nv,) [rad/s]"""
-        return self.robot.velocity_limit * self.config.control.velocity_scale
-
-    @property
-    def acceleration(self) -> Array:
-        """(nv,) [rad/s^2]"""
-        return self.robot.capped_acceleration(self.config.control.acceleration_limit)
-
-    @property
-    def lower(self) -> Array:
-        """(nv,) [rad]"""
-        return self.robot.position_lower + self.config.control.position_margin
-
-    @property
-    def upper(self) -> Array:
-        """(nv,) [rad]"""
-        return self.robot.position_upper - self.config.control.position_margin
-
-    @property
-    def min_distance(self) -> float:
-        """The smallest distance that we keep of any pair [m]: peers know one for all, and none is refused our work."""
-        return float(
-            kept_distances(self.robot, self.config.control).values.min(initial=self.config.control.min_distance)
-        )
-
-    def home_of_others(self) -> dict[str, float]:
-        """Home positions of joints that move no tool, such as fingers."""
-        home = compose(self.config).home
-        return {name: value for name, value in home.items() if name not in self.robot.joint_names}
+    def __init__(self, robot: Robot, config: Config, dt: float) -> None:
+        control = config.control
+        self.robot, self.config, self.dt = robot, config, dt
+        self.position_gain = control.position_gain * dt  # part of the tool's position error that a tick removes
+        self.posture_gain = control.posture_gain * dt  # part of the posture error that a tick removes
+        self.posture_cost = float(control.posture_weight**0.5)  # square root of its weight against the tool's 1
+        self.velocity = robot.velocity_limit * control.velocity_scale  # (nv,) [rad/s]
+        self.acceleration = robot.capped_acceleration(control.acceleration_limit)  # (nv,) [rad/s^2]
+        self.lower = robot.position_lower + control.position_margin  # (nv,) [rad]
+        self.upper = robot.position_upper - control.position_margin  # (nv,) [rad]
+        # The smallest distance that we keep of any pair: peers know one for all, and none is refused our work [m].
+        self.min_distance = float(kept_distances(robot, control).values.min(initial=control.min_distance))
+        home = compose(config).home.items()
+        # Home positions of joints that move no tool, such as fingers.
+        self.home_of_others = {name: value for name, value in home if name not in robot.joint_names}
 
 
 def make_peer(name: str, setup: PeerSettings) -> BenchController:
     """Build a peer of ``PEERS``. Raises what its package raises."""
     module = importlib.import_module(f"q2r2_control.benchmark.peers.{PEERS[name]}")
-    peer: BenchController = module.make(setup, name)
+    peer: BenchController = getattr(module, PEERS[name].capitalize())(setup, name)
     return peer
 
 
@@ -115,19 +73,16 @@ def is_installed(name: str) -> bool:
 
 def build_peers(names: Sequence[str], setup: PeerSettings) -> tuple[list[BenchController], list[str]]:
     """The peers that can be built, and a line on each of ``names``: its limitations, or why there is none."""
-    peers: list[BenchController] = []
-    notes = []
+    peers, notes = list[BenchController](), list[str]()
     for name in names:
         if not is_installed(name):
             notes.append(f"{name}: not installed; {INSTALL}")
             continue
         try:
-            peer = make_peer(name, setup)
+            peers.append(make_peer(name, setup))
+            notes.append(f"{name}: {peers[-1].limitations}")
         except Exception as error:  # a package of another version may raise anything
             notes.append(f"{name}: cannot be built for this cell: {type(error).__name__}: {error}")
-            continue
-        peers.append(peer)
-        notes.append(f"{name}: {peer.limitations}")
     return peers, notes
 
 
@@ -141,21 +96,19 @@ class Leading:
         self._last: Mapping[str, pin.SE3] = {}
 
     def reset(self, q: Array) -> None:
-        """See :class:`BenchController`."""
         self._last = {}
         self._peer.reset(q)
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """See :class:`BenchController`."""
-        last, self._last = self._last or targets, targets
-        return self._peer.step({arm: self._ahead(last[arm], pose, dt) for arm, pose in targets.items()}, dt)
+        """The peer's, towards where each target would be after 1 / gain, going on as since the last tick."""
+        before, self._last = self._last or targets, targets
+        share, ahead = 1.0 / (self._gain * dt), {}
+        for arm, pose in targets.items():
+            last = before[arm]
+            turn = pin.exp3(share * pin.log3(pose.rotation @ last.rotation.T))
+            way = share * (pose.translation - last.translation)
+            ahead[arm] = pin.SE3(turn @ pose.rotation, pose.translation + way)
+        return self._peer.step(ahead, dt)
 
     def hold(self) -> tuple[Array, Array]:
-        """See :class:`BenchController`."""
         return self._peer.hold()
-
-    def _ahead(self, last: pin.SE3, pose: pin.SE3, dt: float) -> pin.SE3:
-        """Where ``pose`` would be after 1 / gain, going on as since the ``last`` tick, in a straight line."""
-        share = 1.0 / (self._gain * dt)
-        turn = pin.exp3(share * pin.log3(pose.rotation @ last.rotation.T))
-        return pin.SE3(turn @ pose.rotation, pose.translation + share * (pose.translation - last.translation))

@@ -25,9 +25,7 @@ from q2r2_control.types import Array
 class Mink:
     """See the module."""
 
-    limitations = (
-        "no acceleration limit; no braking distance to pairs; no pairs of a body and its parent; no certificate"
-    )
+    limitations = "no acceleration limit; no braking distance to pairs; no pairs of body and parent; no certificate"
 
     def __init__(self, setup: PeerSettings, name: str) -> None:
         self.name = name
@@ -42,7 +40,7 @@ class Mink:
         for joint, lower, upper in zip(joints, setup.lower, setup.upper, strict=True):
             self._model.jnt_range[joint.id] = lower, upper
         self._rest = self._model.qpos0.copy()
-        for name, value in setup.home_of_others().items():
+        for name, value in setup.home_of_others.items():
             self._rest[self._model.joint(name).qposadr[0]] = value
         self._configuration = mink.Configuration(self._model)
         self._tasks = {
@@ -75,11 +73,9 @@ class Mink:
         return full
 
     def reset(self, q: Array) -> None:
-        """See :class:`BenchController`."""
         self._configuration.update(self._full(q))
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """See :class:`BenchController`."""
         for arm, task in self._tasks.items():
             task.set_target(mink.SE3.from_matrix(targets[arm].homogeneous))
         v = mink.solve_ik(
@@ -94,7 +90,6 @@ class Mink:
         return self._configuration.q[self._q_index], v[self._v_index]
 
     def hold(self) -> tuple[Array, Array]:
-        """See :class:`BenchController`."""
         return self._configuration.q[self._q_index], np.zeros(len(self._v_index))
 
 
@@ -106,8 +101,3 @@ def _mujoco_names(urdf: str) -> dict[str, str]:
         for index, shape in enumerate(link.findall("collision"))
     }
     return shapes | {f"{FLOOR}_0": FLOOR}  # a plane in the simulation
-
-
-def make(setup: PeerSettings, name: str) -> Mink:
-    """Build it for a cell."""
-    return Mink(setup, name)

@@ -28,7 +28,6 @@ class Pink:
 
     def __init__(self, setup: PeerSettings, name: str) -> None:
         self.name = name
-        control = setup.config.control
         self._collision_model = setup.robot.collision_model
         self._model = setup.robot.model.copy()
         self._model.lowerPositionLimit, self._model.upperPositionLimit = setup.lower, setup.upper
@@ -40,25 +39,18 @@ class Pink:
         self._posture = PostureTask(cost=setup.posture_cost, gain=setup.posture_gain)
         self._posture.set_target(self._home)
         self._acceleration = AccelerationLimit(self._model, setup.acceleration)
-        self._limits = [
-            ConfigurationLimit(self._model),
-            VelocityLimit(self._model, setup.velocity),
-            self._acceleration,
-        ]
-        pairs = len(self._collision_model.collisionPairs)
-        self._barriers = [
-            SelfCollisionBarrier(
-                min(NEAREST_ROWS, pairs),
-                gain=control.separation_gain,
-                d_min=setup.min_distance,
-                safe_displacement_gain=0.0,
-            )
-        ]
+        velocity = VelocityLimit(self._model, setup.velocity)
+        self._limits = [ConfigurationLimit(self._model), velocity, self._acceleration]
+        self._barrier = SelfCollisionBarrier(
+            min(NEAREST_ROWS, len(self._collision_model.collisionPairs)),
+            gain=setup.config.control.separation_gain,
+            d_min=setup.min_distance,
+            safe_displacement_gain=0.0,
+        )
         self._dt = setup.dt
         self.reset(self._home)
 
     def reset(self, q: Array) -> None:
-        """See :class:`BenchController`."""
         self._configuration = pink.Configuration(
             self._model,
             self._model.createData(),
@@ -69,7 +61,6 @@ class Pink:
         self._acceleration.set_last_integration(np.zeros(self._model.nv), self._dt)
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """See :class:`BenchController`."""
         for arm, task in self._tasks.items():
             task.set_target(targets[arm])
         v = pink.solve_ik(
@@ -78,19 +69,13 @@ class Pink:
             dt,
             solver="daqp",
             limits=self._limits,
-            barriers=self._barriers,
+            barriers=[self._barrier],
         )
         self._configuration.integrate_inplace(v, dt)
         self._acceleration.set_last_integration(v, dt)
         return self._configuration.q.copy(), v
 
     def hold(self) -> tuple[Array, Array]:
-        """See :class:`BenchController`."""
         v = np.zeros(self._model.nv)
         self._acceleration.set_last_integration(v, self._dt)
         return self._configuration.q.copy(), v
-
-
-def make(setup: PeerSettings, name: str) -> Pink:
-    """Build it for a cell."""
-    return Pink(setup, name)

@@ -49,7 +49,7 @@ class Roboplan:
         self._ik = optimal_ik.Oink(self._scene, _GROUP, solver)
         self._indices = np.array(self._ik.q_indices)
         self._rest = np.array(self._scene.getCurrentJointPositions())
-        for joint, value in setup.home_of_others().items():
+        for joint, value in setup.home_of_others.items():
             self._rest[self._scene.getJointPositionIndices([joint])] = value
         nv = robot.model.nv
         self._frame_tasks = {arm: self._frame_task(setup, arm) for arm in robot.arms}
@@ -61,26 +61,17 @@ class Roboplan:
         )
         self._tasks = [*self._frame_tasks.values(), posture]
         self._acceleration = optimal_ik.AccelerationLimit(self._ik, dt, setup.acceleration)
-        self._constraints = [
-            optimal_ik.PositionLimit(self._ik),
-            optimal_ik.VelocityLimit(self._ik, dt, setup.velocity),
-            self._acceleration,
-        ]
+        velocity = optimal_ik.VelocityLimit(self._ik, dt, setup.velocity)
+        self._constraints = [optimal_ik.PositionLimit(self._ik), velocity, self._acceleration]
         pairs = len(robot.collision_model.collisionPairs)
-        self._barriers = [
-            optimal_ik.SelfCollisionBarrier(
-                self._ik,
-                self._scene,
-                dt,
-                optimal_ik.SelfCollisionBarrierOptions(
-                    n_collision_pairs=max(1, NEAREST_ROWS if "nearest" in name else pairs),
-                    gain=control.separation_gain,
-                    d_min=setup.min_distance,
-                    safe_displacement_gain=0.0,
-                    d_max=DETECTION_DISTANCE,
-                ),
-            )
-        ]
+        barrier = optimal_ik.SelfCollisionBarrierOptions(
+            n_collision_pairs=max(1, NEAREST_ROWS if "nearest" in name else pairs),
+            gain=control.separation_gain,
+            d_min=setup.min_distance,
+            safe_displacement_gain=0.0,
+            d_max=DETECTION_DISTANCE,
+        )
+        self._barriers = [optimal_ik.SelfCollisionBarrier(self._ik, self._scene, dt, barrier)]
         self.reset(robot.home)
 
     def _frame_task(self, setup: PeerSettings, arm: str) -> optimal_ik.FrameTask:
@@ -94,13 +85,11 @@ class Roboplan:
         return optimal_ik.FrameTask(self._ik, self._scene, goal, options)
 
     def reset(self, q: Array) -> None:
-        """See :class:`BenchController`."""
         self._q = self._rest.copy()
         self._q[self._indices] = q
         self._acceleration.reset()
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """See :class:`BenchController`."""
         for arm, task in self._frame_tasks.items():
             task.setTargetFrameTransform(targets[arm].homogeneous)
         step = np.zeros(len(self._indices))
@@ -111,7 +100,6 @@ class Roboplan:
         return self._q[self._indices], v
 
     def hold(self) -> tuple[Array, Array]:
-        """See :class:`BenchController`."""
         self._acceleration.reset()
         return self._q[self._indices], np.zeros(len(self._indices))
 
@@ -156,8 +144,3 @@ def _watch_pairs(scene: core.Scene, robot: Robot) -> None:
     pairs = list(combinations(links, 2))
     scene.setCollisions([pair for pair in pairs if frozenset(pair) in watched], True)
     scene.setCollisions([pair for pair in pairs if frozenset(pair) not in watched], False)
-
-
-def make(setup: PeerSettings, name: str) -> Roboplan:
-    """Build it for a cell; ``name`` says which pairs get rows."""
-    return Roboplan(setup, name)

@@ -1,0 +1,198 @@
+"""Commands on recordings: ``q2r2 replay``, ``judge``, ``report`` and ``export``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from rich.markup import escape
+from typer import Argument, Exit, Option
+
+from q2r2_control.cli.cell_run import check_window, show_window
+from q2r2_control.cli.output import (
+    Json,
+    as_json_text,
+    counting,
+    figure_table,
+    notice_of_compiling,
+    say,
+    summary_table,
+    verdict_markup,
+)
+from q2r2_control.config.cell import load_config
+from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.export.csv_tables import gather_tables, move_table, write_table
+from q2r2_control.export.episodes import FASTEST, FrameSampling
+from q2r2_control.export.hdf5 import gather_files, require_h5py, write_file
+from q2r2_control.export.kept_episodes import Output, Write, keep_episodes
+from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
+from q2r2_control.judging.judge import Judged, judge_all
+from q2r2_control.judging.page import COLUMNS, page_of
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.recording.reader import recordings_in
+from q2r2_control.recording.replay import replay as replay_recording
+
+_SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
+
+Recordings = Annotated[list[Path], Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them.")]
+Thresholds = Annotated[str | None, Option(metavar="CONFIG", help="The cell whose thresholds to use instead.")]
+
+
+def replay(
+    file: Annotated[str, Argument(metavar="FILE", help="The .mcap of q2r2 run --record, or its folder.")],
+    compare: Annotated[bool, Option("--compare", help="Say what first differs, or identical; exit 1 or 0.")] = False,
+    config: Annotated[str | None, Option(metavar="CONFIG", help="Another cell than the recorded one.")] = None,
+    plant: Annotated[str | None, Option(metavar="NAME", help="Let it move, and measure it.")] = None,
+    viewer: Annotated[bool, Option("--viewer", help="With --plant mujoco: its window, in real time.")] = False,
+    json: Json = False,
+) -> None:
+    """Give a recorded run's hand samples and measured states to the same loop again, tick by tick.
+
+    With the same version and cell all commands are the same to the bit. Lines on stderr say what is not as it was.
+    With --plant the measured states are those of a plant that moves.
+    """
+    if viewer:
+        check_window(plant)
+
+    def prepare(pipeline: Pipeline) -> None:
+        if viewer:
+            show_window(pipeline, paced=True)
+
+    cell = None if config is None else load_config(config)
+    with notice_of_compiling():
+        result = replay_recording(Path(file), cell, plant, compare=compare, prepare=prepare)
+    for note in result.notes:
+        say(note, style="yellow")
+    if result.ended_by is not None:
+        say(f"ended after {result.ticks} ticks: {result.ended_by}")
+    if json:
+        data = {"ticks": result.ticks, "ended_by": result.ended_by, "notes": result.notes}
+        difference = {"difference": result.difference} if compare else {}
+        arms = {} if plant is None else {"plant": plant, "arms": result.arms}
+        summary = None if result.summary is None else result.summary.as_json()
+        print(as_json_text({**data, **difference, **arms, "summary": summary}))
+    else:
+        if compare:
+            print("identical" if result.difference is None else f"first difference at {result.difference}")
+        elif result.summary is not None:
+            Console().print(summary_table(result.summary))
+        for name, arm in result.arms.items():
+            off = f"{arm.position_mm_rms:.3f} mm RMS, {arm.position_mm_max:.3f} mm and {arm.rotation_deg_max:.3f} deg"
+            print(f"{name} arm: tool {off} at most from where it was when recorded")
+    if compare and result.difference is not None:
+        raise Exit(1)
+
+
+def judge(recordings: Recordings, config: Thresholds = None, json: Json = False) -> None:
+    """Say of each recorded episode whether to keep or to discard it, why, and by which numbers.
+
+    Thresholds are those of the recorded cell, its block `judge`. Exit code 2 for a file that is no recording.
+    """
+    judged = _judged(recordings, config)
+    if json:
+        print(as_json_text({"episodes": [one.as_json() for one in judged]}))
+        return
+    columns = [column for column in COLUMNS if column.name in _SHOWN]  # of several hands or arms the worst number
+    kept, console = sum(one.verdict.keep for one in judged), Console()
+    table = figure_table(
+        f"episodes: {kept} kept, {len(judged) - kept} discarded",
+        ("episode", "verdict", *(column.heading for column in columns)),
+        ((one.figures.name, one.verdict.word, *(column.text(one.figures) for column in columns)) for one in judged),
+    )
+    console.print(table)
+    for one in judged:
+        if not one.verdict.keep:
+            name = one.figures.file + ("" if one.figures.part is None else f" #{one.figures.part}")
+            console.print(f"{escape(name)}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
+
+
+def report(
+    recordings: Recordings,
+    output: Annotated[Path, Option(metavar="HTML", help="The page to write; one that exists is replaced.")],
+    config: Thresholds = None,
+) -> None:
+    """Write one HTML page of recorded episodes: verdicts, numbers and plots. It needs no network to be looked at."""
+    if output.is_dir() or not output.parent.is_dir():
+        raise ConfigError(f"--output {output}: allowed: a file in a folder that exists")
+    judged, names = _judged(recordings, config), ", ".join(map(str, recordings))
+    with counting("plots") as progress:
+        page = page_of(judged, f"Recordings: {names}", lambda done: progress("", done, len(judged)))
+    try:
+        output.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--output {output}: {error.strerror}") from error
+    kept = sum(one.verdict.keep for one in judged)
+    print(f"{output}: {len(judged)} episodes, {kept} kept, {len(judged) - kept} discarded")
+
+
+def _judged(recordings: Sequence[Path], config: str | None) -> list[Judged]:
+    settings = None if config is None else load_config(config).judge
+    files, judged = recordings_in(recordings), list[Judged]()
+    with counting("recordings") as progress:
+        for one in judge_all(files, settings):
+            judged.append(one)
+            progress("", len(judged), max(len(judged), len(files)))
+    return judged
+
+
+class Format(StrEnum):
+    """What recordings become."""
+
+    LEROBOT = "lerobot"
+    HDF5 = "hdf5"
+    CSV = "csv"
+
+
+def export(
+    format: Annotated[Format, Argument(metavar="[lerobot|hdf5|csv]", help="What to make.")],
+    recordings: Recordings,
+    output: Annotated[Path, Option(metavar="OUT", help="A new folder, or for csv of one recording a new .csv file.")],
+    fps: Annotated[int, Option(help=f"Frames per second: 1 .. {FASTEST}.")] = 30,
+    trim: Annotated[bool, Option("--trim", help="Leave out times before and after motion.")] = False,
+    workers: Annotated[int, Option(min=1, help="Processes; the result is the same for any number.")] = 1,
+    skip_bad: Annotated[bool, Option("--skip-bad", help="Go on without bad recordings, and name them.")] = False,
+    no_pictures: Annotated[bool, Option("--no-pictures", help="Leave out what cameras recorded.")] = False,
+) -> None:
+    """Make a dataset to train on of recordings of q2r2 run --record, an episode each.
+
+    lerobot: a LeRobotDataset, with a video of each camera; needs the extra `lerobot`. hdf5: a file each, for trainers
+    of ACT; needs the extra `export`. csv: tables of the same numbers.
+    """
+    write: Write = write_table
+    join: Callable[[Sequence[Path], Path], None] = gather_tables
+    if format is Format.LEROBOT:
+        require_lerobot()
+        write, join = write_shard, join_shards
+    elif format is Format.HDF5:
+        require_h5py()
+        write, join = write_file, gather_files
+    elif output.suffix == ".csv":
+        if len(files := recordings_in(recordings)) > 1:
+            raise ConfigError(f"--output {output}: for {len(files)} recordings; allowed: a folder, or one recording")
+        join = move_table
+    sampling = FrameSampling(fps, trim, pictures=not no_pictures and format is not Format.CSV)
+    target, files = Output(output), recordings_in(recordings)
+    try:
+        with counting("recordings") as progress:
+            made = keep_episodes(
+                files,
+                sampling,
+                write,
+                target.episodes(),
+                workers=workers,
+                skip_bad=skip_bad,
+                progress=lambda done: progress("", done, max(done, len(files))),
+            )
+    finally:
+        target.tidy()
+    for fault in made.skipped:
+        say(f"skipped: {fault}", style="yellow")
+    if not made.kept:
+        raise RecordingError("none of the recordings can be exported")
+    target.write(lambda path: join(made.kept, path))
+    whole = len(made.kept) + len(made.skipped) == len(files)
+    count = f"{len(made.kept)} of" if whole else f"{len(made.kept)} episodes of"
+    print(f"{output}: {count} {len(files)} recordings at {fps} frames per second")
