@@ -19,7 +19,7 @@ need_ros()
 from geometry_msgs.msg import PoseStamped
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from q2r2_control.ros.monitoring.endpoints import WatchedPublisher, node_of
+from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 
 _LOST = "_NODE_NAME_UNKNOWN_"  # as rcl says
 TIMEOUT = 0.5  # longer than an acknowledgement takes on an overloaded machine [s]

@@ -6,7 +6,7 @@ import ast
 
 import pytest
 
-from q2r2_control.ros.watching.environment import PACKAGES, examine_environment
+from q2r2_control.ros.watching.findings import PACKAGES, examine_environment
 from tests.ros.processes import ROOT
 
 ROS = ROOT / "q2r2_control" / "ros"

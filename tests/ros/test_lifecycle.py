@@ -1,4 +1,4 @@
-"""Controller and robot as managed nodes: rest before the answer, no commands while inactive, and no jump later."""
+"""The controller as a managed node: rest before the answer, no commands while inactive, and no jump later."""
 
 from __future__ import annotations
 
@@ -32,31 +32,25 @@ STILL = 5e-3  # [rad]
 
 
 class Managed(Cell):
-    """A cell whose nodes' states can be changed, and the joint commands that come."""
+    """A cell whose controller's state can be changed, and the joint commands that come."""
 
     def __init__(self, node: Any, robot: Robot, *processes: Any) -> None:
         super().__init__(node, robot, *processes)
         self.commands: list[JointTrajectory] = []
         node.create_subscription(JointTrajectory, "/joint_trajectory", self.commands.append, STREAM_QOS)
         self.commander = node.create_publisher(JointTrajectory, "/joint_trajectory", 1)
-        self._clients = {
-            name: (
-                node.create_client(ChangeState, f"/{name}/change_state"),
-                node.create_client(GetState, f"/{name}/get_state"),
-            )
-            for name in ("cartesian_controller", "mujoco_robot")
-        }
+        self._change = node.create_client(ChangeState, "/cartesian_controller/change_state")
+        self._get = node.create_client(GetState, "/cartesian_controller/get_state")
 
-    def ask(self, transition: int, name: str = "cartesian_controller") -> bool:
+    def ask(self, transition: int) -> bool:
         """Whether the node says that it did it."""
-        change = self._clients[name][0]
-        wait_until(change.service_is_ready, "the lifecycle's services are there")
-        future = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        wait_until(self._change.service_is_ready, "the lifecycle's services are there")
+        future = self._change.call_async(ChangeState.Request(transition=Transition(id=transition)))
         wait_until(future.done, "the transition is answered")
         return bool(future.result().success)
 
-    def lifecycle(self, name: str = "cartesian_controller") -> str:
-        future = self._clients[name][1].call_async(GetState.Request())
+    def lifecycle(self) -> str:
+        future = self._get.call_async(GetState.Request())
         wait_until(future.done, "the state is answered")
         return str(future.result().current_state.label)
 
@@ -87,6 +81,7 @@ def test_it_starts_active_and_comes_to_rest_before_it_answers_that_it_is_not(cel
     wait_until(lambda: np.abs(cell.joints.states[-1].v).max() > 0.05, "the arm moves")
     assert cell.ask(Transition.TRANSITION_DEACTIVATE)
     assert cell.lifecycle() == "inactive"
+    assert not cell.ask(Transition.TRANSITION_CLEANUP)
     last = np.array(cell.commands[-1].points[0].velocities)
     assert np.abs(last).max() < 1e-3  # the last command is one at rest
     time.sleep(0.3)
@@ -134,21 +129,6 @@ def test_it_does_not_take_over_from_a_node_that_still_commands(cell: Managed, ro
     cell.node.destroy_timer(timer)
     time.sleep(0.5)
     assert cell.ask(Transition.TRANSITION_ACTIVATE)
-
-
-def test_a_robot_that_is_deactivated_takes_no_commands_and_stands(cell: Managed, robot: Robot) -> None:
-    if cell.lifecycle() == "active":
-        assert cell.ask(Transition.TRANSITION_DEACTIVATE)
-    assert cell.ask(Transition.TRANSITION_DEACTIVATE, "mujoco_robot")
-    before, goal = cell.q.copy(), cell.q.copy()
-    goal[0] += 0.2
-    cell.move_by_another(goal, 0.5)
-    assert np.abs(cell.q - before).max() < STILL
-    wait_until(lambda: cell.state("lifecycle", "mujoco_robot") == "inactive", "its state says so")
-    assert not cell.ask(Transition.TRANSITION_CLEANUP, "mujoco_robot")
-    assert cell.ask(Transition.TRANSITION_ACTIVATE, "mujoco_robot")
-    cell.move_by_another(goal)
-    assert abs(cell.q[0] - goal[0]) < 0.02
 
 
 @pytest.mark.parametrize("output", ["velocity", "torque"])

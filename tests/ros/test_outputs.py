@@ -33,7 +33,7 @@ from q2r2_control.ros.bridge.joint_outputs import (
     TorqueArray,
     make_output,
 )
-from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
+from q2r2_control.ros.monitoring import WatchedPublisher
 from q2r2_control.types import Command, CommandMode, RobotState
 
 TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]

@@ -218,7 +218,7 @@ def test_topics_are_silent_without_a_headset_and_a_headset_of_the_other_dialect_
 
 
 def test_frozen_poses_are_left_out_with_one_line(node: Any, processes: Processes) -> None:
-    process, address = start_endpoint(processes, "frozen_time:=0.3")
+    process, address = start_endpoint(processes)
     hand, deadline = Hand(node, "left"), time.monotonic() + PATIENCE
     with KeepaliveHeadset(address) as headset:
         headset.send(headset.registrations())

@@ -15,8 +15,8 @@ from importlib import import_module
 NODES = {
     "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),
     "SimulationInput": ("simulation_input", "SimulationInput"),
-    "hand_input": ("hand_input", "HandInput"),
-    "CheckTCPconnection": ("check_tcp_connection", "CheckTcpConnection"),
+    "hand_input": ("simulation_input", "HandInput"),
+    "CheckTCPconnection": ("tcp_endpoint", "CheckTcpConnection"),
     "cartesian_controller": ("cartesian_controller", "CartesianControllerNode"),
     "mujoco_robot": ("mujoco_robot", "MujocoRobot"),
     "recorder": ("recorder", "RecorderNode"),

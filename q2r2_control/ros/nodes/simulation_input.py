@@ -1,4 +1,4 @@
-"""``SimulationInput``: publishes the messages of a headset from a script, for tests with an input free of tremor."""
+"""``SimulationInput`` publishes a headset's messages from a script free of tremor, ``hand_input`` from any input."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from q2r2_control.config.cell import load_config
+from q2r2_control.inputs.base import make_input
 from q2r2_control.inputs.messages import HandTwist, MessageType
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.inputs.trajectories import FIRST_PRESS, START, TRAJECTORIES
 from q2r2_control.ros.base_node import OK, WARN, BaseNode
-from q2r2_control.ros.bridge.hand_topics import HandPublishers
-from q2r2_control.ros.monitoring.node_states import HandListeners
+from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_haptics
+from q2r2_control.ros.monitoring import HandListeners
 from q2r2_control.types import SIDES, HandSample
 
 _SHORTEST, _LONGEST = 0.001, 0.02  # between two looks at what has come due [s]
@@ -50,9 +52,8 @@ class SimulationInput(BaseNode):
         self._frame = self.parameter("frame_id", "", "Frame of the poses; a headset gives none.")
         self._waits_for_subscribers = True
         self._hands = SIDES if side == "both" else (side,)
-        self._title = f"{trajectory} of {' and '.join(self._hands)}"
+        self._title, self._samples = f"{trajectory} of {' and '.join(self._hands)}", 0
         self._hand_publishers = HandPublishers(self, self._hands, _MODES[mode])
-        self._samples = 0
         self._trajectory, self._rate, self._jitter = trajectory, rate, jitter
         self._listeners = HandListeners(self, self._hands if MessageType.INPUTS in _MODES[mode] else ())
         self._starts = True  # until nothing is pressed again to engage the arms
@@ -63,7 +64,6 @@ class SimulationInput(BaseNode):
         self._timer = self.create_tick(_LONGEST, self._tick)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """What is played, or which subscriber is missing."""
         values = {"samples": self._samples, "sent": self._hand_publishers.sent}
         if self._waits_for_subscribers:
             return WARN, f"waits for a subscriber of {' and '.join(self._missing())}", values
@@ -129,3 +129,41 @@ class SimulationInput(BaseNode):
         twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
         self._hand_publishers.publish_sample(sample, self._frame, HandTwist(twist.linear, twist.angular))
         self._samples += 1
+
+
+_PERIOD = 0.002  # between two polls [s]
+
+
+class HandInput(BaseNode):
+    """Polls an input and publishes each sample. A pose with a fault is left out, so that its arm pauses.
+
+    Raises :class:`ConfigError` for an unknown input or control.
+    """
+
+    ticks = True
+    priority = 37
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("hand_input", **kwargs)
+        config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
+        name = self.parameter("input", config.input, "An installed input.")
+        self._input = make_input(name, config)
+        config.teleop.bindings.check_device(self._input.controls)
+        self._title, self._samples = name, 0
+        self._hand_publishers = HandPublishers(self, kinds=(MessageType.POSE, MessageType.INPUTS))
+        subscribe_to_haptics(self, self._input.send_haptic)
+        self._input.start()
+        self.create_timer(_PERIOD, self._tick)
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        values = {"samples": self._samples, "sent": self._hand_publishers.sent}
+        connected = self._input.connected
+        return OK if connected else WARN, self._title if connected else f"{self._title} is not connected", values
+
+    def close(self) -> None:
+        self._input.close()
+
+    def _tick(self) -> None:
+        for sample in self._input.poll(self.now):
+            self._hand_publishers.publish_sample(sample)
+            self._samples += 1
