@@ -50,10 +50,6 @@ class TickExecutor(SingleThreadedExecutor):
         node.tick_group.is_taken = self._changed = True
         return bool(super().add_node(node))
 
-    def remove_node(self, node: Any) -> None:
-        node.tick_group.is_taken, self._changed = False, True
-        super().remove_node(node)
-
     def wake(self) -> None:
         self._changed = True
         super().wake()

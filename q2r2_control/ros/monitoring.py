@@ -145,10 +145,7 @@ class WatchedPublisher:
 
 
 class CommandWatch:
-    """Listens to a node's own command topics while the node itself sends nothing there.
-
-    Best effort, so that nobody waits for its acknowledgements or takes it for a robot's driver that does not answer.
-    """
+    """Listens to a node's own command topics while it sends nothing; best effort, so nobody awaits its answers."""
 
     def __init__(self, node: BaseNode, kind: type, topics: Iterable[str]) -> None:
         self._node, self._kind = node, kind
@@ -163,7 +160,6 @@ class CommandWatch:
             self._subscriptions.append(self._node.create_subscription(self._kind, topic, on_command, STREAM_QOS))
 
     def end(self) -> None:
-        """Listen no more: what comes from now on is the node's own."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []

@@ -34,7 +34,6 @@ from q2r2_control.wording import event_line
 if TYPE_CHECKING:
     from q2r2_control.loop.arm_conditions import ArmConditions
 
-
 _AXIS_LENGTH, _AXIS_WIDTH, _PATH_WIDTH, _BALL = 0.1, 0.008, 0.004, 0.04  # [m]
 _PATH_POINTS = 200
 _PATH_STEP = 0.005  # between two points of the path [m]
@@ -49,7 +48,6 @@ class TargetMarkers:
 
     def __init__(self, arm: str, tool_frame: str, world_frame: str) -> None:
         self._arm, self._tool_frame, self._world_frame = arm, tool_frame, world_frame
-        self._colour = _SIDES[arm]
         self._path: deque[Array] = deque(maxlen=_PATH_POINTS)
 
     def at(self, target: pin.SE3 | None, tool: pin.SE3 | None, engaged: bool, now: float) -> list[Marker]:
@@ -76,9 +74,9 @@ class TargetMarkers:
 
     def _marker(self, name: str, kind: int, frame: str, opacity: float, now: float) -> Marker:
         marker = Marker(ns=f"{self._arm}_{name}", id=0, type=kind, action=Marker.ADD, frame_locked=True)
-        marker.header.frame_id = frame
-        marker.header.stamp = time_message(now)
-        marker.color = ColorRGBA(r=self._colour[0], g=self._colour[1], b=self._colour[2], a=opacity)
+        marker.header.frame_id, marker.header.stamp = frame, time_message(now)
+        r, g, b = _SIDES[self._arm]
+        marker.color = ColorRGBA(r=r, g=g, b=b, a=opacity)
         marker.pose.orientation.w = 1.0
         return marker
 
@@ -166,12 +164,9 @@ class ConditionPublishers:
         if not any(publisher.get_subscription_count() for publisher in self._publishers.values()):
             return
         for arm, felt in self._conditions.look(state, now).items():
-            message = _Condition(
-                spare_distance=felt.spare if math.isfinite(felt.spare) else None,
-                joints_at_limit=felt.limits,
-                contact_force=felt.force,
-            )
-            self._publishers[arm].publish(String(data=message.model_dump_json()))
+            spare = felt.spare if math.isfinite(felt.spare) else None
+            told = _Condition(spare_distance=spare, joints_at_limit=felt.limits, contact_force=felt.force)
+            self._publishers[arm].publish(String(data=told.model_dump_json()))
 
 
 def listen_to_condition(node: Node, controller: str, arm: str, notice: Callable[[ArmCondition], None]) -> None:

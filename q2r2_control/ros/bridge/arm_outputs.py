@@ -126,7 +126,6 @@ class ArmOutputs:
         decided: float,
         state: ArmState,
     ) -> pin.SE3 | None:
-        """Send the hand's target, see :meth:`TargetOutput.step`."""
         return self.first.step(target, tool, pin.SE3.Identity() if self._filtered else base, now, decided, state=state)
 
     def relay(

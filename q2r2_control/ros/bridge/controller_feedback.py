@@ -93,7 +93,7 @@ class ControllerFeedback:
         if self._reference is not None and self._distances.get_subscription_count():
             points = self._controller.robot.closest_points(self._reference.q, self._reference.report.closest_pair)
             if points is not None:
-                self._distances.publish(distance_marker(points, self._node.now))
+                self._distances.publish(_distance_marker(points, self._node.now))
 
     def _record(self, reference: Reference, now: float, step: float, decided: float) -> None:
         """The reference and how it came about."""
@@ -115,8 +115,7 @@ class ControllerFeedback:
         self._recorded_tick.publish(Float64MultiArray(data=[float(number) for number in numbers]))
 
 
-def distance_marker(points: Array, now: float) -> Marker:
-    """A line between two points (2, 3) [m] of the world at ``now`` [s]: green if they are far apart, red if near."""
+def _distance_marker(points: Array, now: float) -> Marker:
     share = float(np.clip((np.linalg.norm(points[1] - points[0]) - _NEAR) / (_FAR - _NEAR), 0.0, 1.0))
     marker = Marker(ns="closest_pair", type=Marker.LINE_LIST, action=Marker.ADD)
     marker.header.frame_id, marker.header.stamp = WORLD, time_message(now)

@@ -78,17 +78,13 @@ class FrameTree:
         """Pose of ``frame`` in ``within``; None if no chain of transforms connects them."""
         if (found := self._found.get((frame, within))) is not None:
             return found
-        up = dict(self._upwards(_name(within)))
-        for name, placement in self._upwards(_name(frame)):
+        up = dict(self.upwards(within))
+        for name, placement in self.upwards(frame):
             if name in up:
                 pose, received = up[name].pose.inverse() * placement.pose, min(up[name].received, placement.received)
                 self._found[frame, within] = Placement(pose, received)
                 return self._found[frame, within]
         return None
-
-    def ancestors(self, frame: str) -> list[str]:
-        """The frame, and all those that it hangs on."""
-        return [name for name, _ in self._upwards(_name(frame))]
 
     def moves_far(self, transform: ReadTransform) -> bool:
         """Whether the frame is elsewhere in a transform than it was in the last one."""
@@ -97,9 +93,9 @@ class FrameTree:
             return False
         return any(np.greater(apart(before[1].pose, transform.pose), _SAME))
 
-    def _upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
+    def upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
         """The frame and all its ancestors, with the frame's pose in each; ends also if parents form a ring."""
-        pose, received = pin.SE3.Identity(), math.inf
+        frame, pose, received = _name(frame), pin.SE3.Identity(), math.inf
         seen: set[str] = set()
         while frame not in seen:
             yield frame, Placement(pose, received)
@@ -132,7 +128,7 @@ class FrameListener:
         if not self._disagree:
             return None
         now = time.monotonic()
-        for name in self.tree.ancestors(frame):
+        for name, _ in self.tree.upwards(frame):
             if now - self._disagree.get(name, -math.inf) <= _REMEMBERED:
                 return f"two publishers on /tf say different things of {name}: end one of {self._publishers.of('/tf')}"
         return None
@@ -189,7 +185,6 @@ class PoseTopic:
         node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 
     def at(self, now: float) -> pin.SE3 | None:
-        """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         if self._newest is None:
             self.problem = f"nothing on {self.topic}"
             return None

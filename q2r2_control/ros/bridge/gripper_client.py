@@ -180,8 +180,7 @@ class GripperClient:
             self.closed = self._asked < 0.5
             return
         assert self._client is not None
-        self._goals += 1
-        number = self._goals
+        self._goals = number = self._goals + 1
         answer = self._client.send_goal_async(
             self._goal(position), feedback_callback=lambda told: self._note(told.feedback)
         )
@@ -195,14 +194,12 @@ class GripperClient:
             self._end(f"no result from {self._name} for {_RESULT_TIMEOUT:g} s")
 
     def _goal(self, position: float) -> Any:
-        goal = self._action.Goal()
+        goal, effort = self._action.Goal(), self._settings.max_effort
         if self._action is GripperCommand:
-            goal.command.position = position
-            goal.command.max_effort = self._settings.max_effort
+            goal.command.position, goal.command.max_effort = position, effort
         else:
             goal.command.name = [self._settings.joint_name]
-            goal.command.position = [position]
-            goal.command.effort = [self._settings.max_effort]
+            goal.command.position, goal.command.effort = [position], [effort]
         return goal
 
     def _answered(self, handle: Any, number: int) -> None:

@@ -16,24 +16,16 @@ from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
 from q2r2_control.recording.ros_topics import RECORDER
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import (
-    age,
-    hand_inputs,
-    hand_pose,
-    hand_pose_message,
-    hand_twist,
-    hand_twist_message,
-    inputs_message,
-)
+from q2r2_control.ros.bridge import messages as convert
 from q2r2_control.ros.monitoring import Publishers, node_of
 from q2r2_control.types import SIDES, HandInputs, HandSample, HapticFeedback
 
 _DEPTH = 10  # of publishers that are reliable, so that any subscriber matches
 _TYPES = {MessageType.POSE: PoseStamped, MessageType.TWIST: Twist, MessageType.INPUTS: OVR2ROSInputs}
 _READERS: dict[MessageType, Callable[[Any], HandMessage]] = {
-    MessageType.POSE: hand_pose,
-    MessageType.TWIST: hand_twist,
-    MessageType.INPUTS: hand_inputs,
+    MessageType.POSE: convert.hand_pose,
+    MessageType.TWIST: convert.hand_twist,
+    MessageType.INPUTS: convert.hand_inputs,
 }
 
 
@@ -55,11 +47,11 @@ class HandPublishers:
         publisher = self._publishers[topic]
         self.sent[publisher.topic_name] += 1
         if isinstance(message, HandPose):
-            publisher.publish(hand_pose_message(message, frame, t))
+            publisher.publish(convert.hand_pose_message(message, frame, t))
         elif isinstance(message, HandTwist):
-            publisher.publish(hand_twist_message(message))
+            publisher.publish(convert.hand_twist_message(message))
         else:
-            publisher.publish(inputs_message(message))
+            publisher.publish(convert.inputs_message(message))
 
     def publish_sample(self, sample: HandSample, frame: str = "", twist: HandTwist | None = None) -> None:
         """Publish a sample's messages on those topics that there are; a pose with a fault is left out."""
@@ -91,7 +83,6 @@ def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None])
 
 
 def subscribe_to_haptics(node: Node, vibrate: Callable[[HapticFeedback], None]) -> None:
-    """Call ``vibrate`` with what either hand is to feel."""
     for hand, topic in HAPTIC_TOPICS.items():
 
         def feel(message: OVR2ROSHapticFeedback, hand: str = hand) -> None:
@@ -137,11 +128,11 @@ class HandIntake:
             self._node.create_subscription(kind, _topic(hand, what), take, STREAM_QOS)
 
     def put_pose(self, message: PoseStamped) -> None:
-        self._pose = hand_pose(message), self._received
+        self._pose = convert.hand_pose(message), self._received
         self._put()
 
     def put_inputs(self, message: OVR2ROSInputs) -> None:
-        self._inputs = hand_inputs(message), self._received
+        self._inputs = convert.hand_inputs(message), self._received
         self._put()
 
     def take(self) -> list[HandSample]:
@@ -170,7 +161,7 @@ class HandIntake:
 
     def _take(self, hand: str, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
         if hand == self.hand:
-            self._received = self._node.now - age(info)
+            self._received = self._node.now - convert.age(info)
             callback(message)
 
     def _put(self) -> None:

@@ -113,12 +113,8 @@ class TargetIntake:
 
 def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
     """An arm's frame of targets. Raises :class:`ConfigError` for a link that moves."""
-    name = node.parameter(
-        f"{arm}.target_frame_id",
-        WORLD,
-        "frame_id that targets have to have: a link that does not move, or any other name for the cell's world",
-    )
-    model = robot.model
+    what = "frame_id that targets have to have: a link that does not move, or any other name for the cell's world"
+    name, model = node.parameter(f"{arm}.target_frame_id", WORLD, what), robot.model
     if name == WORLD or not model.existFrame(name, pin.FrameType.BODY):
         return TargetFrame(name, pin.SE3.Identity())
     frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]

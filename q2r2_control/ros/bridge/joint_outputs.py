@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -38,8 +37,7 @@ class Kind(ABC):
     message: Any  # its type
 
     def __init__(self, period: float, robot: Robot) -> None:
-        self._due = Duration(sec=int(period), nanosec=int(1e9 * (period % 1.0)))
-        self._model = robot.model
+        self._due, self._model = Duration(sec=int(period), nanosec=int(1e9 * (period % 1.0))), robot.model
 
     @abstractmethod
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
@@ -61,7 +59,7 @@ class TrajectoryOutput(Kind):
 
 
 class PositionArray(Kind):
-    """Float64MultiArray of positions in the order of the joints, as forward_command_controller takes them."""
+    """Float64MultiArray in the order of the joints, as forward_command_controller takes them."""
 
     topic = "position_commands"
     message = Float64MultiArray
@@ -72,15 +70,11 @@ class PositionArray(Kind):
 
 
 class VelocityArray(PositionArray):
-    """Float64MultiArray of velocities, as a velocity forward_command_controller takes them."""
-
     topic, mode, field = "velocity_commands", CommandMode.VELOCITY, "v"
 
 
 class TorqueArray(PositionArray):
-    """Float64MultiArray of torques; gravity and Coriolis are in them."""
-
-    topic, mode, field = "torque_commands", CommandMode.TORQUE, "tau"
+    topic, mode, field = "torque_commands", CommandMode.TORQUE, "tau"  # gravity and Coriolis are in them
 
 
 class JointStates(Kind):
@@ -145,8 +139,7 @@ def _lbr_message(name: str) -> Any:
         ) from error
 
 
-@dataclass(frozen=True, slots=True)
-class Channel:
+class Channel(NamedTuple):
     """One topic and the joints that its messages are about."""
 
     names: list[str]
@@ -161,7 +154,6 @@ class JointOutput:
         self.drive, self._kind, self._channels, self._listeners = drive, kind, channels, 0
 
     def watch(self, node: BaseNode) -> CommandWatch:
-        """What tells whether another node sends such commands."""
         return CommandWatch(node, self._kind.message, [channel.publisher.topic_name for channel in self._channels])
 
     def send(self, command: Command, state: RobotState, t: float, decided: float) -> None:

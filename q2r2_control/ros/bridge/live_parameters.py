@@ -132,7 +132,6 @@ def is_of_teleop(name: str) -> bool:
 
 
 def _within(prefix: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Of ``changes`` those of names under ``prefix``, without it."""
     begin = f"{prefix}."
     return {name.removeprefix(begin): value for name, value in changes.items() if name.startswith(begin)}
 

@@ -82,6 +82,10 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
     topic = declare("target_topic", given.target_topic, 'where targets go; "": as the preset says')
     builtin = declare("builtin_node", "/cartesian_controller", "the built-in controller's node")
     controller = declare("controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix')
+    rate = declare("rate", given.rate or preset.rate, "of targets [Hz]", within=(1.0, 1000.0))
+    if rate < preset.lowest_rate:
+        allowed = f"at least {preset.lowest_rate:g}, better {preset.rate:g}"
+        raise ConfigError(f"parameter rate = {rate:g}: preset {preset.name} needs {allowed}")
     return ArmParameters(
         base_frame=base,
         world_frame=world or base,
@@ -92,16 +96,9 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
         current_pose_topic=declare("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
         builtin_node=builtin,
         builtin_prefix=declare("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
-        tool_timeout=declare(
-            "tool_timeout",
-            STREAM_TIMEOUT,
-            "an older pose of the tool, or safe target, does not count [s]",
-            within=(0.01, 2),
-        ),
-        listener_timeout=declare(
-            "listener_timeout", STREAM_TIMEOUT, "targets may not be acknowledged [s]", within=(0.1, 10)
-        ),
-        rate=_rate(node, preset, given.rate),
+        tool_timeout=declare("tool_timeout", STREAM_TIMEOUT, "of poses of tool and safe target [s]", within=(0.01, 2)),
+        listener_timeout=declare("listener_timeout", STREAM_TIMEOUT, "of acknowledgements [s]", within=(0.1, 10)),
+        rate=rate,
         preset=preset,
         mode=mode,
         gripper_topic=declare("gripper_action_topic", given.gripper_action_topic, "action or topic"),
@@ -122,7 +119,6 @@ def teleop_defaults(mirror: bool, filter_window_size: int | None) -> TeleopSetti
 
 
 def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
-    """The cell's, and the ones given where the cell says nothing."""
     cell, side = load_config(path), given.arm_name
     if side not in cell.arms:
         raise ConfigError(f"parameter config: {path} has no arm {side}; allowed: {', '.join(cell.arms)}")
@@ -146,14 +142,6 @@ def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
         rate=external.rate if takes_poses else None,
         target_topic=(theirs.target_topic or "") if takes_poses else "",
     )
-
-
-def _rate(node: BaseNode, preset: Preset, wanted: float | None) -> float:
-    rate = float(node.parameter("rate", wanted or preset.rate, "of targets [Hz]", within=(1.0, 1000.0)))
-    if rate < preset.lowest_rate:
-        allowed = f"at least {preset.lowest_rate:g}, better {preset.rate:g}"
-        raise ConfigError(f"parameter rate = {rate:g}: preset {preset.name} needs {allowed}")
-    return rate
 
 
 def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:

@@ -51,6 +51,7 @@ class TargetOutput:
         self._node, self._controller, self._frame = node, controller, frame
         self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
         self.topic = self._publisher.topic_name  # as the graph knows it
+        self._unknown_node = f"{self.topic} has a subscriber whose node is not known yet"
         self._wrench = None
         if preset.zero_wrench is not None:
             wrench = preset.zero_wrench.format(ctrl=values.prefix)
@@ -160,7 +161,6 @@ class TargetOutput:
         return max(self._publisher.listeners, self._node.handle.get_count_subscribers(self.topic))
 
     def _holds(self, tool: pin.SE3 | None, state: ArmState, now: float) -> bool:
-        """Whether the last target may be repeated."""
         if self.guard.pose is None:
             return False
         if tool is None or not near(self.guard.pose, tool, *_HELD):
@@ -168,10 +168,6 @@ class TargetOutput:
             return False
         pausing = self.preset is BUILTIN and state is ArmState.PAUSING
         return self.preset.hold is Hold.REPEAT or pausing
-
-    @property
-    def _unknown_node(self) -> str:
-        return f"{self.topic} has a subscriber whose node is not known yet"
 
     def _ask_graph(self, now: float) -> None:
         """Notice a controller that has appeared, or is gone: others that listen may acknowledge in its place."""

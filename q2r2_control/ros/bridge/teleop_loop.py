@@ -79,8 +79,7 @@ class HomeClient:
         elif not self._home.service_is_ready():
             self._end(teleop, now, f"there is no service {self._name}/home")
         else:
-            self._since, self._seen = now, False
-            self._answer = self._home.call_async(Trigger.Request())
+            self._since, self._seen, self._answer = now, False, self._home.call_async(Trigger.Request())
 
     def _call_hold(self) -> None:
         if self._hold is not None:
@@ -140,13 +139,9 @@ class TeleopLoop:
         """Before the first tick: teleoperate this node's arm too. Raises :class:`ConfigError` where nodes differ."""
         ours, first = node.parameters, (self.nodes or [node])[0]
         theirs = first.parameters
-        for what, differ in (
-            ("teleop, mirror and mirror_reflected", ours.teleop != theirs.teleop),
-            ("rate", ours.rate != theirs.rate),
-            ("mode", ours.mode != theirs.mode),
-            ("builtin_node", ours.builtin_node != theirs.builtin_node),
-        ):
-            if differ:
+        for name in ("teleop", "rate", "mode", "builtin_node"):
+            if getattr(ours, name) != getattr(theirs, name):
+                what = "teleop, mirror and mirror_reflected" if name == "teleop" else name
                 raise ConfigError(f"{what}: {first.get_name()} and {node.get_name()} differ; allowed: the same in both")
         self.nodes.append(node)
         self.teleop = Teleop(theirs.teleop, [one.arm_name for one in self.nodes])

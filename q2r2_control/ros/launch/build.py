@@ -19,7 +19,6 @@ from q2r2_control.errors import Q2R2Error
 INTERFACES = Path(__file__).parents[1] / "interfaces"
 # What the generators and ament import while CMake runs; rclpy is what the result is for.
 _PYTHON_TOOLS = ("rclpy", "rosidl_adapter", "rosidl_generator_py", "catkin_pkg", "em", "lark", "numpy")
-_COMPILERS = ("c++", "g++", "clang++")
 
 
 class BuildError(Q2R2Error):
@@ -92,7 +91,7 @@ def missing_tools(prefix: Path) -> list[str]:
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
     if Path(sysconfig.get_path("purelib")) != packages or not os.access(packages, os.W_OK):
         missing.append(f"a virtual environment that can be written to, since {prefix} is none")
-    compilers = [os.environ["CXX"].split()[0]] if os.environ.get("CXX", "").strip() else _COMPILERS
+    compilers = [os.environ["CXX"].split()[0]] if os.environ.get("CXX", "").strip() else ["c++", "g++", "clang++"]
     if not any(map(_found, compilers)):
         missing.append(f"a C++ compiler ({' or '.join(compilers)}; Debian, Ubuntu: g++)")
     tools = {"make": "make", "cmake": "cmake (pip install cmake)"}
@@ -132,13 +131,11 @@ def build(package: Interfaces, prefix: Path, log: Path) -> None:
 
 
 def _found(program: str) -> str | None:
-    """A program that is beside the running Python or on the PATH."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     return shutil.which(program, path=path)
 
 
 def _sourced() -> list[Path]:
-    """The ROS installs that are sourced; none where ROS is part of the environment."""
     return [Path(root) for root in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if root]
 
 

@@ -227,7 +227,6 @@ class BaseArmController(BaseNode):
         return OK, self.feedback.last_line, values
 
     def _base(self) -> pin.SE3 | None:
-        """The frame that targets are published in, in the world frame."""
         if self.parameters.base_frame == self.parameters.world_frame:
             return pin.SE3.Identity()
         placement = self._frames.tree.find(self.parameters.base_frame, self.parameters.world_frame)
@@ -245,10 +244,7 @@ class BaseArmController(BaseNode):
         return None if (unready := self.outputs.unready) is None else (WARN, unready)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
-        """The commanded tool pose, for the leash and for anchors.
-
-        Another controller's is not known: then the tool's, and while the arm is paused the last target counts.
-        """
+        """For the leash and for anchors. Another controller's is not known: then the tool's, or the last target's."""
         if self.engaged:
             return self._target.command_for(tool) if reference is None else reference
         reference = reference or self.outputs.first.last_sent

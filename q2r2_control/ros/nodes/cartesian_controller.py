@@ -88,8 +88,7 @@ class CartesianControllerNode(ManagedNode):
         self._grippers = GripperLimits(self, config, self._loop, asking)
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
-        self._commanding = False
-        self._advances = 0  # ticks that have gone by some time
+        self._commanding, self._advances = False, 0  # ticks that have gone by some time
         # Another controller follows every safe target; arms that listen take a hundred a second.
         every = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
@@ -164,10 +163,11 @@ class CartesianControllerNode(ManagedNode):
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         supervisor, now = self._supervisor, self.now
+        homed = supervisor.homing.outcome
         values: dict[str, Any] = {
             "phase": supervisor.phase,
             "lifecycle": self.lifecycle_state,
-            "homing_ended": "" if supervisor.homing.outcome is None else sentence(supervisor.homing.outcome),
+            "homing_ended": "" if homed is None else sentence(homed),
             "loop_rate_hz": self.tick_rate(),
             "missed_ticks": self._loop.pacer.missed_ticks,
             "sent": self._output.sent,
@@ -258,7 +258,6 @@ class CartesianControllerNode(ManagedNode):
         self._tick()
 
     def _tick_until(self, condition: Callable[[], bool], longest: float) -> bool:
-        """Tick on until ``condition`` holds, for ``longest`` [s] at most; whether it does."""
         deadline = time.monotonic() + longest
         while not (fulfilled := condition()) and time.monotonic() < deadline:
             self._tick_on()

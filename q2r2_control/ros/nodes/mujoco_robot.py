@@ -144,7 +144,15 @@ class MujocoRobot(BaseNode):
         self._delays: dict[tuple[str, ...], DelayWatch] = {}  # by topic and first joint
         self._make_publishers()
         self._make_subscriptions()
-        self._grippers = {arm: self._gripper(arm) for arm in self._cell.plant.gripper_openings()}
+        self._grippers = {
+            arm: GripperServer(
+                self,
+                f"/q2r2/{arm}_gripper/gripper_cmd",
+                partial(self._cell.command_gripper, arm),
+                partial(self._note, f"{arm}_gripper"),
+            )
+            for arm in self._cell.plant.gripper_openings()
+        }
         self.create_service(Trigger, "~/reset", self._reset)
         # The simulation makes its own time, whatever /clock says.
         self.create_tick(self._period, self._tick, clock=STEADY)
@@ -176,16 +184,7 @@ class MujocoRobot(BaseNode):
         for kind, topic, command in kinds:
             self.create_subscription(kind, topic, partial(self._take, topic, command), commands)
 
-    def _gripper(self, arm: str) -> GripperServer:
-        return GripperServer(
-            self,
-            f"/q2r2/{arm}_gripper/gripper_cmd",
-            lambda opening: self._cell.command_gripper(arm, opening),
-            lambda fault: self._note(f"{arm}_gripper", fault),
-        )
-
     def _take(self, topic: str, command: Callable[[Any], str | None], message: Any, info: Mapping[str, Any]) -> None:
-        """Use a message now, or note why not."""
         # Two controllers of an arm each may send on one topic, from hosts with clocks of their own.
         names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
@@ -209,7 +208,6 @@ class MujocoRobot(BaseNode):
         )
 
     def _note(self, topic: str, fault: str | None) -> None:
-        """Say what was refused, until the topic brings something good again."""
         if fault is None:
             self._refused.pop(topic, None)
             return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from q2r2_control.config.cell import load_config
@@ -17,6 +18,7 @@ from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_hap
 from q2r2_control.ros.monitoring import HandListeners
 from q2r2_control.types import SIDES, HandSample
 
+_PERIOD = 0.002  # between two polls of another input [s]
 _SHORTEST, _LONGEST = 0.001, 0.02  # between two looks at what has come due [s]
 # Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
@@ -43,9 +45,8 @@ class SimulationInput(BaseNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("simulation_input", **kwargs)
         side = self.parameter("side", "both", "Which hands move.", one_of=(*SIDES, "both"))
-        mode = self.parameter(
-            "mode", "all", "teleop: poses and inputs; velocity: twists; all: all three.", one_of=tuple(_MODES)
-        )
+        what = "teleop: poses and inputs; velocity: twists; all: all three."
+        mode = self.parameter("mode", "all", what, one_of=tuple(_MODES))
         trajectory = self.parameter("trajectory", "circle", "What the hands do.", one_of=tuple(TRAJECTORIES))
         rate = self.parameter("rate", 75.0, "Samples of each hand [Hz].", within=(1.0, 250.0))
         jitter = self.parameter("jitter", 0.0, "Samples come later by up to this, at random [s].", within=(0.0, 0.01))
@@ -54,7 +55,7 @@ class SimulationInput(BaseNode):
         self._hands = SIDES if side == "both" else (side,)
         self._title, self._samples = f"{trajectory} of {' and '.join(self._hands)}", 0
         self._hand_publishers = HandPublishers(self, self._hands, _MODES[mode])
-        self._trajectory, self._rate, self._jitter = trajectory, rate, jitter
+        self._make_script = partial(ScriptedInput, trajectory, self._hands, rate_hz=rate, jitter=jitter)
         self._listeners = HandListeners(self, self._hands if MessageType.INPUTS in _MODES[mode] else ())
         self._starts = True  # until nothing is pressed again to engage the arms
         self._moves = False  # whether the hands do
@@ -76,12 +77,6 @@ class SimulationInput(BaseNode):
 
     def _tick(self) -> None:
         """Play, and come again when the next sample is due."""
-        self._play()
-        wait = min(max(self._script.due() - self.now, _SHORTEST), _LONGEST)
-        self._timer.timer_period_ns = int(1e9 * wait)
-        self._timer.reset()
-
-    def _play(self) -> None:
         if self._waits_for_subscribers:
             if self._missing():
                 return
@@ -93,6 +88,9 @@ class SimulationInput(BaseNode):
             self._engage(now)
         for sample in self._script.poll(now):
             self._publish(sample)
+        wait = min(max(self._script.due() - self.now, _SHORTEST), _LONGEST)
+        self._timer.timer_period_ns = int(1e9 * wait)
+        self._timer.reset()
 
     def _engage(self, now: float) -> None:
         """Begin the script anew, where its hands rest, until the arms are ready, and then until they follow."""
@@ -119,7 +117,7 @@ class SimulationInput(BaseNode):
             self._rewind(now)
 
     def _rewind(self, now: float) -> None:
-        self._script = ScriptedInput(self._trajectory, self._hands, rate_hz=self._rate, jitter=self._jitter)
+        self._script = self._make_script()
         self._script.start()
         self._began, self._not_to_press, self._moves = now, None, False
 
@@ -129,9 +127,6 @@ class SimulationInput(BaseNode):
         twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
         self._hand_publishers.publish_sample(sample, self._frame, HandTwist(twist.linear, twist.angular))
         self._samples += 1
-
-
-_PERIOD = 0.002  # between two polls [s]
 
 
 class HandInput(BaseNode):

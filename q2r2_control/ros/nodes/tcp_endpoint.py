@@ -26,6 +26,7 @@ from q2r2_control.types import SIDES, HandFault
 from q2r2_control.viewer.headset_table import topic_line, topic_table
 from q2r2_control.wording import sentence
 
+_TABLE_PERIOD, _LINES_PERIOD = 0.2, 1.0  # [s]
 _SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
 
 
@@ -46,9 +47,8 @@ class TcpEndpoint(BaseNode):
         headset = cell.headset if cell else HeadsetConfig()
         host = self.parameter("host", headset.host, "Address to listen on; 0.0.0.0 admits the network.")
         port = self.parameter("port", headset.port, "TCP port; 0 takes any free one.", within=(0, 65535))
-        allow = self.parameter(
-            "allow", ",".join(headset.allow or ()), "Addresses and networks that may connect, by commas; empty: all."
-        )
+        what = "Addresses and networks that may connect, by commas; empty: all."
+        allow = self.parameter("allow", ",".join(headset.allow or ()), what)
         try:
             networks = tuple(network_of(text.strip()) for text in allow.split(",")) if allow.strip() else None
         except ValueError as error:
@@ -114,10 +114,6 @@ class TcpEndpoint(BaseNode):
             self.get_logger().info(self._log.format(record))
 
 
-_TABLE_PERIOD = 0.2  # [s]
-_LINES_PERIOD = 1.0  # [s]
-
-
 class CheckTcpConnection(BaseNode):
     """Shows pose, inputs and twist of both hands with rate and age: a table on a terminal, else a line a topic.
 
@@ -125,13 +121,12 @@ class CheckTcpConnection(BaseNode):
     After ``duration`` it ends, with exit code 1 when every topic has timed out.
     """
 
-    def __init__(self, console: Console | None = None, **kwargs: Any) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         super().__init__("check_tcp_connection", **kwargs)
         duration = self.parameter("duration", 0.0, "Ends after this time; 0: on Ctrl-C [s].", within=(0.0, 86400.0))
         self._recorders: dict[str, TopicRecorder] = {}
-        self._start = time.monotonic()
-        self._console = console = console or Console()
-        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self._start, self._console = time.monotonic(), Console()
+        self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
         if self._live is not None:
             self._live.start()
         subscribe_to_hands(self, self._hear)
@@ -140,8 +135,7 @@ class CheckTcpConnection(BaseNode):
             self.create_timer(duration, self._finish, clock=STEADY)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        topics = self._topics()
-        silent = self._silent(topics)
+        topics, silent = self._topics()
         values = {name: topic.rate for name, topic in topics.items() if topic is not None}
         if not silent:
             return OK, "no timeout", {"rate_hz": values}
@@ -155,17 +149,15 @@ class CheckTcpConnection(BaseNode):
     def _hear(self, topic: str, message: HandMessage) -> None:
         self._recorders.setdefault(topic, TopicRecorder()).record(message, time.monotonic())
 
-    def _topics(self) -> dict[str, TopicStatistics | None]:
-        now = time.monotonic()
-        return {name: self._recorders[name].snapshot(now) if name in self._recorders else None for name in HAND_TOPICS}
-
-    def _silent(self, topics: Mapping[str, TopicStatistics | None]) -> list[str]:
-        running = time.monotonic() - self._start
-        return [name for name, topic in topics.items() if (running if topic is None else topic.age) > SILENCE]
+    def _topics(self) -> tuple[dict[str, TopicStatistics | None], list[str]]:
+        """Of each topic what came, and the topics that are silent."""
+        now, heard = time.monotonic(), self._recorders
+        topics = {name: heard[name].snapshot(now) if name in heard else None for name in HAND_TOPICS}
+        ages = {name: now - self._start if topic is None else topic.age for name, topic in topics.items()}
+        return topics, [name for name, age in ages.items() if age > SILENCE]
 
     def _show(self) -> None:
-        topics = self._topics()
-        silent = self._silent(topics)
+        topics, silent = self._topics()
         if self._live is not None:
             title = f"timeout, nothing for {SILENCE:g} s" if len(silent) == len(topics) else "hands"
             self._live.update(topic_table(title, topics, silent), refresh=True)
@@ -175,4 +167,5 @@ class CheckTcpConnection(BaseNode):
             self._console.print(line, soft_wrap=True, highlight=False, markup=False)
 
     def _finish(self) -> None:
-        self.exit_code = int(len(self._silent(topics := self._topics())) == len(topics))
+        topics, silent = self._topics()
+        self.exit_code = int(len(silent) == len(topics))

@@ -75,7 +75,6 @@ def _nodes(view: SetView, expected: Collection[str]) -> Iterator[Finding]:
 
 
 def _senders(view: SetView) -> Iterator[Finding]:
-    """Commands, targets and hands come from one node each."""
     controllers = {node.name: node for node in view.nodes if node.is_controller}
     counted = {topic for node in view.nodes for topic in node.sent}
     for topic in view.topics:
@@ -96,7 +95,6 @@ def _senders(view: SetView) -> Iterator[Finding]:
 
 
 def _receivers(view: SetView) -> Iterator[Finding]:
-    """Targets and commands are for one node each."""
     controllers = {node.name for node in view.nodes if node.is_controller}
     senders = [node for node in view.nodes if node.arm is not None or node.is_controller]
     counted = {topic for node in senders for topic in node.sent}
@@ -162,12 +160,16 @@ def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str],
     if (distribution := environment.get("ROS_DISTRO", "jazzy")) != "jazzy":
         what = f"ROS {distribution} is sourced; the nodes are made for jazzy"
         findings.append(Finding(False, what, "source a ROS 2 Jazzy"))
+    peers = environment.get("ROS_STATIC_PEERS")
+    reaches = (environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET") + (f", and {peers}" if peers else "")
+    if environment.get("ROS_LOCALHOST_ONLY") == "1":
+        reaches = "this machine only (ROS_LOCALHOST_ONLY)"
     facts = {
         "python": f"{sys.version_info.major}.{sys.version_info.minor}",
         "ros": environment.get("ROS_DISTRO") or "not sourced: from this Python environment",
         "domain": domain,
         "middleware": environment.get("RMW_IMPLEMENTATION") or "the default",
-        "reaches": _reach(environment),
+        "reaches": reaches,
     }
     if missing := [name for name in PACKAGES if importlib.util.find_spec(name) is None]:
         findings.append(error(f"Python cannot import {', '.join(missing)}", _INSTALL))
@@ -184,14 +186,6 @@ def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str],
         what = f"the messages of {', '.join(lacking)} cannot be imported"
         findings.append(error(what, "q2r2 ros build-interfaces"))
     return facts, findings
-
-
-def _reach(environment: Mapping[str, str]) -> str:
-    """Whom nodes find, as the variables say it."""
-    if environment.get("ROS_LOCALHOST_ONLY") == "1":
-        return "this machine only (ROS_LOCALHOST_ONLY)"
-    peers = environment.get("ROS_STATIC_PEERS")
-    return (environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET") + (f", and {peers}" if peers else "")
 
 
 def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> list[str] | Finding:

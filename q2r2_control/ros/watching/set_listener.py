@@ -45,8 +45,7 @@ class SetListener:
         self._names: tuple[str, ...] = ()
 
     def look(self) -> None:
-        node = self._node
-        own = node.get_fully_qualified_name()
+        node, own = self._node, self._node.get_fully_qualified_name()
         self._topics = {name: tuple(types) for name, types in node.get_topic_names_and_types()}
         for topic in self._topics:
             self._publishers[topic] = _names(node.get_publishers_info_by_topic(topic), own)
@@ -62,7 +61,11 @@ class SetListener:
             for name, (state, at) in sorted(self._states.newest.items())
         )
         members = {node.name for node in nodes}
-        topics = tuple(self._topic(name) for name in sorted(self._topics) if self._is_shown(name, members))
+        topics = tuple(
+            TopicView(name, types, self._publishers[name], self._subscribers[name], self._rate(name))
+            for name, types in sorted(self._topics.items())
+            if self._is_shown(name, members)
+        )
         return SetView(nodes, topics, self._names, arm_views(nodes, self._cell))
 
     def _note(self, name: str, state: dict[str, Any]) -> None:
@@ -71,12 +74,15 @@ class SetListener:
             if isinstance(count, int):
                 self._sent.setdefault((name, topic), deque(maxlen=_COUNTS)).append((time.monotonic(), count))
 
-    def _rate(self, name: str, topic: str) -> float | None:
-        counts = self._sent.get((name, topic))
-        if counts is None or len(counts) < 2:
-            return None
-        (began, first), (ended, last) = counts[0], counts[-1]
-        return max(last - first, 0) / max(ended - began, 1e-9)
+    def _rate(self, topic: str) -> float | None:
+        """Of all that say how much they send there [Hz]."""
+        rates = []
+        for name in self._publishers[topic]:
+            counts = self._sent.get((name, topic))
+            if counts is not None and len(counts) > 1:
+                (began, first), (ended, last) = counts[0], counts[-1]
+                rates.append(max(last - first, 0) / max(ended - began, 1e-9))
+        return sum(rates) if rates else None
 
     def _is_shown(self, topic: str, members: set[str]) -> bool:
         """Whether some node of the set awaits it, or sends it and somebody counts or takes it."""
@@ -88,11 +94,6 @@ class SetListener:
         receivers = [self._states.newest[name][0] for name in members.intersection(self._subscribers[topic])]
         # Arms and controllers need what they receive; a robot receives one of many kinds of commands.
         return any(self._publishers[topic] or "arm" in state or "phase" in state for state in receivers)
-
-    def _topic(self, topic: str) -> TopicView:
-        rates = [rate for name in self._publishers[topic] if (rate := self._rate(name, topic)) is not None]
-        rate = sum(rates) if rates else None
-        return TopicView(topic, self._topics[topic], self._publishers[topic], self._subscribers[topic], rate)
 
 
 def watch_set(

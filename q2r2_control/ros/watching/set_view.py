@@ -114,7 +114,6 @@ def arm_views(nodes: tuple[NodeView, ...], cell: Config) -> tuple[ArmView, ...]:
 
 
 def _why(node: NodeView, controller: NodeView | None, cell: Config) -> str:
-    """Why an arm moves, or does not, in one line."""
     values, arm = node.values, node.arm or ""
     if node.age > SILENT:
         return f"{node.name} is silent for {node.age:.0f} s: it has ended, hangs, or the network lost it"
