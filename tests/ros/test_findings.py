@@ -46,7 +46,6 @@ TOPICS = (
 
 
 def view(*changed: NodeView | TopicView, without: str = "", **fields: Any) -> SetView:
-    """A good set with some nodes and topics in the place of those with the same names."""
     parts: dict[str, Any] = {one.name: one for one in (CONTROLLER, ROBOT, LEFT, RIGHT, HAND, *TOPICS)}
     parts |= {one.name: one for one in changed}
     parts.pop(without, None)

@@ -35,7 +35,6 @@ def read(transform: TransformStamped) -> ReadTransform:
 
 @pytest.fixture
 def tree() -> FrameTree:
-    """World with a mount, which carries an arm, and a table beside."""
     made = FrameTree()
     made.set(read(stamped_transform("world", "mount", A)), math.inf)
     made.set(read(stamped_transform("mount", "/tool", B)), 3.0)
@@ -88,7 +87,6 @@ def test_a_name_that_is_no_text_is_another_node_s_fault_and_ends_nothing(node: A
 
 
 def send_from(node: Any, name: str, pose: pin.SE3, counted: int) -> Any:
-    """A timer that publishes the transform of ``name``; ``counted`` messages went before."""
     publisher = node.create_publisher(TFMessage, "/tf", 10)
     for _ in range(counted):
         publisher.publish(TFMessage())

@@ -49,8 +49,6 @@ class Gripper:
         self.opening = float(np.mean(found)) / BLOCK_CELL.arms["left"].gripper.open_position
 
     def wait_until(self, condition: Callable[[], object], what: str) -> None:
-        """Go on as an arm's node does in its ticks, until ``condition`` holds."""
-
         def ticked() -> object:
             self.client.check(time.monotonic())
             return condition()
@@ -62,8 +60,6 @@ class Gripper:
         self.wait_until(lambda: time.monotonic() - self.began > seconds, "time passes")
 
     def close(self) -> None:
-        """Ask for it until there is a server that is asked."""
-
         def asked() -> bool:
             self.client.command(True, time.monotonic())
             return self.client.problem is None

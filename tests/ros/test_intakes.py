@@ -34,8 +34,6 @@ USUAL, LATE = 1_000_000, 1_000_000_000  # from sending to receipt [ns]
 
 
 class Arrivals:
-    """Calls the callback of a node's subscription as the executor does."""
-
     def __init__(self, node: Any, topic: str) -> None:
         self._subscription = next(one for one in node.subscriptions if one.topic_name == topic)
         self._number = 0

@@ -22,7 +22,7 @@ from tests.ros.processes import PATIENCE, ROOT, Processes, States, wait_until
 need_ros()
 
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -179,7 +179,6 @@ def spin_until(executor: Any, condition: Callable[[], object]) -> None:
 
 
 def say(publisher: Any, executor: TickExecutor, *words: str) -> None:
-    """Publish once all subscriptions are matched, and wait until the words have arrived."""
     spin_until(executor, publisher.get_subscription_count)
     for word in words:
         publisher.publish(String(data=word))
@@ -252,6 +251,16 @@ def test_an_error_of_a_callback_comes_out(make: Any, ticking: Ticking, executor:
     make(ticking, PERIOD, fail)
     with pytest.raises(ValueError, match="of the callback"):
         spin_until(executor, lambda: False)
+
+
+def test_another_executor_runs_ticks_and_messages_as_well(ticking: Ticking, context: Any) -> None:
+    plain, publisher = SingleThreadedExecutor(context=context), ticking.listen()
+    plain.add_node(ticking)
+    ticking.create_tick(PERIOD, lambda: ticking.log.append("tick"))
+    spin_until(plain, publisher.get_subscription_count)
+    publisher.publish(String(data="one"))
+    spin_until(plain, lambda: {"one", "tick"} <= set(ticking.log))
+    plain.shutdown()
 
 
 def test_it_ends_with_its_context(executor: TickExecutor, context: Any) -> None:
