@@ -31,8 +31,7 @@ from q2r2_control.config.cell import Config, load_config
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
 from q2r2_control.ros.launch.processes import check_rclpy, nodes_of, run_together
-from q2r2_control.ros.watching.environment import examine_environment
-from q2r2_control.ros.watching.findings import Finding, examine_set
+from q2r2_control.ros.watching.findings import Finding, examine_environment, examine_set
 from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}

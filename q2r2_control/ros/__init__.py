@@ -1,10 +1,8 @@
 """ROS 2: the nodes, and what connects them to the rest of the package, which needs no rclpy.
 
 From the bottom up: ``launch`` starts nodes as processes, ``executor`` spins nodes that tick, ``base_node`` is what
-every node has, ``managed_node`` what those with the states of a lifecycle have, ``monitoring`` watches other nodes,
-``bridge`` turns messages into data and back, ``nodes`` has one module for each executable; ``watching`` looks at a
-running set from outside. Each room imports only those before it. ``interfaces`` holds message packages to build, no
-Python.
+every node has, ``monitoring`` watches other nodes, ``bridge`` turns messages into data and back, ``nodes`` has the
+executables; ``watching`` looks at a running set from outside. ``interfaces`` holds message packages to build.
 """
 
 from __future__ import annotations

@@ -21,8 +21,9 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError, Q2R2Error
@@ -32,46 +33,29 @@ from q2r2_control.ros.launch.middleware import set_up_middleware
 
 # A process that goes first and never sleeps would leave nothing of its processor to others; Linux counts [s].
 _NEVER_IDLE = 0.5
+# All keep the last messages, and are reliable and volatile where they do not say otherwise.
 # Commands, at the receiver: only the newest counts, and it has to arrive.
-COMMAND_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
+COMMAND_QOS = QoSProfile(depth=1)
 # Commands, at the sender: a reliable sender repeats what has not arrived, also after a link was down for a while, and
 # an old target would be a jump. The lifespan is judged by the sender's clock; the receiver's may differ.
-SENT_COMMAND_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-    lifespan=Duration(seconds=0.1),
-)
+SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
 # Streams of a headset or of joint states: a late message is worth less than the next one.
-STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 # What is published for recordings only: all of it counts, and nobody waits for it.
-RECORDED_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.RELIABLE)
+RECORDED_QOS = QoSProfile(depth=200)
 # What subscribers that start later have to get too, such as robot_description.
-LATCHED_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _DIAGNOSTICS_PERIOD = 0.5  # [s]
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # of timers that go on while /clock stands still
 _CLOCK_TIMEOUT = 1.0  # simulated time that stands still for longer is reported [s]
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
 class BaseNode(Node):
-    """A node with described parameters, ``/diagnostics`` and ``~/state`` (one JSON object in a String).
+    """A node with described parameters, ``/diagnostics`` and ``~/state`` (one JSON object in a String)."""
 
-    Subclasses override :meth:`health`. Setting ``exit_code`` ends the executable with it.
-    """
-
-    exit_code: int | None = None
+    exit_code: int | None = None  # once it is set the executable ends with it
     ticks = False  # whether its messages wait for its ticks, see TickExecutor
     priority = 0  # of real time, where it is permitted; 0: as other programs
 
@@ -83,22 +67,19 @@ class BaseNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
         self._ros_time = 0.0, time.monotonic()  # the newest, and the steady time when it was first seen [s]
-        # Steady time, since the diagnostics have to say it when ROS time stands still.
-        self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.ticked, self._counted_at = 0, time.monotonic()  # since the rate was last asked for, and when [s]
+        self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=STEADY)
 
     # rclpy looks at every endpoint's events each time that it waits, which costs processor time. They warn of settings
     # or types that do not match: a publisher's subscribers warn too, and best effort matches every publisher.
     def create_publisher(self, *args: Any, **kwargs: Any) -> Any:
-        """See :class:`rclpy.node.Node`."""
         kwargs.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))
         return super().create_publisher(*args, **kwargs)
 
     def create_subscription(self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **kwargs: Any) -> Any:
-        """See :class:`rclpy.node.Node`."""
-        if isinstance(qos_profile, QoSProfile) and qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
+        if getattr(qos_profile, "reliability", None) is ReliabilityPolicy.BEST_EFFORT:
             kwargs.setdefault("event_callbacks", SubscriptionEventCallbacks(use_default_callbacks=False))
-        latched = isinstance(qos_profile, QoSProfile) and qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL
-        if self.ticks and not latched:
+        if self.ticks and getattr(qos_profile, "durability", None) is not DurabilityPolicy.TRANSIENT_LOCAL:
             kwargs.setdefault("callback_group", self.tick_group)
         return super().create_subscription(msg_type, topic, callback, qos_profile, **kwargs)
 
@@ -116,10 +97,9 @@ class BaseNode(Node):
         one_of: Sequence[str] = (),
         read_only: bool = True,
     ) -> Any:
-        """Declare a parameter and return its value.
+        """Declare a parameter and return its value; rclpy enforces ``within``, and ``one_of`` counts at the start only.
 
-        The range ``within`` is enforced by rclpy, ``one_of`` only at the start. Raises :class:`ConfigError` for a value
-        of another type, outside the range or not in ``one_of``.
+        Raises :class:`ConfigError` for a value of another type, outside the range or not in ``one_of``.
         """
         descriptor = ParameterDescriptor(description=description, read_only=read_only)
         if one_of:
@@ -141,8 +121,14 @@ class BaseNode(Node):
     @property
     def now(self) -> float:
         """The node's clock [s]: ROS time, so that use_sim_time has its effect."""
-        # What ``get_clock().now()`` asks, without the object that it makes: nodes ask several times in each tick.
         return float(self.get_clock().handle.get_now().nanoseconds) * 1e-9
+
+    def tick_rate(self) -> float:
+        """Of what a subclass has counted in ``ticked`` since this was last asked for [Hz]."""
+        now = time.monotonic()
+        rate = self.ticked / max(now - self._counted_at, 1e-9)
+        self.ticked, self._counted_at = 0, now
+        return round(rate, 1)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """Level (OK, WARN, ERROR), one line, and figures."""
@@ -180,6 +166,66 @@ class BaseNode(Node):
         return "use_sim_time is set and the time on /clock stands still" if stands else None
 
 
+class ManagedNode(LifecycleNodeMixin, BaseNode):
+    """A node with a lifecycle, active when it starts: ``ros2 lifecycle set /cartesian_controller deactivate``.
+
+    Subclasses override :meth:`begin` and :meth:`end`, which make it active or inactive, or return why not.
+    A transition is answered when it is done. Parameters are read at the start only, so ``cleanup`` fails.
+    """
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        BaseNode.__init__(self, name, **kwargs)
+        LifecycleNodeMixin.__init__(self)
+        self._starting = False
+
+    def begin(self) -> str | None:
+        return None
+
+    def end(self) -> str | None:
+        return None
+
+    def start_active(self) -> None:
+        """At the end of a subclass's own start: configured and active, without :meth:`begin`."""
+        self._starting = True
+        self.trigger_configure()
+        self.trigger_activate()
+        self._starting = False
+
+    @property
+    def lifecycle_state(self) -> str:
+        """unconfigured, inactive, active, finalized, or the transition between them."""
+        return str(self._state_machine.current_state[1])
+
+    @property
+    def is_active(self) -> bool:
+        return self.lifecycle_state == "active"
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return TransitionCallbackReturn.SUCCESS if self._starting else self._tried("activated", self.begin)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._tried("deactivated", self.end)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.get_logger().warning("not cleaned up: parameters are read once, restart the node for others")
+        return TransitionCallbackReturn.FAILURE
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.exit_code = 0
+        return TransitionCallbackReturn.SUCCESS
+
+    def _tried(self, what: str, act: Callable[[], str | None]) -> TransitionCallbackReturn:
+        try:
+            problem = act()
+        except Exception as error:  # rclpy would swallow it
+            problem = f"{type(error).__name__}: {error}"
+        if problem is None:
+            self.get_logger().info(what)
+            return TransitionCallbackReturn.SUCCESS
+        self.get_logger().warning(f"not {what}: {problem}")
+        return TransitionCallbackReturn.FAILURE
+
+
 def run_node(*makes: Callable[[], BaseNode]) -> int:
     """Main function of an executable: make the node, spin until Ctrl-C or SIGTERM, close it; the exit code.
 
@@ -209,7 +255,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         gc.collect()
         gc.freeze()
         _take_priority(nodes)
-        while rclpy.ok() and not stop.asked and _exit_code(nodes) is None:
+        while rclpy.ok() and not stop.asked and all(node.exit_code is None for node in nodes):
             executor.spin_once(timeout_sec=0.1)
     except (Q2R2Error, ParameterException) as error:
         print(f"{name}: {error}", file=sys.stderr)
@@ -221,7 +267,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
             node.close()
             node.destroy_node()
         rclpy.try_shutdown()
-    return _exit_code(nodes) or 0
+    return next((node.exit_code for node in nodes if node.exit_code is not None), 0)
 
 
 def _take_priority(nodes: Sequence[BaseNode]) -> None:
@@ -229,20 +275,15 @@ def _take_priority(nodes: Sequence[BaseNode]) -> None:
     priority = max(node.priority for node in nodes)
     if not priority:
         return
+    log = nodes[0].get_logger()
     if problem := schedule_process_first(priority):
-        nodes[0].get_logger().info(f"real time: {problem}")
+        log.info(f"real time: {problem}")
         return
     import resource  # on Linux, where alone a process goes first
 
     def give_up(*_: object) -> None:
         schedule_process_as_others()
-        problem = f"given up, since ticks have left no time to sleep for {_NEVER_IDLE:g} s; allowed: a lower rate"
-        nodes[0].get_logger().warning(f"real time: {problem}")
+        log.warning(f"real time: given up, ticks left no time to sleep for {_NEVER_IDLE:g} s; allowed: a lower rate")
 
     signal.signal(signal.SIGXCPU, give_up)
     resource.setrlimit(resource.RLIMIT_RTTIME, (int(1e6 * _NEVER_IDLE), resource.getrlimit(resource.RLIMIT_RTTIME)[1]))
-
-
-def _exit_code(nodes: Sequence[BaseNode]) -> int | None:
-    """That of the first node that wants to end."""
-    return next((node.exit_code for node in nodes if node.exit_code is not None), None)

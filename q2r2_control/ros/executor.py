@@ -12,13 +12,12 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import ROSClock
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
-from rclpy.node import Node
 
 _SERVED = 0.02  # period of services, slow timers, latched topics and all else that is no tick and no stream [s]
 _MOST_CALLS = 20  # of these at once: a coroutine that waits for something is ready all the time
@@ -32,7 +31,6 @@ class TickGroup(MutuallyExclusiveCallbackGroup):
     is_taken = False  # by a TickExecutor
 
     def can_execute(self, entity: Any) -> bool:
-        """See :class:`rclpy.callback_groups.CallbackGroup`."""
         return not self.is_taken and bool(super().can_execute(entity))
 
 
@@ -42,26 +40,17 @@ class TickExecutor(SingleThreadedExecutor):
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
         self._changed = True  # entities were made or destroyed
-        self._streams: list[_Stream] = []
+        # Of each subscription: what takes a message and its times, its type, raw or not, its callback, and how many of
+        # both the callback gets.
+        self._streams: list[tuple[Any, Any, bool, Any, int]] = []
         self._ticks: list[Any] = []  # timers
         self._served_at = -math.inf  # [s]
 
-    def add_node(self, node: Node) -> bool:
-        """See :class:`rclpy.executors.Executor`."""
-        if (group := getattr(node, "tick_group", None)) is not None:
-            group.is_taken = True
-        self._changed = True
+    def add_node(self, node: Any) -> bool:
+        node.tick_group.is_taken = self._changed = True
         return bool(super().add_node(node))
 
-    def remove_node(self, node: Node) -> None:
-        """See :class:`rclpy.executors.Executor`."""
-        if (group := getattr(node, "tick_group", None)) is not None:
-            group.is_taken = False
-        self._changed = True
-        super().remove_node(node)
-
     def wake(self) -> None:
-        """See :class:`rclpy.executors.Executor`."""
         self._changed = True
         super().wake()
 
@@ -89,16 +78,15 @@ class TickExecutor(SingleThreadedExecutor):
         """Run the callbacks of all messages that have arrived; also for a service that ticks by itself for a while."""
         if self._changed:
             self._collect()
-        for stream in self._streams:
+        for take, kind, raw, callback, arguments in self._streams:
             for _ in range(_MOST_MESSAGES):
                 if self._changed:
                     return  # this subscription may be destroyed
-                if (taken := stream.take(stream.kind, stream.raw)) is None:
+                if (taken := take(kind, raw)) is None:
                     break
-                stream.callback(*taken[: stream.arguments])
+                callback(*taken[:arguments])
 
     def _time_left(self, longest: float) -> float:
-        """Until the next tick [s]."""
         if any(isinstance(timer.clock, ROSClock) and timer.clock.ros_time_is_active for timer in self._ticks):
             return min(longest, _SIMULATED)
         left = [timer.time_until_next_call() for timer in self._ticks]  # [ns]; None: cancelled
@@ -114,27 +102,18 @@ class TickExecutor(SingleThreadedExecutor):
 
     def _collect(self) -> None:
         self._changed = False
-        groups = [(node, node.tick_group) for node in self.get_nodes() if hasattr(node, "tick_group")]
+        nodes: list[Any] = list(self.get_nodes())
+        groups = [(node, node.tick_group) for node in nodes]
         self._ticks = [one for node, group in groups for one in node.timers if one.callback_group is group]
         streams = [one for node, group in groups for one in node.subscriptions if one.callback_group is group]
-        self._streams = [_Stream.of(one) for one in streams]
+        self._streams = [
+            (one.handle.take_message, one.msg_type, one.raw, one.callback, _arguments(one.callback)) for one in streams
+        ]
 
 
-class _Stream(NamedTuple):
-    """One subscription of a tick group."""
-
-    take: Callable[[type, bool], Any]  # a message and its times, or None
-    kind: type
-    raw: bool
-    callback: Callable[..., None]
-    arguments: int  # of the callback: the message, or also its times
-
-    @classmethod
-    def of(cls, subscription: Any) -> _Stream:
-        arguments = 1
-        try:
-            inspect.signature(subscription.callback).bind(None)
-        except TypeError:
-            arguments = 2
-        take = subscription.handle.take_message
-        return cls(take, subscription.msg_type, subscription.raw, subscription.callback, arguments)
+def _arguments(callback: Callable[..., None]) -> int:
+    try:
+        inspect.signature(callback).bind(None)
+    except TypeError:
+        return 2
+    return 1

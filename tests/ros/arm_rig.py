@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import pairwise
@@ -21,8 +20,7 @@ from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.messages import pose_message, pose_of, stamped_pose
-from tests.ros.processes import PATIENCE, Processes, RosProcess
-from tests.ros.waiting import wait_until
+from tests.ros.processes import Processes, RosProcess, wait_until
 
 PERIOD = 1.0 / 72.0  # of the hand's messages, as a Quest sends them, and of /tf [s]
 HAND = pin.SE3(pin.exp3(np.array([0.2, -0.4, 0.6])), np.array([0.3, 0.1, 1.0]))
@@ -32,7 +30,6 @@ PATIENT = {"teleop.gate.timeout": 2.0, "tool_timeout": 2.0, "listener_timeout": 
 
 
 def patient(parameters: Mapping[str, Any]) -> list[str]:
-    """Parameters of an arm's node, with timeouts that an overloaded machine keeps to."""
     return [f"{name}:={value}" for name, value in (PATIENT | dict(parameters)).items()]
 
 
@@ -40,21 +37,11 @@ HOLDING = ("paused", "lost")  # states of an arm that was engaged
 
 
 class ArmRig:
-    """The hand ``hand`` and the robot of the arm ``arm``, on a node that a thread spins.
-
-    While ``follows`` the tool is at the newest target; while ``sends_tool`` it is published on /tf.
-    """
+    """The hand and the robot of an arm. While ``follows`` the tool is at the newest target; ``sends_tool``: on /tf."""
 
     def __init__(
-        self,
-        node: Any,
-        arm: str = "left",
-        hand: str | None = None,
-        topic: str | None = None,
-        tool_frame: str | None = None,
-        robot: str = "q2r2",
+        self, node: Any, arm: str = "left", topic: str | None = None, tool_frame: str | None = None, robot: str = "q2r2"
     ) -> None:
-        hand = hand or arm
         self.arm, self.node = arm, node
         self.hand, self.tool = HAND, TOOL
         self.lower = self.upper = False
@@ -64,12 +51,11 @@ class ArmRig:
         self.targets: list[PoseStamped] = []
         self.state: dict[str, Any] = {}
         self.ready_states = 0  # in a row
-        self.levels: Counter[str] = Counter()
         self.pulses: list[tuple[float, float]] = []
         self._frame = tool_frame or f"{arm}_tool_frame"
         self._made = [
-            node.create_publisher(PoseStamped, f"q2r_{hand}_hand_pose", STREAM_QOS),
-            node.create_publisher(OVR2ROSInputs, f"q2r_{hand}_hand_inputs", STREAM_QOS),
+            node.create_publisher(PoseStamped, f"q2r_{arm}_hand_pose", STREAM_QOS),
+            node.create_publisher(OVR2ROSInputs, f"q2r_{arm}_hand_inputs", STREAM_QOS),
             node.create_publisher(TFMessage, "/tf", 100),
         ]
         self._listens = [
@@ -77,7 +63,7 @@ class ArmRig:
             node.create_subscription(String, f"/{arm}_{robot}_arm_controller/state", self._on_state, 10),
             node.create_subscription(
                 OVR2ROSHapticFeedback,
-                f"q2r_{hand}_hand_haptic_feedback",
+                f"q2r_{arm}_hand_haptic_feedback",
                 lambda message: self.pulses.append((round(message.frequency, 3), round(message.amplitude, 3))),
                 QoSProfile(depth=100, reliability=COMMAND_QOS.reliability),  # none lost while this process stalls
             ),
@@ -85,59 +71,45 @@ class ArmRig:
         self._timer = node.create_timer(PERIOD, self._send)
 
     def start(self, processes: Processes, parameters: dict[str, Any] | None = None) -> RosProcess:
-        """Start the arm's controller; returns when it receives the hand."""
         process = processes.start_node(f"{self.arm}_arm_controller", *patient(parameters or {}))
         self.wait_until_connected()
         return process
 
     def wait_until_connected(self) -> None:
-        """Wait until the arm's controller receives the hand."""
         self.wait(lambda: self.state.get("hand_age") is not None, "the controller receives the hand")
 
     def wait(self, condition: Callable[[], Any], what: str) -> None:
-        """See :func:`wait_until`."""
         wait_until(condition, what, lambda: self.state)
 
     def press(self, button: str = "lower") -> None:
-        """A press that is no chord."""
         ArmRigs([self]).press(button)
 
     def engage(self) -> None:
-        """Press until the arm follows."""
         ArmRigs([self]).engage()
 
     def pause(self) -> None:
-        """Press until the arm is paused."""
         ArmRigs([self]).pause()
 
     def move(self, by: tuple[float, float, float], duration: float = 0.4, turn: float = 0.0) -> None:
-        """Move the hand evenly, turning about z."""
-        start, began = self.hand, time.monotonic()
-        while (share := min((time.monotonic() - began) / duration, 1.0)) < 1.0:
-            self._place(start, np.array(by), share, turn)
+        start, began, share = self.hand, time.monotonic(), 0.0
+        while share < 1.0:
+            share = min((time.monotonic() - began) / duration, 1.0)
+            self.hand = offset(start, tuple(share * np.array(by)), share * turn)
             time.sleep(PERIOD / 2)
-        self._place(start, np.array(by), 1.0, turn)
 
     def newest(self) -> pin.SE3:
-        """The last target."""
-        pose = pose_of(self.targets[-1].pose)
-        assert pose is not None
-        return pose
+        return target_of(self, -1)
 
     def wait_for_rest(self) -> pin.SE3:
         """Wait until the target stands still, or no more comes; the target."""
-        deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline:
+
+        def rests() -> bool:
             before = self.newest()
             time.sleep(0.3)
-            if before.isApprox(self.newest(), 1e-6):
-                return self.newest()
-        raise AssertionError("the target does not come to rest")
+            return bool(before.isApprox(self.newest(), 1e-6))
 
-    def _place(self, start: pin.SE3, by: Any, share: float, turn: float) -> None:
-        self.hand = pin.SE3(
-            pin.exp3(np.array([0.0, 0.0, share * turn])) @ start.rotation, start.translation + share * by
-        )
+        wait_until(rests, "the target comes to rest")
+        return self.newest()
 
     def _send(self) -> None:
         now = self.node.get_clock().now().nanoseconds * 1e-9
@@ -159,7 +131,6 @@ class ArmRig:
         self.state = json.loads(message.data)
         ready = self.state["ready"] and self.state["level"] == "ok"
         self.ready_states = self.ready_states + 1 if ready else 0
-        self.levels[self.state["level"]] += 1
 
 
 class ArmRigs:
@@ -169,12 +140,10 @@ class ArmRigs:
         self.rigs = rigs
 
     def wait(self, condition: Callable[[ArmRig], Any], what: str) -> None:
-        """Wait until ``condition`` holds for all."""
         for rig in self.rigs:
             rig.wait(partial(condition, rig), f"{rig.arm}: {what}")
 
     def engage(self) -> None:
-        """Press when all say that they are ready; an older state may be out of date."""
         self.wait_until_ready(1)
         self.press_until(lambda rig: rig.state.get("engaged"), "the arm is engaged")
 
@@ -185,14 +154,12 @@ class ArmRigs:
         self.wait(lambda rig: rig.ready_states >= states, "nothing keeps the arm from being engaged")
 
     def pause(self) -> None:
-        """Press until all are paused."""
         self.press_until(lambda rig: rig.state.get("state") in HOLDING, "the arm is paused")
 
     def wait_for_pause(self) -> None:
         self.wait(lambda rig: rig.state.get("state") in HOLDING, "the arm is paused")
 
     def move(self, by: tuple[float, float, float], duration: float, turn: float = 0.0) -> None:
-        """See :meth:`ArmRig.move`."""
         threads = [threading.Thread(target=rig.move, args=(by, duration, turn)) for rig in self.rigs]
         for thread in threads:
             thread.start()
@@ -205,7 +172,7 @@ class ArmRigs:
             rig.sends_hand = False
         self.wait_for_pause()
         for rig in self.rigs:
-            rig.hand = pin.SE3(rig.hand.rotation, rig.hand.translation + np.array([0.4, -0.4, 0.4]))
+            rig.hand = offset(rig.hand, (0.4, -0.4, 0.4))
             rig.sends_hand = True
 
     def press_until(self, condition: Callable[[ArmRig], Any], what: str) -> None:
@@ -228,33 +195,28 @@ class ArmRigs:
 def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:
     """Where a frame is in another, as on /tf; the stamp is not set."""
     message = TransformStamped(child_frame_id=child)
-    as_pose = pose_message(pose)
-    to, position = message.transform.translation, as_pose.position
-    to.x, to.y, to.z = position.x, position.y, position.z
-    message.transform.rotation = as_pose.orientation
     message.header.frame_id = parent
+    message.transform.rotation, to = pose_message(pose).orientation, message.transform.translation
+    to.x, to.y, to.z = pose.translation.tolist()
     return message
 
 
 def steps(targets: list[PoseStamped]) -> list[float]:
-    """Distances between one target and the next [m]."""
     positions = [np.array([t.pose.position.x, t.pose.position.y, t.pose.position.z]) for t in targets]
     return [float(np.linalg.norm(after - before)) for before, after in pairwise(positions)]
 
 
 def offset(pose: pin.SE3, by: tuple[float, float, float], turn: float = 0.0) -> pin.SE3:
-    """A pose moved by [m] and turned about z [rad], both of the world."""
     return pin.SE3(pin.exp3(np.array([0.0, 0.0, turn])) @ pose.rotation, pose.translation + np.array(by))
 
 
 def assert_same(pose: pin.SE3 | None, other: pin.SE3, tolerance: float) -> None:
-    """Two poses are the same."""
     assert pose is not None
     np.testing.assert_allclose(pose.homogeneous, other.homogeneous, atol=tolerance)
 
 
-def first(rig: ArmRig) -> pin.SE3:
-    """The first target that came."""
-    pose = pose_of(rig.targets[0].pose)
+def target_of(rig: ArmRig, number: int = 0) -> pin.SE3:
+    """The first target that came, or another one."""
+    pose = pose_of(rig.targets[number].pose)
     assert pose is not None
     return pose

@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import threading
 import time
+from bisect import bisect_right
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 import yaml
 from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
@@ -21,12 +25,9 @@ from q2r2_control import Robot
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.frames import FrameTree, read_transforms
-from q2r2_control.ros.bridge.messages import pose_message
+from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.types import Array
-from tests.ros import waiting
-from tests.ros.joint_recorder import JointRecorder
-from tests.ros.processes import CONFIG, PATIENCE, ROOT, Processes, RosProcess
-from tests.ros.waiting import wait_until
+from tests.ros.processes import CONFIG, PATIENCE, ROOT, Processes, RosProcess, call, wait_until
 
 RATE = 100.0  # of targets [Hz]
 NODE_RATE = 125.0  # half of the nodes' default, since many processes share a test machine [Hz]
@@ -38,28 +39,26 @@ PATIENT = ("joint_state_timeout:=0.5", "target_timeout:=0.5", "listener_timeout:
 
 
 class Cell:
-    """Listens to a cell, and streams targets to it."""
-
     def __init__(
         self, node: Any, robot: Robot, *processes: RosProcess, targets: str = "/q2r2/{arm}/target_frame"
     ) -> None:
         self.node, self.robot, self.processes = node, robot, processes
-        self.joints = JointRecorder(robot)
+        self.joints = JointRecorder(node, robot)
         self.frames = FrameTree()
         self.parents: dict[str, str] = {}  # of each frame on /tf and /tf_static
         self.states: dict[str, dict[str, Any]] = {}
+        self.streams: list[Stream] = []
+        self.call = partial(call, node)
         self._publishers = {
             arm: node.create_publisher(PoseStamped, targets.format(arm=arm), COMMAND_QOS) for arm in robot.arms
         }
-        self.joints.subscribe(node)
         for topic, qos in (("/tf", STREAM_QOS), ("/tf_static", LATCHED_QOS)):
             node.create_subscription(TFMessage, topic, self._on_transforms, qos)
         for name in ("mujoco_robot", "cartesian_controller"):
             node.create_subscription(String, f"/{name}/state", partial(self._on_state, name), 10)
 
     def _on_transforms(self, message: TFMessage) -> None:
-        for transform in message.transforms:
-            self.parents[transform.child_frame_id] = transform.header.frame_id
+        self.parents |= {one.child_frame_id: one.header.frame_id for one in message.transforms}
         for read in read_transforms(serialize_message(message)):
             self.frames.set(read, time.monotonic())
 
@@ -68,12 +67,10 @@ class Cell:
 
     @property
     def q(self) -> Array:
-        """The newest joint positions [rad]."""
         return self.joints.q
 
     @property
     def postures(self) -> list[Array]:
-        """All joint positions since :meth:`forget` [rad]."""
         return [state.q for state in self.joints.states[:]]
 
     def forget(self) -> None:
@@ -82,36 +79,23 @@ class Cell:
         wait_until(lambda: self.joints.states, "joint states come")
 
     def tool(self, arm: str) -> pin.SE3:
-        """An arm's tool, from /tf."""
         tool = self.find_tool(arm)
         assert tool is not None
         return tool
 
     def find_tool(self, arm: str) -> pin.SE3 | None:
-        """The same; None as long as it is not known."""
+        """From /tf; None as long as it is not known."""
         placement = self.frames.find(self.robot.arms[arm].tool_frame, WORLD)
         return None if placement is None else placement.pose
 
     def state(self, key: str, name: str = "cartesian_controller") -> Any:
-        """The newest value in a node's state."""
         return self.states.get(name, {}).get(key)
 
-    def send(self, arm: str, pose: pin.SE3, frame: str = "world") -> None:
-        """One target."""
-        message = PoseStamped(pose=pose_message(pose))
-        message.header.frame_id = frame
+    def send(self, arm: str, target: pin.SE3 | PoseStamped) -> None:
+        message = target if isinstance(target, PoseStamped) else stamped_pose(target, WORLD, 0.0)
         self._publishers[arm].publish(message)
-
-    def send_message(self, arm: str, message: PoseStamped) -> None:
-        """One target as it is."""
-        self._publishers[arm].publish(message)
-
-    def call(self, service: str, request: Any = None) -> Any:
-        """The response of a service, see :func:`waiting.call`."""
-        return waiting.call(self.node, service, request)
 
     def wait_until_active(self) -> None:
-        """Wait until the arms can be moved."""
         wait_until(lambda: self.state("phase") == "active", "the controller is active", lambda: self.states)
         wait_until(lambda: all(p.get_subscription_count() for p in self._publishers.values()), "targets have listeners")
         wait_until(lambda: all(self.find_tool(arm) is not None for arm in self.robot.arms), "tools are on /tf")
@@ -130,15 +114,29 @@ class Cell:
             assert time.monotonic() < deadline, f"{arms} do not follow: {self.states}"
             time.sleep(_GAP)
 
-    def wait_until_home(self) -> None:
-        """Wait until /tf tells of tools at home: transforms of before a reset may come late."""
+    def stop_and_reset(self, at_home: bool = False) -> None:
+        """Of the controller; ``at_home``: the simulation puts the arms there meanwhile."""
+        assert self.call("/cartesian_controller/stop").success
+        wait_until(lambda: self.state("phase") == "stopped", "the controller is stopped")
+        if at_home:
+            self.call("/mujoco_robot/reset")
+            # The controller begins where the newest joint state says that the arms are: it may be of before the reset.
+            for arm in self.robot.arms:
+                self.wait_until_there(arm, self.robot.tool_pose(self.robot.home, arm), 2e-3)
+        assert self.call("/cartesian_controller/reset").success
 
-        def at_home(arm: str) -> bool:
-            home = self.robot.tool_pose(self.robot.home, arm).translation
-            there = self.find_tool(arm)
-            return there is not None and float(np.linalg.norm(there.translation - home)) < 2e-3
+    def wait_until_there(self, arm: str, goal: pin.SE3, within: float) -> None:
+        """Wait until a tool is this near to a pose [m]."""
 
-        wait_until(lambda: all(map(at_home, self.robot.arms)), "the tools are at home")
+        def there() -> bool:
+            tool = self.find_tool(arm)
+            return tool is not None and float(np.linalg.norm(tool.translation - goal.translation)) < within
+
+        wait_until(there, f"the {arm} tool is there")
+
+    def end_streams(self) -> None:
+        while self.streams:
+            self.streams.pop().end()
 
 
 class Stream:
@@ -147,6 +145,7 @@ class Stream:
     def __init__(self, cell: Cell, poses: dict[str, pin.SE3]) -> None:
         self.poses = dict(poses)
         self._cell, self._ended = cell, threading.Event()
+        cell.streams.append(self)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -159,7 +158,6 @@ class Stream:
             time.sleep(1.0 / RATE)
 
     def end(self) -> None:
-        """No more targets."""
         self._ended.set()
         self._thread.join()
 
@@ -170,18 +168,15 @@ class Stream:
 
 
 def start_robot(processes: Processes, *parameters: str, config: str = CONFIG) -> RosProcess:
-    """Start the simulated robot."""
     return processes.start_node("mujoco_robot", f"config:={config}", f"rate:={NODE_RATE}", *parameters)
 
 
-def start_controller(processes: Processes, *parameters: str, config: str = CONFIG, **environment: str) -> RosProcess:
-    """Start the built-in controller."""
+def start_controller(processes: Processes, *parameters: str, config: str = CONFIG, node: str = "") -> RosProcess:
     given = (f"config:={config}", f"rate:={NODE_RATE}", *parameters)
-    return processes.start_node("cartesian_controller", *given, **environment)
+    return processes.start_node("cartesian_controller", *given, node=node)
 
 
 def changed_cell(folder: Path, **sections: dict[str, Any]) -> str:
-    """File of the shipped cell with keys of some of its sections changed."""
     cell = yaml.safe_load((ROOT / CONFIG).read_text())
     for section, keys in sections.items():
         cell[section] = cell[section] | keys
@@ -195,6 +190,100 @@ def changed_cell(folder: Path, **sections: dict[str, Any]) -> str:
 SOFT = {"translational_stiffness": 300.0, "rotational_stiffness": 20.0, "nullspace_stiffness": 10.0}
 
 
-def shifted(pose: pin.SE3, x: float, y: float, z: float) -> pin.SE3:
-    """A pose moved along the world's axes [m]."""
-    return pin.SE3(pose.rotation, pose.translation + np.array([x, y, z]))
+def shifted(pose: pin.SE3, *by: float) -> pin.SE3:
+    return pin.SE3(pose.rotation, pose.translation + np.array(by))
+
+
+SLOW = 0.05  # 3 % of a joint's limit: the arm still settles, but no longer follows [rad/s]
+REST = 0.01  # [rad/s]
+REST_TIME = 0.3  # that joints have to be slower than that [s]
+SPEED_WINDOW = 0.2  # longer than a robot without processor time catches up with, shorter than a jump takes [s]
+
+
+class Joints(NamedTuple):
+    t: float  # of its receipt, on this machine's steady clock [s]
+    q: Array
+    v: Array
+    stamp: float  # of the message [s]
+
+
+class JointRecorder:
+    def __init__(self, node: Any, robot: Robot) -> None:
+        self.states: list[Joints] = []
+        self._robot = robot
+        node.create_subscription(JointState, "/joint_states", self._on_joint_state, 100)
+
+    def _on_joint_state(self, message: Any) -> None:
+        """A state without all joints of the arms is ignored."""
+        if set(message.name) >= set(self._robot.joint_names):
+            order = [message.name.index(name) for name in self._robot.joint_names]
+            stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+            q, v = np.array(message.position)[order], np.array(message.velocity)
+            self.states.append(Joints(time.monotonic(), q, v[order] if len(v) else np.zeros(len(q)), stamp))
+
+    @property
+    def q(self) -> Array:
+        return self.states[-1].q
+
+    def tool(self, arm: str) -> pin.SE3:
+        return self._robot.tool_pose(self.q, arm)
+
+    def since(self, t: float) -> list[Joints]:
+        states = self.states[:]  # another thread appends
+        return states[bisect_right(states, t, key=lambda state: state.t) :]
+
+    def speeds(self, duration: float) -> Array:
+        """Greatest speed of each joint in the last ``duration`` [s]."""
+        recent = self.since(time.monotonic() - duration)
+        return np.max([np.abs(state.v) for state in recent], axis=0) if recent else np.zeros(self._robot.model.nv)
+
+    def fastest(self, since: float) -> float:
+        """Greatest speed of any joint since [s], as a mean over a window [rad/s]."""
+        states, first, fastest = self.since(since), 0, 0.0
+        for state in states:
+            while state.stamp - states[first].stamp > SPEED_WINDOW:
+                change = float(np.abs(state.q - states[first].q).max())
+                fastest = max(fastest, change / (state.stamp - states[first].stamp))
+                first += 1
+        return fastest
+
+    def farthest_from(self, posture: Array, since: float) -> float:
+        return max(float(np.abs(state.q - posture).max()) for state in self.since(since))
+
+    def tool_farthest_from(self, posture: Array, since: float) -> float:
+        return max(self._tool_motion(arm, posture, self.since(since)) for arm in self._robot.arms)
+
+    def wait_for_rest(self) -> Array:
+        """Wait until no joint has moved for a while; the positions [rad]."""
+
+        def rests() -> bool:
+            recent = [state.q for state in self.since(time.monotonic() - 0.4)]
+            return len(recent) >= 10 and float(np.ptp(recent, axis=0).max()) < 5e-4
+
+        wait_until(rests, "the arms are at rest")
+        return self.q
+
+    def stop_after(self, fault: float) -> tuple[float, float]:
+        """Wait for rest after a fault [s]: its greatest joint speed [rad/s], and the time until all are slow [s]."""
+
+        def last(speed: float) -> float:
+            """When any joint was last faster than that [s]."""
+            return max((state.t for state in self.since(fault) if np.abs(state.v).max() > speed), default=fault)
+
+        wait_until(lambda: self.states[-1].t - last(REST) > REST_TIME, "all joints rest")
+        before = [state for state in self.states if state.t <= fault][-1]
+        return float(np.abs(before.v).max()), last(SLOW) - fault
+
+    @contextmanager
+    def tools_rest(self, within: float, what: str) -> Iterator[None]:
+        """Asserts that no tool is farther than ``within`` [m] from where it was, at any joint state meanwhile."""
+        first = self.states[-1]
+        yield
+        for arm in self._robot.arms:
+            moved = self._tool_motion(arm, first.q, self.since(first.t))
+            assert moved <= within, f"{arm} moved by {moved:.4f} m while {what}"
+
+    def _tool_motion(self, arm: str, posture: Array, states: list[Joints]) -> float:
+        start = self._robot.tool_pose(posture, arm).translation
+        tools = [self._robot.tool_pose(state.q, arm).translation for state in states]
+        return max((float(np.linalg.norm(tool - start)) for tool in tools), default=0.0)

@@ -13,17 +13,13 @@ import numpy as np
 from q2r2_control import Robot
 from tests.ros.arm_rig import ArmRig, ArmRigs, patient
 from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
-from tests.ros.processes import Processes, RosProcess
-from tests.ros.waiting import wait_until
+from tests.ros.processes import Processes, RosProcess, wait_until
 
 ROBOT, CONTROLLER, ARMS = "mujoco_robot", "cartesian_controller", "arm_controllers"
 
 
 class Cockpit:
-    """The processes, by the names of their executables, and the hands."""
-
     def __init__(self, node: Any, robot: Robot, processes: Processes, parameters: Mapping[str, Any]) -> None:
-        """``parameters``: of the arms' nodes."""
         self._starts: dict[str, Callable[[], RosProcess]] = {
             ROBOT: lambda: start_robot(processes, "max_jump:=1.0"),  # a jump is to be seen
             CONTROLLER: lambda: start_controller(processes, *PATIENT),
@@ -38,12 +34,10 @@ class Cockpit:
         self.wait_until_up()
 
     def wait_until_up(self) -> None:
-        """Wait until all nodes hear each other."""
         self.rigs.wait(lambda rig: rig.state.get("hand_age") is not None, "its node receives the hand")
         wait_until(lambda: self.cell.state("phase") == "active", "the controller is active", lambda: self.cell.states)
 
     def signal(self, name: str, number: signal.Signals) -> float:
-        """Send a node a signal; when that was [s]."""
         sent = time.monotonic()
         os.kill(self.running[name].pid, number)
         if number is signal.SIGKILL:
@@ -60,16 +54,12 @@ class Cockpit:
 
     def go_home(self) -> None:
         """Put the arms at home by the simulation, at rest and not engaged."""
-        assert self.cell.call("/cartesian_controller/stop").success
-        wait_until(lambda: self.cell.state("phase") == "stopped", "the controller is stopped")
-        self.cell.call("/mujoco_robot/reset")
-        self.cell.wait_until_home()
-        assert self.cell.call("/cartesian_controller/reset").success
+        self.cell.stop_and_reset(at_home=True)
         self.wait_until_up()
         self.rigs.wait(lambda rig: not rig.state["engaged"], "no arm is engaged")
 
     def go_away(self) -> None:
-        """Both arms are moved a way from home by their hands."""
+        """Both arms are moved away from home by their hands."""
         self.rigs.engage()
         if self.from_home < 0.1:
             self.rigs.move((0.1, 0.0, 0.08), 1.0)
@@ -79,15 +69,3 @@ class Cockpit:
     @property
     def from_home(self) -> float:
         return float(np.abs(self.cell.q - self.cell.robot.home).max())
-
-    def ask_for_home(self) -> None:
-        """By the left hand."""
-        self.left.grip = 1.0
-        self.rigs.wait(lambda rig: rig.state["state"] == "homing", "both arms are on their way home")
-        self.left.grip = 0.0
-
-    def hold(self, rig: ArmRig, button: str) -> None:
-        """A press that is a long one."""
-        setattr(rig, button, True)
-        time.sleep(1.0)
-        setattr(rig, button, False)

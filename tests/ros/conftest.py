@@ -48,10 +48,7 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 
 @pytest.fixture(scope="session", autouse=True)
 def precedence() -> None:
-    """Where the system permits it this process, and those that it starts, run before other programs of the machine.
-
-    Timeouts of 100 ms do not hold where others take the processors for longer, and arms that pause then are no fault.
-    """
+    """This process and those that it starts go first, where that is permitted: timeouts of 100 ms have to hold."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
     with suppress(OSError):
@@ -60,7 +57,6 @@ def precedence() -> None:
 
 @pytest.fixture(scope="session")
 def robot() -> Robot:
-    """The arms of the cell that the tests run."""
     return Robot.from_config(load_config(CONFIG))
 
 
@@ -74,7 +70,6 @@ def kernels(robot: Robot) -> None:
 
 @pytest.fixture(scope="module")
 def module_processes(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
-    """Processes that outlive one test, since each takes seconds to start."""
     started = Processes(tmp_path_factory.mktemp("processes"), os.environ)
     yield started
     started.end_all()
@@ -82,7 +77,6 @@ def module_processes(domain: int, tmp_path_factory: pytest.TempPathFactory) -> I
 
 @pytest.fixture(scope="module")
 def module_node(domain: int) -> Iterator[Any]:
-    """A node that outlives one test."""
     with spun_node(domain) as made:
         yield made
 
@@ -98,7 +92,6 @@ def processes(domain: int, tmp_path: Path, request: pytest.FixtureRequest) -> It
 
 @pytest.fixture
 def node(domain: int) -> Iterator[Any]:
-    """An ``rclpy`` node in the private domain, spun by a thread of its own."""
     with spun_node(domain) as made:
         yield made
 
@@ -150,9 +143,7 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(
-    item: pytest.Item, call: pytest.CallInfo[None]
-) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     report = yield
     if report.failed and (started := item.stash.get(_PROCESSES, None)):
         report.sections += [(f"output of {process.name}", process.output) for process in started.started]

@@ -14,20 +14,22 @@ import numpy as np
 import pytest
 
 from tests.ros.conftest import need_ros, spun_node
-from tests.ros.processes import PATIENCE, Processes
-from tests.ros.waiting import call
+from tests.ros.processes import PATIENCE, Processes, as_arguments, call
 
 need_ros()
 
 import control_msgs.action
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionServer
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError
+from q2r2_control.ros.bridge.messages import time_message
 from q2r2_control.ros.nodes.arm_controllers import LeftArmController
 from q2r2_control.teleop.haptics import GRASP, NEAR
-from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, patient, steps
+from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, patient, steps, target_of
 from tests.ros.programs.stalling_arm import STALL
 
 
@@ -36,16 +38,14 @@ def rig(node: Any) -> ArmRig:
     return ArmRig(node)
 
 
-def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_a_jump(
-    rig: ArmRig, processes: Processes
-) -> None:
+def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_jump(rig: ArmRig, processes: Processes) -> None:
     process = rig.start(processes)
     rig.move((0.2, 0.0, 0.0), 0.1)
     time.sleep(0.3)
     assert rig.targets == []
     rig.engage()
     rig.wait(lambda: rig.targets, "the first target comes")
-    assert_same(first(rig), TOOL, 1e-9)
+    assert_same(target_of(rig), TOOL, 1e-9)
     assert rig.targets[0].header.frame_id == "world"
 
     rig.move((0.05, -0.1, 0.08), turn=0.3)
@@ -96,10 +96,7 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     rig.sends_hand = False
     rig.wait(lambda: rig.state["state"] == "lost", "the watchdog pauses the arm")
     assert re.match(r"lost: no (data|pose) of the left hand from /test for 0\.5", rig.state["last_event"])
-    rig.wait(
-        lambda: "of the left hand from /test for" in rig.state["message"],
-        "diagnostics name the node",
-    )
+    rig.wait(lambda: "of the left hand from /test for" in rig.state["message"], "diagnostics name the node")
     assert rig.state["level"] == "warn"
     held = rig.wait_for_rest()
     rig.hand = offset(rig.hand, (0.3, 0.3, 0.0))
@@ -112,12 +109,9 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     assert_same(rig.newest(), held, 1e-6)
 
 
-def test_a_node_that_stood_still_in_the_middle_of_a_tick_sends_no_target_of_the_past(
-    rig: ArmRig, processes: Processes
-) -> None:
+def test_a_node_that_stood_still_in_a_tick_sends_no_target_of_the_past(rig: ArmRig, processes: Processes) -> None:
     """Neither the one that it had decided on, nor the way that its last motion had left to brake on."""
-    arguments = [part for parameter in patient({}) for part in ("-p", parameter)]
-    process = processes.start_module("tests.ros.programs.stalling_arm", "--ros-args", *arguments)
+    process = processes.start_module("tests.ros.programs.stalling_arm", *as_arguments(*patient({})))
     rig.wait_until_connected()
     rig.engage()
     mover = threading.Thread(target=rig.move, args=((0.6, 0.0, 0.0), 2.0))
@@ -135,9 +129,7 @@ def test_a_node_that_stood_still_in_the_middle_of_a_tick_sends_no_target_of_the_
     assert_same(rig.wait_for_rest(), offset(held, (0.0, 0.05, 0.0)), 1e-3)
 
 
-def test_without_its_tools_pose_an_arm_is_not_engaged_nor_a_gripper_closed_without_server(
-    rig: ArmRig, processes: Processes
-) -> None:
+def test_an_arm_needs_its_tools_pose_and_a_gripper_its_server(rig: ArmRig, processes: Processes) -> None:
     rig.sends_tool = False
     rig.start(processes)
     rig.press()
@@ -186,9 +178,7 @@ def test_a_hand_feels_what_the_controller_says_of_its_arm(rig: ArmRig, node: Any
 
 
 @pytest.mark.parametrize("kind", ["GripperCommand", "ParallelGripperCommand"])
-def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
-    kind: str, rig: ArmRig, processes: Processes, domain: int
-) -> None:
+def test_a_gripper_is_closed_when_its_result_says_so(kind: str, rig: ArmRig, processes: Processes, domain: int) -> None:
     action = getattr(control_msgs.action, kind)
     goals: Queue[Any] = Queue()
     stalls = True
@@ -230,6 +220,32 @@ BAD_PARAMETERS = {
 @pytest.mark.parametrize("given", BAD_PARAMETERS)
 def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> None:
     with pytest.raises(ConfigError) as error:
-        LeftArmController(context=context, cli_args=["--ros-args", "-p", given])
+        LeftArmController(context=context, cli_args=as_arguments(given))
     assert BAD_PARAMETERS[given] in str(error.value)
     assert len(str(error.value).splitlines()) == 1
+
+
+def test_an_arm_without_time_is_not_engaged_or_paused(rig: ArmRig, node: Any, processes: Processes) -> None:
+    diagnostics: list[DiagnosticStatus] = []
+    node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: diagnostics.extend(message.status), 10)
+    rig.start(processes, {"use_sim_time": True})
+    rig.wait(lambda: rig.state["message"].startswith("use_sim_time is set and nothing comes"), "it says so")
+    rig.wait(lambda: diagnostics and "nothing comes on /clock" in diagnostics[-1].message, "so do the diagnostics")
+    assert (diagnostics[-1].name, diagnostics[-1].level) == ("/left_q2r2_arm_controller", DiagnosticStatus.ERROR)
+    rig.press()
+    assert (rig.state["engaged"], rig.state["ready"], rig.targets) == (False, False, [])
+
+    publisher, began = node.create_publisher(Clock, "/clock", 1), time.monotonic()
+    send_time = lambda: publisher.publish(Clock(clock=time_message(1.0 + time.monotonic() - began)))  # noqa: E731
+    timer = node.create_timer(0.01, send_time)
+    rig.wait(lambda: rig.state["ready"], "it is ready when time comes")
+    assert (rig.state["engaged"], rig.targets) == (False, [])  # by the press before
+    rig.engage()
+    node.destroy_timer(timer)
+    # On a machine with other load something else may have paused it before, so the reason is asked of what it says now.
+    rig.wait(lambda: "time on /clock stands still" in rig.state["message"], "it says that time stops")
+    rig.wait(lambda: not rig.state["engaged"] and not rig.state["ready"], "it is paused")
+    rig.press()
+    node.create_timer(0.01, send_time)
+    rig.wait(lambda: rig.state["ready"], "it is ready when time goes on")
+    assert not rig.state["engaged"]

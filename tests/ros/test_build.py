@@ -1,22 +1,25 @@
-"""``q2r2 ros build-interfaces``: what it builds, what it leaves alone, and what it says when something is missing."""
+"""The ROS packages: message packages with their type hashes, how they are built, and the repository under colcon."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
 import venv
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from q2r2_control.ros.launch.build import INTERFACES, BuildError, Interfaces, build, interface_packages, missing_tools
 from tests.ros.conftest import need_ros
 from tests.ros.processes import ROOT
 
 need_ros()
-pytestmark = pytest.mark.slow
+
 
 SITE_PACKAGES = Path("lib", f"python{sys.version_info.major}.{sys.version_info.minor}", "site-packages")
 NAMES = ["control_msgs", "quest2ros", "tf2_msgs"]
@@ -29,38 +32,25 @@ def build_interfaces(
     return subprocess.run(command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=120)
 
 
-@pytest.fixture
-def bare_environment(tmp_path: Path) -> Path:
-    """A virtual environment that holds nothing; returns its folder."""
-    folder = tmp_path / "bare"
-    venv.create(folder, symlinks=True, with_pip=False)
-    return folder
-
-
-@pytest.fixture
-def sourced(bare_environment: Path) -> dict[str, str]:
-    """Variables that let another environment see the packages of this one, as sourcing a ROS install does."""
-    prefix = Path(sys.prefix)
-    libraries = [prefix / "lib", *(prefix / SITE_PACKAGES).glob("ros_*.libs")]
-    return {
-        "AMENT_PREFIX_PATH": str(prefix),
-        "PYTHONPATH": os.pathsep.join(map(str, [ROOT, *filter(None, sys.path)])),
-        "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),
-    }
-
-
+@pytest.mark.slow
 def test_the_shipped_packages_define_what_the_app_and_grippers_use() -> None:
     assert [package.name for package in interface_packages()] == NAMES
     assert "from quest2ros.msg import OVR2ROSInputs" in Interfaces(INTERFACES / "quest2ros").proof
     assert "from control_msgs.action import ParallelGripperCommand" in Interfaces(INTERFACES / "control_msgs").proof
 
 
-def test_a_sourced_install_is_left_alone_and_a_package_built_beside_it_is_used_after_sourcing_it_too(
-    bare_environment: Path, sourced: dict[str, str], tmp_path: Path
-) -> None:
+@pytest.mark.slow
+def test_a_sourced_install_stays_and_a_package_built_beside_it_is_used_once_it_is_sourced_too(tmp_path: Path) -> None:
     if missing := missing_tools(Path(sys.prefix)):
         pytest.skip(f"nothing can be built here: missing {'; '.join(missing)}")
-    python = bare_environment / "bin" / "python"
+    venv.create(bare_environment := tmp_path / "bare", symlinks=True, with_pip=False)
+    python, prefix = bare_environment / "bin" / "python", Path(sys.prefix)
+    libraries = [prefix / "lib", *(prefix / SITE_PACKAGES).glob("ros_*.libs")]
+    sourced = {  # as sourcing a ROS install does
+        "AMENT_PREFIX_PATH": str(prefix),
+        "PYTHONPATH": os.pathsep.join(map(str, [ROOT, *filter(None, sys.path)])),
+        "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),
+    }
     run = build_interfaces("--force", python=python, **sourced)
     assert [line.split(" (")[0] for line in run.stdout.splitlines()] == [f"{name}: already there" for name in NAMES]
     build(Interfaces(INTERFACES / "quest2ros"), bare_environment, tmp_path / "quest2ros.log")
@@ -83,6 +73,7 @@ def test_a_sourced_install_is_left_alone_and_a_package_built_beside_it_is_used_a
     assert run.stdout.split() == [str(packages / "quest2ros"), "12"], run.stderr
 
 
+@pytest.mark.slow
 def test_without_a_compiler_one_line_says_so(tmp_path: Path) -> None:
     """With a PATH that has make and nothing else; CMake comes with the environment."""
     if (make := shutil.which("make")) is None:
@@ -95,10 +86,12 @@ def test_without_a_compiler_one_line_says_so(tmp_path: Path) -> None:
     assert line.endswith(" not built: missing a C++ compiler (c++ or g++ or clang++; Debian, Ubuntu: g++)")
 
 
+@pytest.mark.slow
 def test_a_folder_that_no_python_looks_into_is_refused(tmp_path: Path) -> None:
     assert f"a virtual environment that can be written to, since {tmp_path} is none" in missing_tools(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_build_that_fails_names_its_log(tmp_path: Path) -> None:
     pytest.importorskip("catkin_pkg")
     source = tmp_path / "broken"
@@ -110,12 +103,14 @@ def test_a_build_that_fails_names_its_log(tmp_path: Path) -> None:
     assert "broken" in log.read_text()
 
 
+@pytest.mark.slow
 def test_importing_the_package_imports_no_rclpy() -> None:
     code = "import sys, q2r2_control.ros.launch.processes; print('rclpy' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert (run.stdout, run.stderr) == ("False\n", "")
 
 
+@pytest.mark.slow
 def test_the_names_that_subclasses_need_come_from_the_package() -> None:
     pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
     from q2r2_control.ros import BaseArmController, BaseNode, run_node
@@ -124,3 +119,83 @@ def test_the_names_that_subclasses_need_come_from_the_package() -> None:
     assert callable(run_node)
     with pytest.raises(ImportError):
         from q2r2_control.ros import no_such_name  # noqa: F401
+
+
+# What docs.ros.org/en/jazzy/p/control_msgs lists, in its order; a type hash depends on names and types of fields alone.
+GRIPPER_STATE = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal"
+PUBLISHED_FIELDS = {
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "control_msgs/msg/GripperCommand": "float64 position\nfloat64 max_effort",
+    "control_msgs/action/GripperCommand_Goal": "control_msgs/GripperCommand command",
+    "control_msgs/action/GripperCommand_Result": GRIPPER_STATE,
+    "control_msgs/action/GripperCommand_Feedback": GRIPPER_STATE,
+    "control_msgs/action/ParallelGripperCommand_Goal": "sensor_msgs/JointState command",
+    "control_msgs/action/ParallelGripperCommand_Result": (
+        "sensor_msgs/JointState state\nbool stalled\nbool reached_goal"
+    ),
+    "control_msgs/action/ParallelGripperCommand_Feedback": "sensor_msgs/JointState state",
+}
+
+
+def built_hash(kind: str) -> str:
+    package, folder, name = kind.split("/")
+    module = Path(import_module(package).__path__[0])  # prefix/lib/python3.x/site-packages/package
+    file = module.parents[3] / "share" / package / folder / f"{name.split('_')[0]}.json"
+    hashes = json.loads(file.read_text())["type_hashes"]
+    return next(entry["hash_string"] for entry in hashes if entry["type_name"] == kind)
+
+
+def published_hash(kind: str) -> str:
+    """The type hash of the published fields, computed by rosbags from its own definitions of what they contain."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, fields in PUBLISHED_FIELDS.items():
+        store.register(get_types_from_msg(fields, name))
+    return store.hash_rihs01(kind)
+
+
+@pytest.mark.parametrize("kind", PUBLISHED_FIELDS)
+def test_a_type_has_the_hash_of_its_published_fields(kind: str) -> None:
+    assert built_hash(kind) == published_hash(kind)
+
+
+PACKAGE = ("package.xml", "pyproject.toml", "setup.py", "setup.cfg", "README.md", "LICENSE")
+FOLDERS = ("config", "launch", "q2r2_control", "resource", "robots", "views")
+
+
+def printed(folder: Path, *command: str, **environment: str) -> str:
+    """What a command prints that runs in ``folder``, without the PYTHONPATH of these tests."""
+    inherited = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    given = {"cwd": folder, "env": inherited | environment, "capture_output": True, "text": True, "timeout": 120}
+    run: subprocess.CompletedProcess[str] = subprocess.run(command, **given)  # type: ignore[call-overload]
+    assert run.returncode == 0, run.stdout + run.stderr
+    return run.stdout
+
+
+def test_colcon_installs_a_command_that_runs_with_its_own_settings_robots_and_interfaces(tmp_path: Path) -> None:
+    pytest.importorskip("colcon_ros", reason="needs colcon: pip install 'q2r2_control[dev]'")
+    copy = tmp_path / "src" / "q2r2_control"
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in PACKAGE:
+        shutil.copy(ROOT / name, copy)
+    colcon = (sys.executable, "-c", "import sys; from colcon_core.command import main; sys.exit(main())")
+    printed(tmp_path, *colcon, "build", "--event-handlers", "console_direct+", PYTHONWARNINGS="ignore")
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    installed = tmp_path / "install" / "q2r2_control"
+
+    def sourced(command: str) -> str:
+        return printed(elsewhere, "bash", "-c", f'. "{tmp_path}/install/local_setup.bash" && {command}')
+
+    assert "Bimanual VR teleoperation" in sourced(f'"{installed}/lib/q2r2_control/q2r2" --help')
+    assert "build-interfaces" in sourced(f'"{installed}/lib/q2r2_control/q2r2" ros --help')
+    script = "import q2r2_control.config.resources as r; print(r.__file__); print(r.find_resource('robots/iiwa7.urdf'))"
+    code, robot = sourced(f'"{sys.executable}" -c "{script}"').splitlines()
+    assert Path(code).is_relative_to(installed / "lib")
+    share = installed / "share" / "q2r2_control"
+    assert Path(robot) == share / "robots" / "iiwa7.urdf"
+    assert (share / "package.xml").is_file()
+    shipped = {file.name for folder in ("config", "robots", "launch") for file in (ROOT / folder).glob("*.*")}
+    assert {file.name for file in share.glob("*/*.*")} >= shipped
+    (package,) = installed.glob("lib/python3.*/site-packages/q2r2_control/ros/interfaces")
+    definitions = [file.relative_to(INTERFACES) for file in INTERFACES.rglob("*") if file.is_file()]
+    assert sorted(file.relative_to(package) for file in package.rglob("*") if file.is_file()) == sorted(definitions)

@@ -14,16 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from q2r2_control import Robot, load_config
-from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control import Robot
 from tests.ros.conftest import need_ros, spun_node
-from tests.ros.processes import CONFIG, Processes
+from tests.ros.processes import Processes
 
 need_ros()
 
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -33,13 +31,9 @@ from trajectory_msgs.msg import JointTrajectory
 from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.ros.bridge.messages import pose_message, stamped_pose, time_message
 from tests.ros.cell import NODE_RATE, PATIENT, STILL, Cell, Stream, shifted, start_controller, start_robot
-from tests.ros.waiting import wait_until
+from tests.ros.processes import wait_until
 
 pytestmark = pytest.mark.alone
-
-EVERY_COMMAND = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-# How far the simulated arms lag behind their reference at the speeds of these tests, between two arms.
-TRACKING = 0.01  # [m]
 
 
 @pytest.fixture(scope="module")
@@ -49,57 +43,25 @@ def started(module_node: Any, module_processes: Processes, robot: Robot) -> Cell
 
 
 @pytest.fixture
-def cell(started: Cell) -> Cell:
+def cell(started: Cell) -> Iterator[Cell]:
     """At home, active, without targets."""
-    started.call("/cartesian_controller/stop")
-    wait_until(lambda: started.state("phase") == "stopped", "the controller is stopped")
-    started.call("/mujoco_robot/reset")
-    # Before the controller begins where the newest joint state says that the arms are: it may be of before the reset.
-    started.wait_until_home()
-    started.call("/cartesian_controller/reset")
+    started.stop_and_reset(at_home=True)
     started.wait_until_active()
     started.forget()
-    return started
+    yield started
+    started.end_streams()
 
 
-@pytest.fixture
-def streams() -> Iterator[list[Stream]]:
-    """Streams that a test began; they end with it."""
-    begun: list[Stream] = []
-    yield begun
-    for stream in begun:
-        stream.end()
-
-
-def engage(cell: Cell, streams: list[Stream], *arms: str) -> Stream:
-    streams.append(cell.engage(*arms))
-    return streams[-1]
-
-
-def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Robot, streams: list[Stream]) -> None:
-    stream = engage(cell, streams, "left")
+def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Robot) -> None:
+    stream = cell.engage("left")
     start_q, begin = cell.q, stream.poses["left"]
     stream.move("left", (0.05, 0.0, 0.0))
     goal = stream.poses["left"]
     assert np.linalg.norm(goal.translation - begin.translation) == pytest.approx(0.05)
-    wait_until(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 2e-3, "the arm is there")
+    cell.wait_until_there("left", goal, 2e-3)
     wait_until(lambda: np.linalg.norm(pin.log3(cell.tool("left").rotation.T @ goal.rotation)) < 5e-3, "it is turned so")
     right = robot.arms["right"].joints
     assert all(np.abs((q - start_q)[right]).max() < STILL for q in cell.postures)
-
-
-def test_crossing_targets_never_bring_the_arms_nearer_than_the_least_distance(
-    cell: Cell, robot: Robot, streams: list[Stream]
-) -> None:
-    stream = engage(cell, streams, "left", "right")
-    kept = kept_distances(robot, load_config(CONFIG).control).values
-    for _ in range(25):
-        for arm, sign in (("left", -1.0), ("right", 1.0)):
-            stream.poses[arm] = shifted(stream.poses[arm], 0.0, 0.02 * sign, 0.0)
-        time.sleep(0.04)
-    time.sleep(1.0)
-    margin = min(float((robot.distance_values(q) - kept).min()) for q in cell.postures)
-    assert -TRACKING <= margin < 0.02  # they did meet
 
 
 def test_a_bad_target_moves_nothing_and_is_reported_once(cell: Cell) -> None:
@@ -110,7 +72,7 @@ def test_a_bad_target_moves_nothing_and_is_reported_once(cell: Cell) -> None:
     kinds = {"frame_id 'elsewhere'": odd, "the stream is 0.1": stamped_pose(far, "world", 0.0)}
     for said, message in kinds.items():
         for _ in range(30):
-            cell.send_message("left", message)
+            cell.send("left", message)
             time.sleep(0.01)
         process.wait_for(said)
         assert process.output[begin:].count(said) == 1
@@ -119,16 +81,14 @@ def test_a_bad_target_moves_nothing_and_is_reported_once(cell: Cell) -> None:
     assert all(np.abs(q - before).max() < STILL for q in cell.postures)
 
 
-def test_an_arm_holds_without_targets_and_follows_only_a_stream_that_begins_at_its_tool(
-    cell: Cell, streams: list[Stream]
-) -> None:
-    stream = engage(cell, streams, "left")
+def test_an_arm_holds_without_targets_and_follows_only_a_stream_that_begins_at_its_tool(cell: Cell) -> None:
+    stream = cell.engage("left")
     stream.move("left", (0.05, 0.0, 0.0))
     stream.end()
     wait_until(lambda: cell.state("left_state") == "holding", "the arm holds")
     rest = cell.joints.wait_for_rest()
     far = shifted(stream.poses["left"], 0.0, 0.0, 0.1)
-    streams.append(again := Stream(cell, {"left": far}))
+    again = Stream(cell, {"left": far})
     again.move("left", (0.0, 0.0, -0.1))  # comes by where the arm is
     time.sleep(0.3)
     assert np.abs(cell.q - rest).max() < STILL
@@ -139,8 +99,8 @@ def test_an_arm_holds_without_targets_and_follows_only_a_stream_that_begins_at_i
     wait_until(lambda: cell.state("left_state") == "following", "the arm follows")
 
 
-def test_pause_stop_and_home(cell: Cell, robot: Robot, streams: list[Stream]) -> None:
-    stream = engage(cell, streams, "left")
+def test_pause_stop_and_home(cell: Cell, robot: Robot) -> None:
+    stream = cell.engage("left")
     stream.move("left", (0.0, 0.0, 0.06))
     assert cell.call("/cartesian_controller/pause", SetBool.Request(data=True)).success
     rest = cell.joints.wait_for_rest()
@@ -149,24 +109,21 @@ def test_pause_stop_and_home(cell: Cell, robot: Robot, streams: list[Stream]) ->
     assert not cell.call("/cartesian_controller/home").success
     assert cell.call("/cartesian_controller/pause", SetBool.Request(data=False)).success
     assert cell.call("/cartesian_controller/home").success
-    home = robot.tool_pose(robot.home, "left")
-    wait_until(lambda: np.linalg.norm(cell.tool("left").translation - home.translation) < 4e-3, "the tool is at home")
+    cell.wait_until_there("left", robot.tool_pose(robot.home, "left"), 4e-3)
     assert cell.call("/cartesian_controller/stop").success
     wait_until(lambda: cell.state("phase") == "stopped", "the controller is stopped")
     wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "nothing is commanded")
 
 
-def test_a_controller_that_stood_still_in_motion_publishes_no_jump(
-    cell: Cell, robot: Robot, streams: list[Stream]
-) -> None:
+def test_a_controller_that_stood_still_in_motion_publishes_no_jump(cell: Cell, robot: Robot) -> None:
     commands: list[tuple[int, Any]] = []  # their numbers, and the positions
 
     def take(message: JointTrajectory, info: Any) -> None:
         order = [message.joint_names.index(name) for name in robot.joint_names]
         commands.append((info["publication_sequence_number"], np.array(message.points[0].positions)[order]))
 
-    subscription = cell.node.create_subscription(JointTrajectory, "/joint_trajectory", take, EVERY_COMMAND)
-    stream = engage(cell, streams, "left")
+    subscription = cell.node.create_subscription(JointTrajectory, "/joint_trajectory", take, 1000)
+    stream = cell.engage("left")
     for way in (0.2, -0.2, 0.2):
         stream.poses["left"] = shifted(stream.poses["left"], 0.0, 0.0, way)
         wait_until(lambda: cell.joints.speeds(0.05).max() > 0.5, "the arm is fast")
@@ -179,12 +136,10 @@ def test_a_controller_that_stood_still_in_motion_publishes_no_jump(
     cell.node.destroy_subscription(subscription)
 
 
-def test_invalid_joint_states_stop_the_arms_with_one_diagnostic(
-    cell: Cell, robot: Robot, streams: list[Stream]
-) -> None:
+def test_invalid_joint_states_stop_the_arms_with_one_diagnostic(cell: Cell, robot: Robot) -> None:
     process, said = cell.processes[1], "joint states: position of left_A4 is not finite"
     begin = len(process.output)
-    stream = engage(cell, streams, "left")
+    stream = cell.engage("left")
     stream.move("left", (0.0, 0.0, 0.03))
     publisher = cell.node.create_publisher(JointState, "/joint_states", 10)
     q = cell.q.copy()
@@ -201,10 +156,8 @@ def test_invalid_joint_states_stop_the_arms_with_one_diagnostic(
     assert np.abs(cell.q - rest).max() < STILL
 
 
-def test_a_second_publisher_of_targets_in_mid_motion_stops_the_arm_and_is_named(
-    cell: Cell, streams: list[Stream], domain: int
-) -> None:
-    stream = engage(cell, streams, "left")
+def test_a_second_publisher_of_targets_in_mid_motion_stops_the_arm_and_is_named(cell: Cell, domain: int) -> None:
+    stream = cell.engage("left")
     begin, elsewhere = stream.poses["left"], shifted(cell.tool("left"), 0.0, 0.0, 0.2)
     with spun_node(domain, "sender") as other:
         publisher = other.create_publisher(PoseStamped, "/q2r2/left/target_frame", COMMAND_QOS)
@@ -229,13 +182,12 @@ def test_a_second_publisher_of_targets_in_mid_motion_stops_the_arm_and_is_named(
     wait_until(lambda: cell.state("left_state") == "following", "the stream that is left begins anew")
 
 
-def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simulated_time(
+def test_it_follows_in_another_layout_and_frame_and_on_simulated_time(
     cell: Cell, robot: Robot, processes: Processes
 ) -> None:
     cell.call("/cartesian_controller/stop")
     layout = ("left.target_topic:=/left/target_pose", "left.target_frame_id:=left_link_0", "output:=joint_state")
-    arguments = [part for parameter in (*layout, *PATIENT, "use_sim_time:=true") for part in ("-p", parameter)]
-    processes.run_node("cartesian_controller", *arguments, "-r", "__node:=second")
+    start_controller(processes, *layout, *PATIENT, "use_sim_time:=true", node="second")
     states: list[dict[str, Any]] = []
     node = cell.node
     subscription = node.create_subscription(String, "/second/state", lambda m: states.append(json.loads(m.data)), 10)
@@ -256,12 +208,3 @@ def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simul
     for publisher in (clock, targets):
         node.destroy_publisher(publisher)
     node.destroy_subscription(subscription)
-
-
-def test_an_impossible_parameter_ends_in_one_line(processes: Processes) -> None:
-    faults = {"output:=lbr_torque": "lbr_fri_idl", "rate:=5000.0": "rate"}
-    begun = {said: start_controller(processes, fault) for fault, said in faults.items()}
-    for said, process in begun.items():
-        assert process.wait() == 2
-        (line,) = (line for line in process.output.splitlines() if line)
-        assert said in line

@@ -1,16 +1,18 @@
-"""What is wrong with a set of nodes, and what helps."""
+"""What is wrong with a set of nodes or its environment, and what helps."""
 
 from __future__ import annotations
 
+import ast
+import re
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from q2r2_control import load_config
-from q2r2_control.ros.watching.findings import Finding, examine_set
+from q2r2_control.ros.watching.findings import PACKAGES, Finding, examine_environment, examine_set
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
-from tests.ros.processes import CONFIG
+from tests.ros.processes import CONFIG, ROOT
 
 CELL = load_config(CONFIG)
 EXPECTED = ("mujoco_robot", "cartesian_controller", "left_arm_controller", "right_arm_controller")
@@ -25,15 +27,8 @@ def topic(name: str, publishers: tuple[str, ...], subscribers: tuple[str, ...], 
 
 
 def arm(name: str, **values: Any) -> NodeView:
-    given = {
-        "arm": name,
-        "hand": name,
-        "state": "idle",
-        "ready": True,
-        "engaged": False,
-        "sent": {f"/{name}/target": 1},
-    }
-    return node(f"/{name}_arm", **(given | values))
+    given = {"arm": name, "hand": name, "state": "idle", "ready": True, "engaged": False}
+    return node(f"/{name}_arm", **(given | {"sent": {f"/{name}/target": 1}} | values))
 
 
 CONTROLLER = node("/controller", phase="active", left_state="holding", right_state="holding", sent={"/commands": 1})
@@ -51,7 +46,6 @@ TOPICS = (
 
 
 def view(*changed: NodeView | TopicView, without: str = "", **fields: Any) -> SetView:
-    """A good set with some nodes and topics in the place of those with the same names."""
     parts: dict[str, Any] = {one.name: one for one in (CONTROLLER, ROBOT, LEFT, RIGHT, HAND, *TOPICS)}
     parts |= {one.name: one for one in changed}
     parts.pop(without, None)
@@ -69,55 +63,38 @@ def test_nothing_is_found_in_a_good_set_nor_where_none_runs() -> None:
     assert found(SetView((), (), ("/stranger",), arm_views((), CELL))) == []
 
 
-@pytest.mark.parametrize(
-    ("seen", "what", "cure"),
-    [
-        pytest.param(
-            view(topic("/left/target", ("/left_arm", "/x"), ("/controller",))),
-            "2 publishers of /left/target: /left_arm, /x",
-            "end all but one",
-            id="two publishers of a target",
-        ),
-        pytest.param(
-            view(topic("/positions", ("/x",), ("/robot",))),
-            "/robot is commanded by several",
-            "end",
-            id="two commanders",
-        ),
-        pytest.param(
-            view(
-                node("/other", phase="active", left_state="holding"),
-                topic("/left/target", ("/left_arm",), ("/controller", "/other")),
-            ),
-            "two controllers take /left/target: /controller, /other",
-            "end all but one",
-            id="two controllers",
-        ),
-        pytest.param(view(names=("/robot", "/robot")), "2 nodes are called /robot", "end", id="one node twice"),
-        pytest.param(view(without="/left_arm"), "the left arm: no node", "start left_arm_controller", id="no arm"),
-        pytest.param(view(without="/controller"), "no built-in controller", "start cartesian", id="no controller"),
-        pytest.param(view(without="/joint_states"), "nothing publishes joint states", "start the", id="no robot"),
-        pytest.param(view(node("/robot", age=5.0)), "/robot is silent for 5 s", "restart it", id="silent"),
-        pytest.param(
-            view(arm("left", clock_problem="use_sim_time is set and nothing comes on /clock")),
-            "/left_arm: use_sim_time is set and nothing comes on /clock",
-            "without use_sim_time",
-            id="no clock",
-        ),
-        pytest.param(
-            view(arm("left", ready=False, message="/left/target has no subscriber", kind="no_subscriber")),
-            "the left arm: /left/target has no subscriber",
-            "start the arm's controller",
-            id="an arm that is not ready",
-        ),
-        pytest.param(
-            view(arm("left", ready=False, message="/c is stopped: by hand; call /c/reset", kind="controller_refuses")),
-            "/c is stopped",
-            "/c/reset",
-            id="stop",
-        ),
-    ],
-)
+OTHER = node("/other", phase="active", left_state="holding")
+STOPPED = "/c is stopped: by hand; call /c/reset"
+NO_CLOCK = "use_sim_time is set and nothing comes on /clock"
+NO_SUBSCRIBER = "/left/target has no subscriber"
+STOPPING = {
+    "two publishers of a target": (
+        view(topic("/left/target", ("/left_arm", "/x"), ("/controller",))),
+        *("2 publishers of /left/target: /left_arm, /x", "end all but one"),
+    ),
+    "two commanders": (view(topic("/positions", ("/x",), ("/robot",))), "/robot is commanded by several", "end"),
+    "two controllers": (
+        view(OTHER, topic("/left/target", ("/left_arm",), ("/controller", "/other"))),
+        *("two controllers take /left/target: /controller, /other", "end all but one"),
+    ),
+    "one node twice": (view(names=("/robot", "/robot")), "2 nodes are called /robot", "end"),
+    "no arm": (view(without="/left_arm"), "the left arm: no node", "start left_arm_controller"),
+    "no controller": (view(without="/controller"), "no built-in controller", "start cartesian"),
+    "no robot": (view(without="/joint_states"), "nothing publishes joint states", "start the"),
+    "silent": (view(node("/robot", age=5.0)), "/robot is silent for 5 s", "restart it"),
+    "no clock": (view(arm("left", clock_problem=NO_CLOCK)), f"/left_arm: {NO_CLOCK}", "without use_sim_time"),
+    "an arm that is not ready": (
+        view(arm("left", ready=False, message=NO_SUBSCRIBER, kind="no_subscriber")),
+        *(f"the left arm: {NO_SUBSCRIBER}", "start the arm's controller"),
+    ),
+    "stop": (
+        view(arm("left", ready=False, message=STOPPED, kind="controller_refuses")),
+        *("/c is stopped", "/c/reset"),
+    ),
+}
+
+
+@pytest.mark.parametrize(("seen", "what", "cure"), STOPPING.values(), ids=STOPPING)
 def test_what_stops_the_arms_is_found_with_its_cure(seen: SetView, what: str, cure: str) -> None:
     assert [one for one in found(seen) if one.stops_arms and what in one.what and cure in one.cure], found(seen)
 
@@ -132,3 +109,33 @@ def test_a_second_taker_of_commands_is_a_warning() -> None:
     (finding,) = found(view(topic("/commands", ("/controller",), ("/robot", "/echo"))))
     assert "2 takers: /robot, /echo" in finding.what
     assert not finding.stops_arms
+
+
+ROS = ROOT / "q2r2_control" / "ros"
+
+INTERFACES = {file.parent.name for file in ROS.glob("interfaces/*/package.xml")}
+
+
+def test_every_package_that_the_nodes_import_is_looked_for() -> None:
+    imported = {
+        name.split(".")[0]
+        for file in ROS.rglob("*.py")
+        for part in ast.walk(ast.parse(file.read_text()))
+        for name in ([part.module or ""] if isinstance(part, ast.ImportFrom) else [])
+    }
+    ros = {name for name in imported if re.fullmatch(r"rclpy|.*_(msgs|srvs|interfaces)", name)}
+    assert ros - INTERFACES == set(PACKAGES)
+
+
+@pytest.mark.parametrize(
+    ("variables", "reaches"),
+    [
+        ({}, "SUBNET"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_STATIC_PEERS": "10.0.0.2"}, "OFF, and 10.0.0.2"),
+        ({"ROS_LOCALHOST_ONLY": "1"}, "this machine only"),
+    ],
+)
+def test_it_says_whom_nodes_find(variables: dict[str, str], reaches: str) -> None:
+    facts, findings = examine_environment(variables | {"ROS_DOMAIN_ID": "-1"})  # so that no node is tried
+    assert facts["reaches"].startswith(reaches)
+    assert any("ROS_DOMAIN_ID is '-1'" in finding.what and finding.stops_arms for finding in findings)

@@ -22,7 +22,7 @@ from tf2_msgs.msg import TFMessage
 from q2r2_control.ros.base_node import LATCHED_QOS
 from q2r2_control.ros.bridge.frames import FrameListener, FrameTree, ReadTransform, read_transforms
 from tests.ros.arm_rig import stamped_transform
-from tests.ros.waiting import wait_until
+from tests.ros.processes import wait_until
 
 A = pin.SE3(pin.exp3(np.array([0.3, -1.0, 0.2])), np.array([1.0, 2.0, -0.5]))
 B = pin.SE3(pin.exp3(np.array([-0.7, 0.1, 2.0])), np.array([0.2, -0.4, 0.9]))
@@ -30,13 +30,11 @@ C = pin.SE3(pin.exp3(np.array([1.1, 0.4, -0.3])), np.array([-0.6, 0.1, 0.3]))
 
 
 def read(transform: TransformStamped) -> ReadTransform:
-    """What a listener reads of a message with this transform."""
     return read_transforms(serialize_message(TFMessage(transforms=[transform])))[0]
 
 
 @pytest.fixture
 def tree() -> FrameTree:
-    """World with a mount, which carries an arm, and a table beside."""
     made = FrameTree()
     made.set(read(stamped_transform("world", "mount", A)), math.inf)
     made.set(read(stamped_transform("mount", "/tool", B)), 3.0)
@@ -89,7 +87,6 @@ def test_a_name_that_is_no_text_is_another_node_s_fault_and_ends_nothing(node: A
 
 
 def send_from(node: Any, name: str, pose: pin.SE3, counted: int) -> Any:
-    """A timer that publishes the transform of ``name``; ``counted`` messages went before."""
     publisher = node.create_publisher(TFMessage, "/tf", 10)
     for _ in range(counted):
         publisher.publish(TFMessage())
@@ -98,7 +95,7 @@ def send_from(node: Any, name: str, pose: pin.SE3, counted: int) -> Any:
 
 
 @pytest.mark.parametrize(("second", "disagree"), [(A, False), (C, True)], ids=["the same pose", "another pose"])
-def test_two_publishers_of_a_frame_block_the_tool_only_if_they_disagree(
+def test_two_publishers_of_a_frame_block_it_if_they_disagree(
     second: pin.SE3, disagree: bool, domain: int, node: Any
 ) -> None:
     node.now = 0.0  # which nodes of the package have
@@ -117,12 +114,3 @@ def test_two_publishers_of_a_frame_block_the_tool_only_if_they_disagree(
     wait_until(lambda: listener.conflict("mount") is None, "it is over when one ends")
     for timer in timers:
         node.destroy_timer(timer)
-
-
-def test_nodes_of_one_process_read_each_message_once() -> None:
-    message = serialize_message(TFMessage(transforms=[stamped_transform("world", "tool", pin.SE3.Identity())]))
-    assert read_transforms(message) is read_transforms(bytes(bytearray(message)))
-
-
-def test_what_is_no_message_has_no_transforms() -> None:
-    assert read_transforms(b"no message") == ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from queue import Queue
 
 import pytest
@@ -20,7 +20,7 @@ from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.ros.base_node import LATCHED_QOS
 from q2r2_control.ros.bridge.gripper_client import GripperClient, OpeningGrants
-from tests.ros.waiting import wait_until
+from tests.ros.processes import wait_until
 
 _CLOSED = 0.05  # [m]
 
@@ -30,6 +30,7 @@ class Bench:
 
     def __init__(self, domain: int, kind: GripperType = GripperType.GRIPPER_COMMAND, topic: str = "/gripper") -> None:
         self._nodes = ExitStack()
+        self.close = self._nodes.close
         near, self.far = (self._nodes.enter_context(spun_node(domain, name)) for name in ("near", "far"))
         self.goals: Queue[float] = Queue()  # openings
         self.asked: list[list[float]] = []  # wanted, commanded
@@ -76,15 +77,11 @@ class Bench:
     def openings(self) -> list[float]:
         return [round(opening, 6) for opening in list(self.goals.queue)]
 
-    def close(self) -> None:
-        self._nodes.close()
-
 
 @pytest.fixture
 def bench(domain: int) -> Iterator[Bench]:
-    bench = Bench(domain)
-    yield bench
-    bench.close()
+    with closing(Bench(domain)) as bench:
+        yield bench
 
 
 def test_it_goes_on_as_more_is_granted_and_has_opened_only_at_the_end(bench: Bench) -> None:
@@ -130,9 +127,7 @@ def test_a_press_without_a_server_ends_the_wish_before_it(bench: Bench) -> None:
     assert bench.asked[-1] == [0.4, 0.4]
 
 
-def test_a_gripper_follows_a_trigger_with_ten_wishes_a_second_at_most(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gripper_follows_a_trigger_ten_times_a_second_at_most(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float] = []
     monkeypatch.setattr(bench.grants, "ask", asked.append)
     for step in range(21):
@@ -158,8 +153,7 @@ def test_a_goal_that_is_refused_on_the_way_ends_the_wish(bench: Bench) -> None:
 
 
 def test_a_gripper_behind_a_topic_waits_too_and_two_presses_before_an_answer_are_two(domain: int) -> None:
-    bench = Bench(domain, GripperType.FLOAT64_MULTI_ARRAY, "/fingers")
-    try:
+    with closing(Bench(domain, GripperType.FLOAT64_MULTI_ARRAY, "/fingers")) as bench:
         bench.client.toggle(time.monotonic())
         bench.client.toggle(time.monotonic())
         bench.grant(1.0, 0.6)
@@ -167,5 +161,3 @@ def test_a_gripper_behind_a_topic_waits_too_and_two_presses_before_an_answer_are
         bench.grant(1.0, 1.0)
         bench.wait(lambda: bench.openings() == [0.6, 1.0], "and to the end")
         assert bench.client.state == "open"
-    finally:
-        bench.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from std_msgs.msg import Float64MultiArray
 from q2r2_control.ros.base_node import LATCHED_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.gripper_client import GripperClient, OpeningGrants
 from tests.ros.cell import PATIENT, STILL, Cell, Stream, changed_cell, start_controller, start_robot
-from tests.ros.waiting import wait_until
+from tests.ros.processes import wait_until
 
 pytestmark = pytest.mark.alone
 
@@ -38,6 +38,7 @@ class Gripper:
     """The left gripper, commanded as an arm's node commands it; and what its fingers do."""
 
     def __init__(self, cell: Cell) -> None:
+        self.began = 0.0
         self._cell, self.opening = cell, 1.0  # 0 closed .. 1 open, as joint states have it
         cell.node.create_subscription(JointState, "/joint_states", self._on_joint_state, STREAM_QOS)
         self.grants = OpeningGrants(cell.node, "/cartesian_controller", "left", "/q2r2/left/target_frame")
@@ -48,17 +49,17 @@ class Gripper:
         self.opening = float(np.mean(found)) / BLOCK_CELL.arms["left"].gripper.open_position
 
     def wait_until(self, condition: Callable[[], object], what: str) -> None:
-        """Go on as an arm's node does in its ticks, until ``condition`` holds."""
-
         def ticked() -> object:
             self.client.check(time.monotonic())
             return condition()
 
         wait_until(ticked, what, lambda: (self.opening, self.grants.granted, self.client.state, self._cell.states))
 
-    def close(self) -> None:
-        """Ask for it until there is a server that is asked."""
+    def pass_time(self, seconds: float) -> None:
+        self.began = time.monotonic()
+        self.wait_until(lambda: time.monotonic() - self.began > seconds, "time passes")
 
+    def close(self) -> None:
         def asked() -> bool:
             self.client.command(True, time.monotonic())
             return self.client.problem is None
@@ -76,67 +77,18 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def cell(module_node: Any, module_processes: Processes, config: str) -> Cell:
+def cell(module_node: Any, module_processes: Processes, config: str) -> Iterator[Cell]:
     simulated = start_robot(module_processes, config=config)
     controller = start_controller(module_processes, *PATIENT, config=config)
     cell = Cell(module_node, Robot.from_config(BLOCK_CELL), simulated, controller)
     cell.wait_until_active()
-    return cell
+    yield cell
+    cell.end_streams()
 
 
-def _go(cell: Cell, stream: Stream, goal: pin.SE3) -> None:
-    way = goal.translation - stream.poses["left"].translation
-    stream.move("left", tuple(way))
+def _go(stream: Stream, goal: pin.SE3) -> None:
+    stream.move("left", tuple(goal.translation - stream.poses["left"].translation))
     stream.poses["left"] = goal
-
-
-def _is_at(cell: Cell, goal: pin.SE3) -> bool:
-    return float(np.linalg.norm(cell.tool("left").translation - goal.translation)) < _ARRIVED
-
-
-def _stop_and_reset(cell: Cell) -> None:
-    assert cell.call("/cartesian_controller/stop").success
-    wait_until(lambda: cell.state("phase") == "stopped", "the arms are stopped")
-    assert cell.call("/cartesian_controller/reset").success
-    wait_until(lambda: cell.state("phase") == "active", "the arms are active")
-
-
-def test_a_closed_gripper_goes_where_an_open_one_could_not_and_opens_there_as_far_as_is_proven(cell: Cell) -> None:
-    gripper = Gripper(cell)
-    wait_until(lambda: gripper.grants.answered, "the controller answers")
-    stream = cell.engage("left")
-    try:
-        _go(cell, stream, ABOVE)
-        gripper.close()
-        gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "the gripper is closed")
-        # An open gripper's fingers would be 12 mm inside of the block.
-        _go(cell, stream, BESIDE)
-        gripper.wait_until(lambda: _is_at(cell, BESIDE), "the tool is beside the block")
-
-        # Stopped and activated anew where they are: nothing is too close, so nothing moves.
-        stream.end()
-        rest = cell.joints.wait_for_rest()
-        _stop_and_reset(cell)
-        began = time.monotonic()
-        wait_until(lambda: time.monotonic() - began > 1.0, "a second passes")
-        assert cell.joints.farthest_from(rest, began) < STILL
-
-        gripper.client.command(False, time.monotonic())
-        gripper.wait_until(lambda: cell.state("left_gripper_held_by"), "the block holds the gripper")
-        assert "block" in cell.state("left_gripper_held_by")
-        gripper.wait_until(lambda: gripper.opening > 0.3, "the gripper opens as far as it may")
-        began = time.monotonic()
-        gripper.wait_until(lambda: time.monotonic() - began > 1.0, "a second passes")
-        assert 0.3 < gripper.opening < 0.5
-        assert gripper.client.state == "opening"
-
-        stream = cell.engage("left")
-        _go(cell, stream, ABOVE)
-        gripper.wait_until(lambda: gripper.opening > 0.98, "the gripper opens by itself where there is room")
-        gripper.wait_until(lambda: gripper.client.state == "open", "the goal has its result")
-        wait_until(lambda: cell.state("left_gripper_held_by") == "", "nothing holds it")
-    finally:
-        stream.end()
 
 
 def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
@@ -144,7 +96,8 @@ def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
     assert cell.state("right_holds_object") is False
     wanted.publish(Float64MultiArray(data=[0.3, math.nan]))  # and no goal: it stays open
     wait_until(lambda: cell.state("right_holds_object") is True, "the object counts")
-    _stop_and_reset(cell)
+    cell.stop_and_reset()
+    wait_until(lambda: cell.state("phase") == "active", "the arms are active")
     wait_until(lambda: cell.state("right_holds_object") is True, "it still does")
     wanted.publish(Float64MultiArray(data=[1.0, math.nan]))
     wait_until(lambda: cell.state("right_holds_object") is False, "the object does not count any more")
@@ -162,34 +115,46 @@ def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell:
     cell.node.destroy_publisher(sender)
 
 
-def test_when_a_controller_ends_and_another_begins_a_gripper_that_waited_stays_and_so_do_the_arms(
-    cell: Cell, module_processes: Processes, config: str
-) -> None:
+def test_a_gripper_opens_as_far_as_is_proven(cell: Cell, module_processes: Processes, config: str) -> None:
     gripper = Gripper(cell)
     wait_until(lambda: gripper.grants.answered, "the controller answers")
     stream = cell.engage("left")
-    try:
-        gripper.close()
-        gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "the gripper is closed")
-        _go(cell, stream, BESIDE)
-        gripper.wait_until(lambda: _is_at(cell, BESIDE), "the tool is beside the block")
-        gripper.client.command(False, time.monotonic())
-        gripper.wait_until(lambda: gripper.opening > 0.3, "the gripper opens as far as it may")
-    finally:
-        stream.end()
-    cell.joints.wait_for_rest()
+    _go(stream, ABOVE)
+    gripper.close()
+    gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "the gripper is closed")
+    # An open gripper's fingers would be 12 mm inside of the block.
+    _go(stream, BESIDE)
+    cell.wait_until_there("left", BESIDE, _ARRIVED)
+    stream.end()
+    # Stopped and activated anew where they are: nothing is too close, so nothing moves.
+    rest = cell.joints.wait_for_rest()
+    cell.stop_and_reset()
+    wait_until(lambda: cell.state("phase") == "active", "the arms are active")
+    gripper.pass_time(1.0)
+    assert cell.joints.farthest_from(rest, gripper.began) < STILL
+
+    gripper.client.command(False, time.monotonic())
+    gripper.wait_until(lambda: cell.state("left_gripper_held_by"), "the block holds the gripper")
+    assert "block" in cell.state("left_gripper_held_by")
+    gripper.wait_until(lambda: gripper.opening > 0.3, "the gripper opens as far as it may")
+    gripper.pass_time(1.0)
+    assert 0.3 < gripper.opening < 0.5
+    assert gripper.client.state == "opening"
+
     cell.processes[1].interrupt()
     gripper.wait_until(lambda: gripper.client.problem, "the gripper's client gives up")
     assert "the controller that grants openings has ended" in str(gripper.client.problem)
     rest = cell.joints.wait_for_rest()
-
     cell.states.clear()
     start_controller(module_processes, *PATIENT, config=config)
     wait_until(lambda: cell.state("phase") == "active", "the new controller is active")
-    began = time.monotonic()
-    gripper.wait_until(lambda: time.monotonic() - began > 1.5, "a second and a half pass")
+    gripper.pass_time(1.5)
     # The fingers rest where they are just proven; at most a millimetre of tracking is given back.
-    assert cell.joints.tool_farthest_from(rest, began) < 0.002
+    assert cell.joints.tool_farthest_from(rest, gripper.began) < 0.002
     assert 0.3 < gripper.opening < 0.5
-    gripper.close()
-    gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "it closes")
+
+    gripper.client.command(False, time.monotonic())
+    _go(cell.engage("left"), ABOVE)
+    gripper.wait_until(lambda: gripper.opening > 0.98, "the gripper opens by itself where there is room")
+    gripper.wait_until(lambda: gripper.client.state == "open", "the goal has its result")
+    wait_until(lambda: cell.state("left_gripper_held_by") == "", "nothing holds it")

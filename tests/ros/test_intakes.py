@@ -1,7 +1,4 @@
-"""What nodes take of messages and what not: late ones, joint states in parts, torques, a controller's refusals.
-
-No program can be made to send late at will, so the subscriptions' callbacks get what the middleware would tell them.
-"""
+"""What nodes take of messages that the middleware tells of: late ones, joint states in parts, torques, refusals."""
 
 from __future__ import annotations
 
@@ -20,23 +17,23 @@ from tests.ros.conftest import need_ros
 need_ros()
 
 import rclpy
+from geometry_msgs.msg import Point, Pose, Quaternion
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
 
 from q2r2_control.ros.base_node import WARN, BaseNode
 from q2r2_control.ros.bridge.arm_outputs import FollowWatch
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
-from q2r2_control.ros.bridge.messages import stamped_pose
+from q2r2_control.ros.bridge.messages import pose_of, robot_state, stamped_pose
 from q2r2_control.ros.nodes.mujoco_robot import MujocoRobot
 from q2r2_control.types import RobotState
 from q2r2_control.wording import sentence
+from tests.ros.processes import as_arguments
 
 USUAL, LATE = 1_000_000, 1_000_000_000  # from sending to receipt [ns]
 
 
 class Arrivals:
-    """Calls the callback of a node's subscription as the executor does."""
-
     def __init__(self, node: Any, topic: str) -> None:
         self._subscription = next(one for one in node.subscriptions if one.topic_name == topic)
         self._number = 0
@@ -92,11 +89,9 @@ def test_a_late_command_does_not_move_the_simulated_robot_and_is_reported(defaul
     node.destroy_node()
 
 
-def test_joint_states_of_an_arm_each_are_merged_by_name_and_one_that_misses_a_joint_is_refused(
-    context: Any, robot: Robot
-) -> None:
-    given = [part for arm in robot.arms for part in ("-p", f"{arm}.joint_states_topic:=/{arm}/joint_states")]
-    node = BaseNode("intake", context=context, cli_args=["--ros-args", *given])
+def test_joint_states_of_an_arm_each_are_merged_and_need_all_joints(context: Any, robot: Robot) -> None:
+    given = as_arguments(*(f"{arm}.joint_states_topic:=/{arm}/joint_states" for arm in robot.arms))
+    node = BaseNode("intake", context=context, cli_args=given)
     intake = JointIntake(node, robot)
     taken: list[Any] = []
     intake.subscribe(lambda state, now: taken.append(state), lambda message: None)
@@ -121,15 +116,12 @@ def test_joint_states_of_an_arm_each_are_merged_by_name_and_one_that_misses_a_jo
     node.destroy_node()
 
 
-def test_states_have_the_external_torques_without_which_an_admittance_has_no_good_state(
-    context: Any, robot: Robot
-) -> None:
+def test_an_admittance_has_no_good_state_without_external_torques(context: Any, robot: Robot) -> None:
     node = BaseNode("intake", context=context)
     with pytest.raises(ConfigError, match=r"admittance.enabled = true: set the parameter external_torque_topic"):
         JointIntake(node, robot, needs_external_torque=True)
     node.destroy_node()
-    arguments = ["--ros-args", "-p", "external_torque_topic:=/felt"]
-    node = BaseNode("intake", context=context, cli_args=arguments)
+    node = BaseNode("intake", context=context, cli_args=as_arguments("external_torque_topic:=/felt"))
     intake = JointIntake(node, robot, needs_external_torque=True)
     taken: list[Any] = []
     intake.subscribe(lambda state, now: taken.append(state), lambda message: None)
@@ -148,9 +140,7 @@ def test_states_have_the_external_torques_without_which_an_admittance_has_no_goo
     node.destroy_node()
 
 
-def test_an_arm_pauses_when_its_controller_follows_no_more_or_not_in_time_but_not_on_its_way_home(
-    context: Any,
-) -> None:
+def test_an_arm_pauses_when_its_controller_does_not_follow_but_not_on_its_way_home(context: Any) -> None:
     node = BaseNode("arm", context=context)
     watch = FollowWatch(node, "/controller", "left", 0.3)
     following, states = Arrivals(node, "/controller/following/left"), Arrivals(node, "/controller/state")
@@ -172,3 +162,52 @@ def test_an_arm_pauses_when_its_controller_follows_no_more_or_not_in_time_but_no
     states.arrive(String(data='{"left_state": "stopped", "message": "by ~/stop"}'))
     assert watch.unready == "/controller is stopped: by /controller/stop; call /controller/reset"
     node.destroy_node()
+
+
+NAMES = ("a", "b", "c")
+TURN = {"z": 0.6, "w": 0.8}
+
+
+def joint_state(**changes: Any) -> JointState:
+    fields = {
+        "name": ["c", "finger", "a", "b"],
+        "position": [3.0, math.nan, 1.0, 2.0],
+        "velocity": [0.3, 0.9, 0.1, 0.2],
+    }
+    return JointState(**(fields | changes))
+
+
+def test_joints_are_matched_by_name_others_may_be_not_finite_and_torques_missing() -> None:
+    state = robot_state(joint_state(), NAMES, 7.0)
+    assert isinstance(state, RobotState)
+    assert (state.q.tolist(), state.v.tolist(), state.tau.tolist()) == ([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], [0.0] * 3)
+    assert state.stamp == 7.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"name": ["c", "finger", "b", "b"]}, "a joint is named twice"),
+        ({"name": ["c", "finger", "other", "b"]}, "no joint a"),
+        ({"position": [3.0, 9.0, math.nan, 2.0]}, "position of a is not finite"),
+        ({"velocity": [math.inf, 0.9, 0.1, 0.2]}, "velocity of c is not finite"),
+        ({"position": [3.0, 9.0, 1.0]}, "3 position values for 4 joints"),
+        ({"position": []}, "0 position values for 4 joints"),
+    ],
+)
+def test_a_state_that_is_none_is_refused_by_name(changes: dict[str, Any], fault: str) -> None:
+    assert robot_state(joint_state(**changes), NAMES, 0.0) == fault
+
+
+def test_a_pose_is_read_with_its_quaternion_normalized() -> None:
+    pose = pose_of(Pose(position=Point(x=1.0), orientation=Quaternion(z=0.6003, w=0.8004)))
+    assert pose is not None
+    np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("position", "orientation"),
+    [({"x": math.nan}, TURN), ({"y": math.inf}, TURN), ({}, {"w": 0.0}), ({}, {"w": 1.1}), ({}, {"w": math.nan})],
+)
+def test_numbers_that_are_no_pose_are_none(position: dict[str, float], orientation: dict[str, float]) -> None:
+    assert pose_of(Pose(position=Point(**position), orientation=Quaternion(**orientation))) is None

@@ -1,4 +1,4 @@
-"""Controller and robot as managed nodes: rest before the answer, no commands while inactive, and no jump later."""
+"""The controller as a managed node: rest before the answer, no commands while inactive, and no jump later."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.ros.base_node import STREAM_QOS
 from tests.ros.cell import PATIENT, SOFT, Cell, changed_cell, shifted, start_controller, start_robot
-from tests.ros.waiting import wait_until
+from tests.ros.processes import wait_until
 
 pytestmark = pytest.mark.alone
 
@@ -32,31 +32,22 @@ STILL = 5e-3  # [rad]
 
 
 class Managed(Cell):
-    """A cell whose nodes' states can be changed, and the joint commands that come."""
-
     def __init__(self, node: Any, robot: Robot, *processes: Any) -> None:
         super().__init__(node, robot, *processes)
         self.commands: list[JointTrajectory] = []
         node.create_subscription(JointTrajectory, "/joint_trajectory", self.commands.append, STREAM_QOS)
         self.commander = node.create_publisher(JointTrajectory, "/joint_trajectory", 1)
-        self._clients = {
-            name: (
-                node.create_client(ChangeState, f"/{name}/change_state"),
-                node.create_client(GetState, f"/{name}/get_state"),
-            )
-            for name in ("cartesian_controller", "mujoco_robot")
-        }
+        self._change = node.create_client(ChangeState, "/cartesian_controller/change_state")
+        self._get = node.create_client(GetState, "/cartesian_controller/get_state")
 
-    def ask(self, transition: int, name: str = "cartesian_controller") -> bool:
-        """Whether the node says that it did it."""
-        change = self._clients[name][0]
-        wait_until(change.service_is_ready, "the lifecycle's services are there")
-        future = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
+    def ask(self, transition: int) -> bool:
+        wait_until(self._change.service_is_ready, "the lifecycle's services are there")
+        future = self._change.call_async(ChangeState.Request(transition=Transition(id=transition)))
         wait_until(future.done, "the transition is answered")
         return bool(future.result().success)
 
-    def lifecycle(self, name: str = "cartesian_controller") -> str:
-        future = self._clients[name][1].call_async(GetState.Request())
+    def lifecycle(self) -> str:
+        future = self._get.call_async(GetState.Request())
         wait_until(future.done, "the state is answered")
         return str(future.result().current_state.label)
 
@@ -64,10 +55,10 @@ class Managed(Cell):
         point = JointTrajectoryPoint(positions=[float(value) for value in q])
         self.commander.publish(JointTrajectory(joint_names=list(self.robot.joint_names), points=[point]))
 
-    def move_by_another(self, q: Any, seconds: float = 1.0) -> None:
-        """Joint commands of another node to ``q`` [rad], evenly."""
+    def move_by_another(self, q: Any) -> None:
+        """Joint commands of another node to ``q`` [rad], evenly, within a second."""
         start, began = self.q.copy(), time.monotonic()
-        while (share := (time.monotonic() - began) / seconds) < 1.5:
+        while (share := time.monotonic() - began) < 1.5:
             self.command(start + min(share, 1.0) * (q - start))
             time.sleep(0.01)
 
@@ -87,6 +78,7 @@ def test_it_starts_active_and_comes_to_rest_before_it_answers_that_it_is_not(cel
     wait_until(lambda: np.abs(cell.joints.states[-1].v).max() > 0.05, "the arm moves")
     assert cell.ask(Transition.TRANSITION_DEACTIVATE)
     assert cell.lifecycle() == "inactive"
+    assert not cell.ask(Transition.TRANSITION_CLEANUP)
     last = np.array(cell.commands[-1].points[0].velocities)
     assert np.abs(last).max() < 1e-3  # the last command is one at rest
     time.sleep(0.3)
@@ -102,13 +94,18 @@ def test_it_starts_active_and_comes_to_rest_before_it_answers_that_it_is_not(cel
     wait_until(lambda: cell.state("left_state") == "deactivated", "its state says so")
 
 
-def test_it_takes_over_where_another_node_has_left_the_arms(cell: Managed, robot: Robot) -> None:
+def test_it_takes_over_where_another_node_that_is_silent_has_left_the_arms(cell: Managed, robot: Robot) -> None:
     if cell.lifecycle() == "active":
         assert cell.ask(Transition.TRANSITION_DEACTIVATE)
     goal = cell.q.copy()
     goal[robot.arms["right"].joints[5]] += 0.3
     cell.move_by_another(goal)
+    timer = cell.node.create_timer(0.02, lambda: cell.command(goal))
     assert np.abs(cell.q - goal).max() < 0.02
+    assert not cell.ask(Transition.TRANSITION_ACTIVATE)
+    assert cell.lifecycle() == "inactive"
+    wait_until(lambda: "commands the arms on /joint_trajectory" in cell.processes[1].output, "the log says why")
+    cell.node.destroy_timer(timer)
     time.sleep(0.5)
     cell.commands.clear()
     before = cell.q.copy()
@@ -120,35 +117,6 @@ def test_it_takes_over_where_another_node_has_left_the_arms(cell: Managed, robot
     time.sleep(0.5)
     assert np.abs(cell.q - before).max() < 2.0 * STILL
     assert cell.lifecycle() == "active"
-
-
-def test_it_does_not_take_over_from_a_node_that_still_commands(cell: Managed, robot: Robot) -> None:
-    if cell.lifecycle() == "active":
-        assert cell.ask(Transition.TRANSITION_DEACTIVATE)
-    q, period = cell.q.copy(), 0.02
-    timer = cell.node.create_timer(period, lambda: cell.command(q))
-    time.sleep(0.5)
-    assert not cell.ask(Transition.TRANSITION_ACTIVATE)
-    assert cell.lifecycle() == "inactive"
-    wait_until(lambda: "commands the arms on /joint_trajectory" in cell.processes[1].output, "the log says why")
-    cell.node.destroy_timer(timer)
-    time.sleep(0.5)
-    assert cell.ask(Transition.TRANSITION_ACTIVATE)
-
-
-def test_a_robot_that_is_deactivated_takes_no_commands_and_stands(cell: Managed, robot: Robot) -> None:
-    if cell.lifecycle() == "active":
-        assert cell.ask(Transition.TRANSITION_DEACTIVATE)
-    assert cell.ask(Transition.TRANSITION_DEACTIVATE, "mujoco_robot")
-    before, goal = cell.q.copy(), cell.q.copy()
-    goal[0] += 0.2
-    cell.move_by_another(goal, 0.5)
-    assert np.abs(cell.q - before).max() < STILL
-    wait_until(lambda: cell.state("lifecycle", "mujoco_robot") == "inactive", "its state says so")
-    assert not cell.ask(Transition.TRANSITION_CLEANUP, "mujoco_robot")
-    assert cell.ask(Transition.TRANSITION_ACTIVATE, "mujoco_robot")
-    cell.move_by_another(goal)
-    assert abs(cell.q[0] - goal[0]) < 0.02
 
 
 @pytest.mark.parametrize("output", ["velocity", "torque"])
@@ -164,7 +132,7 @@ def test_arms_that_are_commanded_speeds_or_torques_follow_are_left_at_rest_and_t
         stream = cell.engage("left")
         goal = shifted(stream.poses["left"], 0.0, 0.0, 0.1)
         stream.move("left", (0.0, 0.0, 0.1), speed=0.1)
-        wait_until(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 4e-3, "the arm is there")
+        cell.wait_until_there("left", goal, 4e-3)
         assert cell.state("mode", "mujoco_robot") == ("torque" if output == "torque" else "position")
         assert cell.ask(Transition.TRANSITION_DEACTIVATE)
         stream.end()

@@ -1,29 +1,36 @@
-"""Parameters that are set while an arm moves: no jump, what counts from then on, what is refused as a whole and why."""
+"""Settings of arms and of the controller: from a cell's YAML, at the start, and while an arm moves, without a jump."""
 
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+import yaml
 
 from tests.ros.conftest import need_ros
-from tests.ros.processes import Processes
-from tests.ros.waiting import wait_until
+from tests.ros.processes import Processes, as_arguments, wait_until
+from tests.support.external_cell import external
 
 need_ros()
 
+from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.config.control import ImpedanceSettings
+from q2r2_control.errors import ConfigError
+from q2r2_control.ros import BaseArmController
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live
-from q2r2_control.ros.nodes.arm_controllers import LeftArmController
+from q2r2_control.ros.bridge.messages import stamped_pose
+from q2r2_control.ros.nodes.arm_controllers import LeftArmController, RightArmController
 from q2r2_control.types import RobotState
-from tests.ros.arm_rig import ArmRig, assert_same, offset, steps
+from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, steps, target_of
 
 
 def set_in(node: Any, **values: Any) -> Any:
@@ -32,9 +39,7 @@ def set_in(node: Any, **values: Any) -> Any:
     return node.set_parameters_atomically(parameters)
 
 
-def test_scale_and_guard_that_are_set_in_motion_count_from_then_on_and_nothing_jumps(
-    node: Any, processes: Processes
-) -> None:
+def test_scale_and_guard_that_are_set_in_motion_count_without_a_jump(node: Any, processes: Processes) -> None:
     rig = ArmRig(node)
     rig.start(processes)
     client = AsyncParameterClient(node, "left_q2r2_arm_controller")
@@ -96,9 +101,7 @@ def test_distances_and_gains_of_the_controller_are_set_together_or_not_at_all(co
     node.destroy_node()
 
 
-def test_an_impedance_that_is_set_counts_for_both_arms_and_what_is_not_allowed_changes_nothing(
-    context: Any, robot: Robot
-) -> None:
+def test_an_impedance_that_is_set_counts_for_both_arms_if_it_is_allowed(context: Any, robot: Robot) -> None:
     impedance = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
     zero = np.zeros(robot.model.nv)
     at_home = RobotState(robot.home, zero, zero, None, 0.0)
@@ -119,3 +122,91 @@ def test_an_impedance_that_is_set_counts_for_both_arms_and_what_is_not_allowed_c
     assert [impedance.in_force(arm) for arm in robot.arms] == [before] * 2  # until the arms are commanded
     impedance.reset(at_home)
     assert [impedance.in_force(arm) for arm in robot.arms] == [asked] * 2
+
+
+@pytest.fixture
+def rig(node: Any) -> ArmRig:
+    return ArmRig(node)
+
+
+def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(context: Any, tmp_path: Path) -> None:
+    cell = external()
+    cell["external"] |= {"preset": "fzi", "rate": 60.0, "limits": {"max_velocity": 0.2}}
+    cell["teleop"] |= {"stance": "mirror_reflected", "position_scale": 0.5}
+    config = tmp_path / "cell.yaml"
+    config.write_text(yaml.safe_dump(cell))
+    arguments = as_arguments(f"config:={config}", "guard.max_acceleration:=1.0")
+    made = RightArmController(context=context, cli_args=arguments)
+    values = made.parameters
+    assert (values.preset.name, values.mode, values.rate) == ("fzi", "raw", 60.0)
+    assert (values.teleop.stance, values.teleop.position_scale) == ("mirror_reflected", 0.5)
+    assert values.target_topic == "/bh_robot/right_arm_clik_controller/target_frame"
+    assert (values.base_frame, values.world_frame, values.tool_frame) == (
+        "bh_robot_base",
+        "bh_robot_base",
+        "right_arm_link_ee",
+    )
+    assert values.gripper_topic == "/bh_robot/right_arm_gripper_action_controller/gripper_cmd"
+    assert (values.guard.max_velocity, values.guard.max_acceleration) == (0.2, 1.0)
+    assert values.guard.max_angular_velocity == values.preset.guard.max_angular_velocity
+    made.destroy_node()
+
+    del cell["external"]["arms"]["right"], cell["arms"]["right"]
+    config.write_text(yaml.safe_dump(cell))
+    with pytest.raises(ConfigError, match=r"cell\.yaml has no arm right; allowed: left"):
+        RightArmController(context=context, cli_args=arguments)
+
+
+def test_a_subclass_may_mirror_its_arm_and_give_its_filter_in_samples(context: Any) -> None:
+    made = BaseArmController("right", "bh_robot", mirror=True, filter_window_size=4, context=context)
+    assert made.get_name() == "right_bh_robot_arm_controller"
+    assert (made.parameters.teleop.stance, made.hand) == ("mirror", "left")
+    assert made.parameters.teleop.filter.smoothing_delay == pytest.approx(1.5 / 75.0)  # half of 4 - 1 periods
+    made.destroy_node()
+
+
+def test_an_arm_whose_tool_is_on_a_topic_pauses_when_that_ends(rig: ArmRig, node: Any, processes: Processes) -> None:
+    rig.sends_tool = False
+    publisher = node.create_publisher(PoseStamped, "/left/current_pose", 10)
+    timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(rig.tool, "world", 0.0)))
+    rig.start(processes, {"current_pose_topic": "/left/current_pose"})
+    rig.engage()
+    rig.wait(lambda: rig.targets, "targets come")
+    assert_same(target_of(rig), TOOL, 1e-9)
+    rig.move((0.05, 0.0, 0.0))
+    assert_same(rig.wait_for_rest(), offset(TOOL, (0.05, 0.0, 0.0)), 1e-3)
+    node.destroy_timer(timer)
+    rig.wait(lambda: rig.state["state"] == "lost", "an arm without tool poses is paused")
+    rig.wait(lambda: "/left/current_pose from /test is silent" in rig.state["message"], "the reason is reported")
+
+
+def test_an_arm_waits_while_its_controllers_tool_is_elsewhere(rig: ArmRig, node: Any, processes: Processes) -> None:
+    safe = offset(TOOL, (0.0, 0.0, 0.15))  # as with a tool_frame that is not the cell's
+    publisher = node.create_publisher(PoseStamped, "/cartesian_controller/safe_target/left", 10)
+    timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(safe, "world", 0.0)))
+    node.create_subscription(PoseStamped, "/theirs/target_frame", lambda _: None, 10)
+    rig.start(processes, {"mode": "filtered", "preset": "fzi", "target_topic": "/theirs/target_frame"})
+    rig.wait(lambda: rig.state.get("kind") == "controller_refuses", "the arm is not ready")
+    assert "is not where the tool is" in rig.state["message"]
+    rig.press()
+    rig.wait(lambda: rig.state["last_event_kind"] == "controller_refuses", "the press is refused")
+    assert not rig.targets
+    safe = TOOL
+    rig.engage()
+    node.destroy_timer(timer)
+
+
+def test_a_target_that_slips_on_its_leash_is_felt(rig: ArmRig, processes: Processes) -> None:
+    rig.follows = False  # as if something were in the way
+    rig.start(processes, {"teleop.leash.distance": 0.05})
+    rig.engage()
+    rig.wait(lambda: (0.0, 0.0) in rig.pulses, "engaging is felt")
+    rig.pulses.clear()
+    rig.move((0.04, 0.0, 0.0))
+    rig.wait_for_rest()
+    assert rig.pulses == []
+    rig.move((0.09, 0.0, 0.0), 0.6)
+    rig.wait(lambda: rig.pulses.count((0.2, 0.2)) >= 3, "every two centimetres of slip are felt")
+    rig.wait(lambda: rig.state["slip"] > 0.06, "the slip is reported")
+    assert set(rig.pulses) == {(0.2, 0.2), (0.0, 0.0)}
+    assert np.linalg.norm(rig.wait_for_rest().translation - TOOL.translation) < 0.051

@@ -6,7 +6,6 @@ import os
 import signal
 import time
 from functools import partial
-from queue import Queue
 from typing import Any
 from xml.etree import ElementTree
 
@@ -27,8 +26,9 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
+from q2r2_control.ros.bridge.messages import nanoseconds
 from tests.ros.cell import Cell
-from tests.ros.waiting import wait_until
+from tests.ros.processes import subscribed, wait_until
 
 FINGERS = tuple(f"{side}_finger_joint_{number}" for side in ("left", "right") for number in (1, 2))
 
@@ -64,17 +64,15 @@ def trajectory(robot: Robot, q: np.ndarray, names: tuple[str, ...] | None = None
 
 def test_links_are_where_robot_state_publisher_puts_them_each_in_its_parent_s_frame(cell: Cell, robot: Robot) -> None:
     joints = [joint for joint in ElementTree.fromstring(robot.urdf) if joint.tag == "joint"]
-    parents = {link_of(joint, "child"): link_of(joint, "parent") for joint in joints}
+    links: list[Any] = [(joint.find("child"), joint.find("parent")) for joint in joints]
+    parents = {child.attrib["link"]: parent.attrib["link"] for child, parent in links}
     wait_until(lambda: cell.parents.keys() >= parents.keys(), "all links are on /tf or /tf_static")
     assert cell.parents == parents
 
-    states: Queue[JointState] = Queue()
-    cell.node.create_subscription(JointState, "/joint_states", states.put, 10)
-    state = states.get(timeout=PATIENCE)
+    state = subscribed(cell.node, JointState, "/joint_states").get(timeout=PATIENCE)
     assert list(state.name) == [*robot.joint_names, *FINGERS]
-    description: Queue[str] = Queue()
-    cell.node.create_subscription(String, "/robot_description", lambda m: description.put(m.data), LATCHED_QOS)
-    assert description.get(timeout=PATIENCE) == robot.urdf
+    description = subscribed(cell.node, String, "/robot_description", LATCHED_QOS)
+    assert description.get(timeout=PATIENCE).data == robot.urdf
     model = pin.buildModelFromXML(robot.urdf)
     data, q = model.createData(), pin.neutral(model)
     for name, position in zip(state.name, state.position, strict=True):
@@ -88,16 +86,8 @@ def test_links_are_where_robot_state_publisher_puts_them_each_in_its_parent_s_fr
         assert np.allclose(found.pose.homogeneous, expected.homogeneous, atol=1e-3), child
 
 
-def link_of(joint: ElementTree.Element, role: str) -> str:
-    element = joint.find(role)
-    assert element is not None
-    return element.get("link", "")
-
-
 @pytest.mark.parametrize("kind", ["joint_trajectory", "joint_commands", "position_commands"])
-def test_it_follows_positions_in_any_order_of_names_and_stays_where_they_end(
-    cell: Cell, robot: Robot, kind: str
-) -> None:
+def test_it_follows_positions_in_any_order_of_names_and_stays_there(cell: Cell, robot: Robot, kind: str) -> None:
     postures = [robot.home.copy() for _ in range(80)]
     for step, q in enumerate(postures, 1):
         q[0] += 0.2 * min(step / 50, 1.0)
@@ -161,7 +151,6 @@ def test_a_gripper_closes_on_nothing_opens_and_refuses_what_it_cannot_reach(cell
 
 
 def result_of(client: ActionClient, position: float) -> Any:
-    """The result of a goal, or None where it is refused."""
     goal = GripperCommand.Goal()
     goal.command.position, goal.command.max_effort = position, 5.0
     sent = client.send_goal_async(goal)
@@ -174,12 +163,10 @@ def result_of(client: ActionClient, position: float) -> Any:
 
 
 def test_external_torques_are_of_the_tick_of_joint_states(cell: Cell) -> None:
-    stamps: dict[str, list[tuple[int, int]]] = {"/joint_states": [], "/mujoco_robot/external_torque": []}
+    stamps: dict[str, list[int]] = {"/joint_states": [], "/mujoco_robot/external_torque": []}
 
-    def note(topic: str, message: JointState) -> None:
-        stamps[topic].append((message.header.stamp.sec, message.header.stamp.nanosec))
-
-    for topic in stamps:
-        cell.node.create_subscription(JointState, topic, partial(note, topic), 1000)
+    for topic, its in stamps.items():
+        note = lambda message, its=its: its.append(nanoseconds(message.header.stamp))  # noqa: E731
+        cell.node.create_subscription(JointState, topic, note, 1000)
     states, torques = stamps.values()
     wait_until(lambda: len(set(torques) & set(states)) > 10, "torques come with the stamps of joint states")

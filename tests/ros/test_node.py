@@ -1,4 +1,4 @@
-"""What all nodes tell of themselves, whatever the time does."""
+"""What all nodes tell of themselves, how they tick and end, and how they find each other, as the user has set it."""
 
 from __future__ import annotations
 
@@ -6,30 +6,38 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from q2r2_control.ros.launch.executables import NODES
+from q2r2_control.ros.launch.middleware import set_up_middleware
 from tests.ros.conftest import need_ros
-from tests.ros.processes import ROOT, Processes
-from tests.ros.waiting import States
+from tests.ros.processes import PATIENCE, ROOT, Processes, States, wait_until
 
 need_ros()
 
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
-def test_all_threads_of_a_node_that_ticks_have_its_real_time_priority_where_it_is_permitted(
-    node: Any, processes: Processes
-) -> None:
-    wanted = 7
+from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.executor import TickExecutor
+
+
+def test_all_threads_of_a_node_have_its_real_time_priority_where_permitted(node: Any, processes: Processes) -> None:
     if sys.platform != "linux":
         pytest.skip("only Linux has SCHED_FIFO")
     states = States(node, "simulation_input")
-    process = processes.start_node("SimulationInput", f"realtime_priority:={wanted}")
+    process = processes.start_node("SimulationInput", "realtime_priority:=7")
     states.wait_for("waits for a subscriber")
     refused = "no SCHED_FIFO" in process.output
-    expected = (0, 0) if refused else (os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, wanted)
+    expected = (0, 0) if refused else (os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 7)
     # The thread that ticks, and those of the middleware that were there before: others may have begun since.
     threads = [int(name) for name in os.listdir(f"/proc/{process.pid}/task")]
     found = [(os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority) for thread in sorted(threads)]
@@ -75,3 +83,188 @@ def test_ctrl_c_before_the_interpreter_has_started_waits_for_the_executable_of_a
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=120)
     assert (output, process.returncode) == ("", -signal.SIGINT)
+
+
+LISTENER = """
+import rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node("listener")
+node.create_subscription(String, "/words", lambda message: print(message.data, flush=True), 10)
+rclpy.spin(node)
+"""
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"FASTRTPS_DEFAULT_PROFILES_FILE": "my.xml"},
+        {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
+        {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
+        {"ROS_LOCALHOST_ONLY": "1"},
+        {"ROS_STATIC_PEERS": "192.168.1.7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
+    ],
+)
+def test_what_the_user_has_set_stays(environment: dict[str, str]) -> None:
+    before = dict(environment)
+    set_up_middleware(environment)
+    assert environment == before
+
+
+@pytest.mark.parametrize("ours", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}], ids=["subnet", "localhost"])
+def test_a_profile_of_ours_is_set_and_stays(ours: dict[str, str]) -> None:
+    set_up_middleware(ours)
+    assert Path(ours["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
+    # Either says UDP alone: the one by a variable, the other by its profile, which the range has to leave alone.
+    assert (
+        ours.get("FASTDDS_BUILTIN_TRANSPORTS") == "UDPv4" or ours["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SYSTEM_DEFAULT"
+    )
+    once = dict(ours)
+    set_up_middleware(ours)
+    assert ours == once
+
+
+def shared_memory(process: Any) -> list[str]:
+    mapped = Path(f"/proc/{process.pid}/maps")
+    if not mapped.exists():
+        pytest.skip("needs /proc")
+    return [line for line in mapped.read_text().splitlines() if "/dev/shm/fastrtps" in line]
+
+
+def test_a_node_of_this_machine_alone_hears_others_and_shares_memory_with_none(node: Any, processes: Processes) -> None:
+    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    set_up_middleware(environment)
+    listener = processes.start(sys.executable, "-c", LISTENER, name="listener", **environment)
+    publisher = node.create_publisher(String, "/words", 10)
+    wait_until(lambda: publisher.publish(String(data="hello")) or "hello" in listener.output, "the listener hears")
+    assert not shared_memory(listener)
+
+
+PERIOD = 0.01  # of the node's tick [s]
+
+
+class Ticking(BaseNode):
+    ticks = True
+
+    def __init__(self, context: Any) -> None:
+        super().__init__("ticking", context=context)
+        self.log: list[str] = []
+
+    def listen(self, qos: Any = 10) -> Any:
+        publisher = self.create_publisher(String, "words", qos)
+        self.create_subscription(String, "words", lambda message: self.log.append(message.data), qos)
+        return publisher
+
+
+@pytest.fixture
+def ticking(context: Any) -> Iterator[Ticking]:
+    node = Ticking(context)
+    yield node
+    node.destroy_node()
+
+
+@pytest.fixture
+def executor(ticking: Ticking, context: Any) -> Iterator[TickExecutor]:
+    made = TickExecutor(context=context)
+    made.add_node(ticking)
+    yield made
+    made.shutdown()
+
+
+def spin_until(executor: Any, condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline
+        executor.spin_once(timeout_sec=0.1)
+
+
+def say(publisher: Any, executor: TickExecutor, *words: str) -> None:
+    spin_until(executor, publisher.get_subscription_count)
+    for word in words:
+        publisher.publish(String(data=word))
+    time.sleep(0.1)
+
+
+def test_all_that_has_arrived_is_taken_in_order_before_the_tick(ticking: Ticking, executor: TickExecutor) -> None:
+    times: list[Mapping[str, int]] = []
+    ticking.create_subscription(String, "words", lambda _, info: times.append(info), 10)
+    say(ticking.listen(), executor, "one", "two", "three")
+    ticking.create_tick(PERIOD, lambda: ticking.log.append("tick"))
+    spin_until(executor, lambda: "tick" in ticking.log)
+    assert ticking.log[:4] == ["one", "two", "three", "tick"]
+    assert 0 < times[-1]["source_timestamp"] <= times[-1]["received_timestamp"]
+
+
+def test_latched_messages_are_heard_and_a_cancelled_tick_is_silent(ticking: Ticking, executor: TickExecutor) -> None:
+    timer = ticking.create_tick(PERIOD, lambda: ticking.log.append("tick"))
+    ticking.listen(LATCHED_QOS).publish(String(data="said before"))
+    spin_until(executor, lambda: {"tick", "said before"} <= set(ticking.log))
+    timer.cancel()
+    ticking.log.clear()
+    for _ in range(20):
+        executor.spin_once(timeout_sec=PERIOD)
+    assert ticking.log == []
+
+
+def test_a_subscription_that_a_message_destroys_gets_no_other_one(ticking: Ticking, executor: TickExecutor) -> None:
+    subscriptions: list[Any] = []
+
+    def hear(message: Any) -> None:
+        ticking.log.append(message.data)
+        while subscriptions:
+            ticking.destroy_subscription(subscriptions.pop())
+
+    publisher = ticking.create_publisher(String, "words", 10)
+    subscriptions += [ticking.create_subscription(String, "words", hear, 10) for _ in range(2)]
+    spin_until(executor, lambda: publisher.get_subscription_count() == 2)
+    say(publisher, executor, "one", "two")
+    for _ in range(3):
+        executor.spin_once(timeout_sec=0.05)
+    assert ticking.log == ["one"]
+
+
+def test_services_are_answered_and_coroutines_run(ticking: Ticking, executor: TickExecutor) -> None:
+    def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = True
+        return response
+
+    ticking.create_service(Trigger, "serve", serve, callback_group=ReentrantCallbackGroup())
+    client = ticking.create_client(Trigger, "serve", callback_group=ReentrantCallbackGroup())
+
+    async def ask() -> None:
+        ticking.log.append("asks")
+        timer.cancel()
+        answer = await client.call_async(Trigger.Request())
+        ticking.log.append(f"success: {answer.success}")
+
+    spin_until(executor, client.service_is_ready)
+    timer = ticking.create_timer(PERIOD, ask)
+    spin_until(executor, lambda: len(ticking.log) == 2)
+    assert ticking.log == ["asks", "success: True"]
+
+
+@pytest.mark.parametrize("make", [BaseNode.create_tick, BaseNode.create_timer], ids=["a tick's", "a slow timer's"])
+def test_an_error_of_a_callback_comes_out(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
+    def fail() -> None:
+        raise ValueError("of the callback")
+
+    make(ticking, PERIOD, fail)
+    with pytest.raises(ValueError, match="of the callback"):
+        spin_until(executor, lambda: False)
+
+
+def test_another_executor_runs_ticks_and_messages_as_well(ticking: Ticking, context: Any) -> None:
+    plain, publisher = SingleThreadedExecutor(context=context), ticking.listen()
+    plain.add_node(ticking)
+    ticking.create_tick(PERIOD, lambda: ticking.log.append("tick"))
+    spin_until(plain, publisher.get_subscription_count)
+    publisher.publish(String(data="one"))
+    spin_until(plain, lambda: {"one", "tick"} <= set(ticking.log))
+    plain.shutdown()
+
+
+def test_it_ends_with_its_context(executor: TickExecutor, context: Any) -> None:
+    executor.spin_once(timeout_sec=0.0)
+    context.try_shutdown()
+    with pytest.raises(ExternalShutdownException):
+        spin_until(executor, lambda: False)

@@ -1,9 +1,13 @@
-"""What an output sends, and when it gives its receiver up: not while the arms follow, never a receiver of torques."""
+"""What outputs send, and when they give their receiver up; what the controller says of arms for hands to feel."""
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
 import time
-from queue import Queue
+from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,50 +15,44 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from q2r2_control import CartesianController, Robot
+from q2r2_control.loop.arm_conditions import ArmConditions
+from q2r2_control.types import SIDES, ActiveLimit, LimitKind, RobotState
 from tests.ros.conftest import need_ros
-from tests.ros.waiting import wait_until
+from tests.ros.processes import CONFIG, Processes, RosProcess, as_arguments, subscribed, wait_until
 
 need_ros()
 
+from geometry_msgs.msg import PoseStamped
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control import Robot, load_config
+from q2r2_control import load_config
 from q2r2_control.drives.base import make_drive
 from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge import joint_outputs
-from q2r2_control.ros.bridge.joint_outputs import (
-    Channel,
-    JointOutput,
-    LbrPosition,
-    LbrTorque,
-    PositionArray,
-    TorqueArray,
-    make_output,
-)
-from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
-from q2r2_control.types import Command, CommandMode, RobotState
+from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers, listen_to_condition
+from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, PositionArray, TorqueArray, make_output
+from q2r2_control.ros.monitoring import WatchedPublisher, node_of
+from q2r2_control.teleop.haptics import ArmCondition
+from q2r2_control.types import Command, CommandMode
 
 TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
 
 
 class Commands:
-    """Sends commands, and listens to them as a joint controller."""
-
     def __init__(self, node: Any, positions: bool) -> None:
         self._node, self.taken = node, 0
         self._publisher = WatchedPublisher(node, Float64MultiArray, "/commands", TIMEOUT)
-        self._channel = Channel([], np.arange(0), self._publisher)
-        config = load_config("config/dual_iiwa7.yaml")
+        config, kind = load_config(CONFIG), PositionArray if positions else TorqueArray
         robot = Robot.from_config(config)
-        kind = PositionArray if positions else TorqueArray
         drive = make_drive(kind.mode, robot, config, has_servos=False)
-        self.output = JointOutput(drive, kind(0.004, robot), [self._channel])
+        self.output = JointOutput(drive, kind(0.004, robot), [Channel([], np.arange(0), self._publisher)])
         self.listen()
 
     def listen(self) -> None:
-        """One more listener."""
         known = self._publisher.listeners
         self._node.create_subscription(Float64MultiArray, "/commands", self._take, COMMAND_QOS)
         wait_until(lambda: self._publisher.listeners > known, "the listener is found")
@@ -83,7 +81,7 @@ def test_a_receiver_of_positions_is_not_given_up_while_the_arms_are_off_their_re
 
 
 @pytest.mark.parametrize(("positions", "off_reference"), [(True, True), (True, False), (False, True)])
-def test_a_new_receiver_of_positions_is_noticed_where_the_arms_are_off_their_reference(
+def test_a_new_receiver_is_noticed_while_arms_are_off_their_reference(
     positions: bool, off_reference: bool, node: Any
 ) -> None:
     commands = Commands(node, positions)
@@ -96,11 +94,10 @@ def test_a_new_receiver_of_positions_is_noticed_where_the_arms_are_off_their_ref
 def test_arms_with_a_topic_each_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
     # The right arm's topic is by the pattern for all, the left one's by itself.
     given = ("output_topic:=/{arm}/commands", "left.output_topic:=/left/commands")
-    sender = BaseNode("sender", context=context, cli_args=["--ros-args", *(p for g in given for p in ("-p", g))])
-    output = make_output("trajectory", sender, robot, load_config("config/dual_iiwa7.yaml"), 0.004)
+    sender = BaseNode("sender", context=context, cli_args=as_arguments(*given))
+    output = make_output("trajectory", sender, robot, load_config(CONFIG), 0.004)
     assert set(output.sent) == {"/left/commands", "/right/commands"}
-    taken: Queue[Any] = Queue()
-    node.create_subscription(JointTrajectory, "/right/commands", taken.put, COMMAND_QOS)
+    taken = subscribed(node, JointTrajectory, "/right/commands", COMMAND_QOS)
     q, zero = robot.home, np.zeros_like(robot.home)
     state = RobotState(q, zero, zero, None, 0.0)
     command = Command(CommandMode.POSITION, q, zero, zero, {})
@@ -114,19 +111,136 @@ def test_arms_with_a_topic_each_get_their_own_joints_there(node: Any, robot: Rob
     sender.destroy_node()
 
 
-def test_torques_for_an_lbr_are_without_gravity_and_come_with_its_measured_positions(
-    robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_torques_for_an_lbr_are_without_gravity(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match="lbr_fri_idl cannot be imported"):
-        LbrTorque(0.004, robot)
+        joint_outputs.LbrTorque(0.004, robot)
     monkeypatch.setattr(joint_outputs, "_lbr_message", lambda name: SimpleNamespace)
     q, zero = robot.home + 0.1, np.zeros_like(robot.home)
     gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
     command = Command(CommandMode.TORQUE, robot.home, zero, gravity + 1.0, {})
     joints = robot.arms["left"].joints
     to_send = command, RobotState(q, zero, zero, None, 0.0), 0.0
-    sent = LbrTorque(0.004, robot).encode(*to_send, [], joints)
+    sent = joint_outputs.LbrTorque(0.004, robot).encode(*to_send, [], joints)
     np.testing.assert_allclose(sent.torque, 1.0)
     np.testing.assert_array_equal(sent.joint_position, q[joints])
-    sent = LbrPosition(0.004, robot).encode(*to_send, [], joints)
+    sent = joint_outputs.LbrPosition(0.004, robot).encode(*to_send, [], joints)
     np.testing.assert_array_equal(sent.joint_position, robot.home[joints])
+
+
+PUSH = np.array([0.0, 0.0, 20.0])  # at the left tool [N]
+
+
+def test_nearness_limits_and_contact_of_each_arm_are_told_as_they_are(node: Any, robot: Robot) -> None:
+    controller = CartesianController(robot)
+    controller.reset(robot.home)
+    told: dict[str, ArmCondition] = {}
+    for arm in SIDES:
+        listen_to_condition(node, "/test", arm, partial(told.__setitem__, arm))
+    publishers = ConditionPublishers(node, SIDES, ArmConditions(controller))
+    zero, data = np.zeros_like(robot.home), robot.model.createData()
+    frame = robot.arms["left"].frame_id
+    J = pin.computeFrameJacobian(robot.model, data, robot.home, frame, pin.LOCAL_WORLD_ALIGNED)
+    felt = RobotState(q=robot.home, v=zero, tau=zero, tau_external=J[:3].T @ PUSH, stamp=0.0)
+    binding = ActiveLimit(LimitKind.POSITION, ("left_A4",)), ActiveLimit(LimitKind.VELOCITY, ("right_A2",))
+    report = replace(controller.step({}, 0.004).report, binding=binding)
+    now = 0.0
+
+    def comes(state: RobotState) -> bool:
+        nonlocal now
+        now += 0.05
+        publishers.update(report, state, now)
+        left = told.get("left")
+        return left is not None and len(told) == 2 and (left.force is None) is (state.tau_external is None)
+
+    wait_until(lambda: comes(felt), "both arms are told of")
+    assert told["left"].force == pytest.approx(20.0, rel=0.01)
+    assert told["right"].force == pytest.approx(0.0, abs=1e-6)
+    assert (told["left"].limits, told["right"].limits) == ({"left_A4"}, set())
+    for arm in SIDES:
+        assert told[arm].spare == pytest.approx(controller.spare_distance(arm))
+    wait_until(lambda: comes(replace(felt, tau_external=None)), "no force is told where none is measured")
+
+
+_LOST = "_NODE_NAME_UNKNOWN_"  # as rcl says
+LISTENER = """
+import rclpy
+from geometry_msgs.msg import PoseStamped
+rclpy.init()
+node = rclpy.create_node("listener")
+node.create_subscription(PoseStamped, "watched", lambda message: None, 1)
+rclpy.spin(node)
+"""
+
+
+class Stream:
+    def __init__(self, publisher: WatchedPublisher, rate: float) -> None:
+        self._publisher, self._period = publisher, 1.0 / rate
+        self.published = self.left_out = 0
+
+    def run(self, seconds: float) -> str | None:
+        """Publish for so long; returns the reported silence of the listener, if there was one."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if (silence := self._publisher.silence()) is not None:
+                return silence
+            if self._publisher.waits():
+                self.left_out += 1
+            else:
+                self._publisher.publish(PoseStamped(), time.monotonic())
+                self.published += 1
+            time.sleep(self._period)
+        return None
+
+
+@pytest.fixture
+def listener(processes: Processes) -> RosProcess:
+    return processes.start(sys.executable, "-c", LISTENER, name="listener")
+
+
+@pytest.mark.parametrize(("rate", "acknowledged"), [(50.0, False), (500.0, True)])
+def test_a_frozen_listener_alone_is_reported(rate: float, acknowledged: bool, node: Any, listener: RosProcess) -> None:
+    publisher = WatchedPublisher(node, PoseStamped, "/watched", TIMEOUT)
+    wait_until(lambda: publisher.listeners == 1, "the listener is found")
+    publisher.begin(acknowledged)
+    stream = Stream(publisher, rate)
+    assert stream.run(2.0) is None
+    assert stream.published > stream.left_out
+    os.kill(listener.pid, signal.SIGSTOP)
+    silence = stream.run(10.0 * TIMEOUT)
+    assert silence is not None
+    assert silence.startswith("messages on /watched are not acknowledged for 0.")
+    os.kill(listener.pid, signal.SIGCONT)
+    wait_until(lambda: publisher.silence() is None, "it is there again")
+
+
+def test_a_listener_that_ended_before_is_not_reported(node: Any, listener: RosProcess, processes: Processes) -> None:
+    publisher = WatchedPublisher(node, PoseStamped, "/watched", TIMEOUT)
+    wait_until(lambda: publisher.listeners == 1, "the listener is found")
+    os.kill(listener.pid, signal.SIGKILL)
+    listener.wait()
+    publisher.begin()
+    assert Stream(publisher, 100.0).run(3.0 * TIMEOUT) is None
+    assert publisher.listeners == 1  # as the graph says
+
+
+def test_an_endpoint_keeps_the_name_of_its_node_where_the_graph_has_lost_it() -> None:
+    known, lost, other = (
+        TopicEndpointInfo(node_namespace=space, node_name=name, endpoint_gid=[number] * 16)
+        for space, name, number in (("/", "talker", 1), ("_NODE_NAMESPACE_UNKNOWN_", _LOST, 1), ("/", _LOST, 2))
+    )
+    assert [node_of(one) for one in (known, lost, other)] == ["/talker", "/talker", None]
+
+
+# How long Fast DDS takes to find it again is its own business, and once was more than 30 s.
+@pytest.mark.slow
+@pytest.mark.soak
+def test_a_node_that_the_graph_had_lost_is_known_when_it_comes_back(node: Any, listener: RosProcess) -> None:
+    def nodes() -> list[str | None]:
+        return [node_of(info) for info in node.get_subscriptions_info_by_topic("/watched")]
+
+    node.create_publisher(PoseStamped, "/watched", 1)
+    wait_until(lambda: nodes() == ["/listener"], "the listener and its name are found")
+    os.kill(listener.pid, signal.SIGSTOP)
+    wait_until(lambda: nodes() == [], "the graph has lost it")
+    os.kill(listener.pid, signal.SIGCONT)
+    wait_until(lambda: nodes() == ["/listener"], "it is found again")

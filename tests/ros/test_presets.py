@@ -1,7 +1,7 @@
 """Another project's controller moves the arms: what it gets keeps its rules, in both modes.
 
-The program of this package's own controller stands in for it, under another name and with topics of its own. The left
-arm's node sends it the hand's target itself, the right arm's what the built-in controller makes of that.
+This package's own controller stands in for it, with another name and topics. The left arm's node sends it the hand's
+target itself, the right arm's what the built-in controller makes of that.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import types
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pinocchio as pin
@@ -21,11 +22,11 @@ import pytest
 import yaml
 
 from q2r2_control import Robot
-from q2r2_control.config.presets import BUILTIN, PRESETS, Mode, preset_of
+from q2r2_control.config.presets import BUILTIN, PRESETS
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 from tests.ros.conftest import need_ros, spun_node
-from tests.ros.processes import CONFIG, Processes, RosProcess
+from tests.ros.processes import CONFIG, Processes
 
 need_ros()
 pytestmark = pytest.mark.alone
@@ -36,8 +37,8 @@ from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
 from q2r2_control.ros.bridge.arm_outputs import CommandType
 from q2r2_control.ros.bridge.messages import pose_of, seconds
 from tests.ros.arm_rig import ArmRig, ArmRigs, patient
-from tests.ros.cell import NODE_RATE, PATIENT, Cell, start_controller, start_robot
-from tests.ros.waiting import wait_until
+from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
+from tests.ros.processes import wait_until
 
 PRESET = "kuka_lbr_impedance"
 STILL = 4e-3  # how far a tool at rest may move [m]
@@ -45,8 +46,8 @@ NEAR = 6e-3  # a tool this near has arrived [m]
 SETTLED = 4e-3  # from a tool or a target that rests [m]
 LONGEST_GAP = 0.3  # in a stream, on a machine with other load [s]
 NAMES = {
-    **{"builtin": "target_frame", "kuka_lbr_clik": "target_frame", "kuka_lbr_impedance": "target_frame"},
-    **{"fzi": "target_frame", "mayr": "reference_pose", "crisp": "target_pose", "moveit_servo": "pose_target_cmds"},
+    **dict.fromkeys(("builtin", "kuka_lbr_clik", "kuka_lbr_impedance", "fzi"), "target_frame"),
+    **{"mayr": "reference_pose", "crisp": "target_pose", "moveit_servo": "pose_target_cmds"},
     **{"lbr_position": "command/joint_position", "forward_position": "commands", "jtc": "joint_trajectory"},
 }
 JOINTS = ("lbr_position", "forward_position", "jtc")
@@ -69,9 +70,7 @@ class Theirs:
     def start(self) -> None:
         topics = [f"{arm}.target_topic:=/robot/{arm}_ctrl/target_frame" for arm in self.robot.arms]
         frames = [f"{arm}.target_frame_id:={arm}_link_0" for arm in self.robot.arms]
-        given = (f"config:={CONFIG}", f"rate:={NODE_RATE}", *PATIENT, *topics, *frames)
-        arguments = [part for parameter in given for part in ("-p", parameter)]
-        self.process: RosProcess = self._processes.run_node("cartesian_controller", *arguments, "-r", "__node:=theirs")
+        self.process = start_controller(self._processes, *PATIENT, *topics, *frames, node="theirs")
         self.process.wait_for("active: ")
 
     def _take(self, arm: str, message: PoseStamped) -> None:
@@ -93,9 +92,8 @@ class Theirs:
 
 
 def pose_in(message: PoseStamped) -> pin.SE3:
-    turned = message.pose.orientation
+    turned, pose = message.pose.orientation, pose_of(message.pose)
     assert abs(np.linalg.norm([turned.x, turned.y, turned.z, turned.w]) - 1.0) < 1e-6
-    pose = pose_of(message.pose)
     assert pose is not None
     return pose
 
@@ -131,7 +129,7 @@ def start_arm(node: Any, processes: Processes, arm: str, mode: str) -> ArmRig:
     return rig
 
 
-def test_a_controller_gets_targets_by_its_rules_in_both_modes_and_its_arms_never_jump(
+def test_a_controller_gets_targets_by_its_rules_in_both_modes(
     theirs: Theirs, processes: Processes, domain: int
 ) -> None:
     joints = theirs.cell.joints
@@ -144,9 +142,8 @@ def test_a_controller_gets_targets_by_its_rules_in_both_modes_and_its_arms_never
         joints.wait_for_rest()
 
     with spun_node(domain, "hands") as node:
-        rigs = ArmRigs(
-            [start_arm(node, processes, arm, mode) for arm, mode in (("left", "raw"), ("right", "filtered"))]
-        )
+        modes = {"left": "raw", "right": "filtered"}
+        rigs = ArmRigs([start_arm(node, processes, arm, mode) for arm, mode in modes.items()])
         rigs.wait(lambda rig: rig.state.get("hand_age") is not None, "the arm's node receives the hand")
         with joints.tools_rest(STILL, "it is engaged"):
             rigs.wait_until_ready(3)
@@ -176,33 +173,14 @@ def test_a_controller_gets_targets_by_its_rules_in_both_modes_and_its_arms_never
     assert (wrench.wrench.force.x, wrench.wrench.force.z, wrench.wrench.torque.x) == (0.0, 0.0, 0.0)
 
 
-class Servo:
-    """The service of MoveIt Servo that agrees to poses, and the node that calls it."""
-
-    def __init__(self) -> None:
-        self.asked: list[int] = []
-        self.success = False
-
-    def create_client(self, kind: type, service: str) -> Servo:
-        return self
-
-    def service_is_ready(self) -> bool:
-        return True
-
-    def call_async(self, request: Any) -> Any:
-        self.asked.append(request.command_type)
-        answer = types.SimpleNamespace(success=self.success)
-        return types.SimpleNamespace(done=lambda: True, result=lambda: answer)
-
-
 def test_moveit_servo_is_told_to_take_poses_after_each_of_its_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    servo: Any = Servo()
+    servo = MagicMock()  # the node that calls the service
+    client = servo.create_client.return_value
     monkeypatch.setitem(sys.modules, "moveit_msgs.srv", None)
     with pytest.raises(ConfigError, match="moveit_msgs, which cannot be imported"):
         CommandType(servo, "/servo/switch_command_type")
-    monkeypatch.setitem(sys.modules, "moveit_msgs", types.ModuleType("moveit_msgs"))
-    messages: Any = types.ModuleType("moveit_msgs.srv")
-    messages.ServoCommandType = types.SimpleNamespace(Request=types.SimpleNamespace)
+    messages = SimpleNamespace(ServoCommandType=SimpleNamespace(Request=SimpleNamespace))
+    monkeypatch.setitem(sys.modules, "moveit_msgs", MagicMock())
     monkeypatch.setitem(sys.modules, "moveit_msgs.srv", messages)
     command_type = CommandType(servo, "/servo/switch_command_type")
 
@@ -210,11 +188,12 @@ def test_moveit_servo_is_told_to_take_poses_after_each_of_its_starts(monkeypatch
         command_type.step(starts, now)
         return command_type.unready is None
 
+    answers = [MagicMock(**{"result.return_value.success": agrees}) for agrees in (False, False, True, True)]
+    client.call_async.side_effect = answers
     assert [agreed(0, now) for now in (0.0, 0.5, 1.2)] == [False] * 3  # it refuses
-    servo.success = True
     assert [agreed(0, now) for now in (2.4, 2.5, 9.0)] == [False, True, True]
     assert not agreed(1, 10.0)  # it was started again
-    assert servo.asked == [2, 2, 2, 2]
+    assert [call.args[0].command_type for call in client.call_async.call_args_list] == [2, 2, 2, 2]
 
 
 @pytest.mark.parametrize("name", ["fzi", "mayr", "crisp", "kuka_lbr_clik"])
@@ -234,10 +213,3 @@ def test_the_presets_have_the_topics_of_their_controllers() -> None:
         assert (preset.zero_wrench is not None) == (name == "kuka_lbr_impedance")
         assert (preset.command_type is not None) == (name == "moveit_servo")
     assert PRESETS["builtin"] is BUILTIN
-
-
-@pytest.mark.parametrize("name", JOINTS)
-def test_presets_that_take_joints_need_the_built_in_controller(name: str) -> None:
-    assert preset_of(name, "filtered") == (PRESETS[name], Mode.FILTERED)
-    with pytest.raises(ConfigError, match=f"preset = '{name}' with mode = 'raw': it takes joint positions"):
-        preset_of(name, "raw")

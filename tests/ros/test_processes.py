@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import runpy
 import signal
 import sys
-import time
 import tomllib
-import types
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 import yaml
 
+from q2r2_control import Robot
 from q2r2_control.ros.launch import executables
 from q2r2_control.ros.launch.processes import NO_INPUT, NodeProcess, nodes_of
+from q2r2_control.types import SIDES
+from tests.ros.cell import JointRecorder
 from tests.ros.conftest import need_ros
-from tests.ros.processes import CONFIG, PATIENCE, ROOT, Processes, RosProcess
+from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess, wait_until
 from tests.support.external_cell import external
 from tests.support.processes import alive, children
 
@@ -75,21 +80,21 @@ def test_a_process_that_does_not_end_is_killed(pair: RosProcess) -> None:
 def test_a_set_whose_command_is_killed_ends_by_itself(pair: RosProcess) -> None:
     started = children(pair.pid)
     os.kill(pair.pid, signal.SIGKILL)
-    deadline = time.monotonic() + PATIENCE
-    while any(map(alive, started)):
-        assert time.monotonic() < deadline, "a program has outlived the command"
-        time.sleep(0.05)
+    wait_until(lambda: not any(map(alive, started)), "no program outlives the command")
 
 
-def test_the_command_starts_and_stops_the_whole_set(processes: Processes) -> None:
-    nodes = nodes_of(CONFIG, "scripted")
-    process = processes.start(sys.executable, "-m", "q2r2_control", "ros", "up", CONFIG, name="up")
-    for name in ("mujoco_robot", "cartesian_controller"):
-        process.wait_for(f"[{name}] ")
-    process.wait_for("active: ")
-    started = children(process.pid)
-    assert len(started) == len(nodes) == 4
-    assert process.interrupt(60.0) == 0
+def test_the_command_in_the_readme_moves_both_arms_and_stops(node: Any, robot: Robot, processes: Processes) -> None:
+    command = re.search(r"`q2r2 (ros up \S+ --input scripted)`", (ROOT / "README.md").read_text())
+    assert command is not None
+    joints = JointRecorder(node, robot)
+    up = processes.start(sys.executable, "-u", "-m", "q2r2_control", *command[1].split(), name="up")
+    wait_until(lambda: joints.states, "joint states come")
+    home = joints.q
+    arms = robot.arms.values()
+    wait_until(lambda: all(np.abs(joints.q - home)[arm.joints].max() > 0.05 for arm in arms), "both arms move")
+    started = children(up.pid)
+    assert len(started) == len(nodes_of(CONFIG, "scripted")) == 4
+    assert up.interrupt(60.0) == 0
     assert not any(map(alive, started))
 
 
@@ -105,50 +110,31 @@ def names(nodes: Sequence[NodeProcess]) -> list[str]:
     return [node.name for node in nodes]
 
 
-TOGETHER = ["arm_controllers"]
-SEPARATE = ["left_arm_controller", "right_arm_controller"]
-
-
-def test_controllers_that_take_the_hands_target_need_no_other(tmp_path: Path) -> None:
+def test_a_set_has_the_controller_that_its_preset_needs_with_its_topics_and_frames(tmp_path: Path) -> None:
     file = external_cell(tmp_path, "fzi", "raw")
-    assert names(nodes_of(file, "headset")) == [*TOGETHER, "tcp_endpoint"]
-    assert names(nodes_of(file, "none", "mujoco")) == ["mujoco_robot", *TOGETHER]
+    assert names(nodes_of(file, "headset")) == ["arm_controllers", "tcp_endpoint"]
+    assert names(nodes_of(file, "none", "mujoco")) == ["mujoco_robot", "arm_controllers"]
     assert all(node.parameters == {"config": file} for node in nodes_of(file, "none"))
 
+    nodes = nodes_of(external_cell(tmp_path, "fzi", "filtered", world_frame="cell"))
+    assert names(nodes) == ["cartesian_controller", "arm_controllers", "SimulationInput"]
+    each = {"target_frame_id": "cell", "joint_states_topic": "joint_states"}
+    per_arm = {f"{arm}.{name}": value for arm in SIDES for name, value in each.items()}
+    assert nodes[0].parameters == {"config": file, "output": "none", **per_arm}
 
-def test_controllers_that_take_what_the_built_in_one_allows_get_it_without_joint_commands(tmp_path: Path) -> None:
-    file = external_cell(tmp_path, "fzi", "filtered", world_frame="cell")
-    nodes = nodes_of(file)
-    assert names(nodes) == ["cartesian_controller", *TOGETHER, "SimulationInput"]
-    assert nodes[0].parameters == {
-        "config": file,
-        "output": "none",
-        "left.target_frame_id": "cell",
-        "left.joint_states_topic": "joint_states",
-        "right.target_frame_id": "cell",
-        "right.joint_states_topic": "joint_states",
-    }
-
-
-def test_controllers_of_joints_get_them_from_the_built_in_one_each_on_its_topic(tmp_path: Path) -> None:
-    file = external_cell(tmp_path, "lbr_position", "filtered")
-    parameters = nodes_of(file)[0].parameters
+    parameters = nodes_of(external_cell(tmp_path, "lbr_position", "filtered"))[0].parameters
     assert (parameters["output"], parameters["rate"]) == ("lbr_position", 200.0)
-    for arm in ("left", "right"):
+    for arm in SIDES:
         assert parameters[f"{arm}.output_topic"] == f"/bh_robot/{arm}_arm_clik_controller/command/joint_position"
         assert parameters[f"{arm}.target_frame_id"] == "bh_robot_base"
 
 
-def test_arms_have_a_process_each_where_that_is_asked_for() -> None:
-    assert names(nodes_of(CONFIG, "none"))[2:] == TOGETHER
-    assert names(nodes_of(CONFIG, "none", separate=True))[2:] == SEPARATE
-
-
-def test_a_cell_with_one_arm_has_one_arms_nodes(tmp_path: Path) -> None:
+def test_arms_have_a_process_each_where_that_is_asked_for_and_a_cell_with_one_arm_has_its_nodes(tmp_path: Path) -> None:
+    assert names(nodes_of(CONFIG, "none"))[2:] == ["arm_controllers"]
+    assert names(nodes_of(CONFIG, "none", separate=True))[2:] == ["left_arm_controller", "right_arm_controller"]
     cell = external() | {"controller": "builtin"}
     del cell["external"], cell["arms"]["right"]
-    file = tmp_path / "one.yaml"
-    file.write_text(yaml.safe_dump(cell))
+    (file := tmp_path / "one.yaml").write_text(yaml.safe_dump(cell))
     assert names(nodes_of(str(file), "none")) == ["mujoco_robot", "cartesian_controller", "left_arm_controller"]
 
 
@@ -163,32 +149,16 @@ def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
             assert callable(getattr(executables, function))
 
 
-class Recorded:
-    """Stands for a class of launch: keeps what it was made with. Whether launch takes that, only launch can tell."""
-
-    def __init__(self, *given: Any, **named: Any) -> None:
-        self.given, self.named = given, named
-
-    def perform(self, context: dict[str, str]) -> str:
-        return context[self.given[0]]
-
-
 @pytest.fixture
-def launch_file(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The launch file with launch's classes recorded, since launch itself is not in the Python registry."""
-    for module, classes in {
-        "launch": ["LaunchDescription"],
-        "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction", "Shutdown"],
-        "launch.substitutions": ["LaunchConfiguration"],
-        "launch_ros": [],
-        "launch_ros.actions": ["Node"],
-        "launch_ros.parameter_descriptions": ["ParameterValue"],
-    }.items():
-        made = types.ModuleType(module)
-        for name in classes:
-            setattr(made, name, type(name, (Recorded,), {}))
+def launch(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Stands for launch, which is not in the Python registry, and keeps what its classes were made with."""
+    made = MagicMock()
+    made.LaunchConfiguration = lambda name: SimpleNamespace(perform=lambda context: context[name])
+    made.ParameterValue = lambda value, value_type: (value, value_type)
+    parts = ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions")
+    for module in (*parts, "launch_ros.parameter_descriptions"):
         monkeypatch.setitem(sys.modules, module, made)
-    return runpy.run_path(str(ROOT / "launch" / "teleop.launch.py"))
+    return made
 
 
 @pytest.mark.parametrize(
@@ -196,20 +166,19 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> Any:
     [("builtin", "headset", "recordings", "true"), ("jtc", "none", "", "false")],
 )
 def test_the_launch_file_starts_what_the_command_starts(
-    launch_file: Any, tmp_path: Path, preset: str, source: str, folder: str, separate: str
+    launch: Any, tmp_path: Path, preset: str, source: str, folder: str, separate: str
 ) -> None:
     config = CONFIG if preset == "builtin" else external_cell(tmp_path, preset, "filtered")
-    *arguments, nodes = launch_file["generate_launch_description"]().given[0]
-    given = {argument.given[0]: argument.named["default_value"] for argument in arguments}
+    runpy.run_path(str(ROOT / "launch" / "teleop.launch.py"))["generate_launch_description"]()
+    given = {call.args[0]: call.kwargs["default_value"] for call in launch.DeclareLaunchArgument.call_args_list}
     given |= {"config": config, "input": source, "record": folder, "separate": separate}
-    actions = nodes.named["function"](given)
+    launch.OpaqueFunction.call_args.kwargs["function"](given)
     recording = {"folder": folder} if folder else None
     expected = nodes_of(config, source, separate=separate == "true", recording=recording)
-    assert [(action.named["package"], action.named["executable"]) for action in actions] == [
-        ("q2r2_control", node.name) for node in expected
-    ]
+    actions = [call.kwargs for call in launch.Node.call_args_list]
     for action, node in zip(actions, expected, strict=True):
-        (parameters,) = action.named["parameters"]
-        assert {key: value.given[0] for key, value in parameters.items()} == node.parameters
-        assert all(isinstance(value.given[0], value.named["value_type"]) for value in parameters.values())
-        assert action.named["on_exit"].named == {"reason": f"{node.name} ended"}
+        assert (action["package"], action["executable"]) == ("q2r2_control", node.name)
+        (parameters,) = action["parameters"]
+        assert parameters == {key: (value, type(value)) for key, value in node.parameters.items()}
+    ends = [call.kwargs for call in launch.Shutdown.call_args_list]
+    assert ends == [{"reason": f"{node.name} ended"} for node in expected]

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,80 +27,42 @@ from std_msgs.msg import String
 from q2r2_control.errors import RecordingError
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording.episode_spans import read_spans
-from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS
 from q2r2_control.recording.writer import FLUSH_PERIOD
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
 from q2r2_control.ros.nodes.recorder import HANDOVER_PERIOD
-from q2r2_control.teleop.haptics import (
-    EPISODE_BEGINS,
-    EPISODE_DISCARDED,
-    EPISODE_ENDS,
-    Pulse,
-)
+from q2r2_control.teleop.haptics import EPISODE_BEGINS, EPISODE_DISCARDED, EPISODE_ENDS, Pulse
 from tests.recording.runs import read_elsewhere
 from tests.ros.arm_rig import ArmRig
-from tests.ros.waiting import States, call, wait_until
+from tests.ros.processes import States, call, wait_until
 
 HAND = "/q2r_left_hand_pose"
 
 
 class RunningRecorder:
-    """A recorder's process, as a test's node sees it."""
-
     def __init__(self, node: Any, processes: Processes, folder: Path) -> None:
         self.node, self._states = node, States(node, "recorder")
         self.process = processes.start_node("recorder", f"config:={CONFIG}", f"folder:={folder}", 'task:="3: blocks"')
-        self._folder = Path(self.state()["file"] or folder).parent
+        self.folder = Path(self.state()["file"] or folder).parent
 
     def state(self, text: str = "") -> dict[str, Any]:
-        """Its next state whose message contains ``text``."""
         return self._states.wait_for(text)
 
     def wait(self, key: str, value: object) -> None:
         wait_until(lambda: self.state()[key] == value, f"{key} is {value}")
 
-    def wait_until_heard(self, topic: str, send: Callable[[], None]) -> None:
-        """Send until it is taken: publisher and recorder find each other each in its own time."""
-
-        def taken() -> bool:
-            send()
-            time.sleep(0.05)
-            return self._newest(topic) != b""
-
-        wait_until(taken, "the recorder takes what is sent")
-
-    def wait_for(self, topic: str, begin: bytes) -> None:
-        """What was published before Ctrl-C may still be on its way: wait for a message that begins so (its CDR)."""
-        wait_until(lambda: self._newest(topic).startswith(begin), "the last message is in the file")
-
-    def _newest(self, topic: str) -> bytes:
-        """The newest message in the file; empty while there is none."""
-        records = self._records(topic)
-        return records[-1].payload if records else b""
-
-    def count(self, topic: str) -> int:
-        """How many messages are in the file, while it is being written."""
-        return len(self._records(topic))
-
-    def _records(self, topic: str) -> list[Message]:
-        try:
-            recording = open_recording(self._folder)
-            return [message for messages in recording.messages((topic,)) for message in messages]
-        except RecordingError:  # in the middle of a write
-            return []
-
-    @property
-    def folder(self) -> Path:
-        return Path(self.state()["file"]).parent
+    def poses(self) -> list[bytes]:
+        """Of the hand, in the file while it is being written."""
+        with suppress(RecordingError):  # in the middle of a write
+            recording = open_recording(self.folder)
+            return [message.payload for messages in recording.messages((HAND,)) for message in messages]
+        return []
 
     def end(self) -> Path:
-        """Ctrl-C; the recording's folder."""
-        folder = self.folder
         assert self.process.interrupt(60.0) == 0
-        return folder
+        return self.folder
 
 
 @pytest.fixture
@@ -112,20 +74,19 @@ def record_poses(recorder: RunningRecorder, node: Any, count: int) -> bytes:
     """Publish poses of a hand, slowly enough for best effort; returns how the last one begins, once it is taken."""
     publisher = node.create_publisher(PoseStamped, HAND, STREAM_QOS)
     message = PoseStamped()
-    recorder.wait_until_heard(HAND, lambda: publisher.publish(message))
+    # Publisher and recorder find each other each in its own time.
+    wait_until(lambda: publisher.publish(message) or recorder.poses(), "the recorder takes poses")
     for number in range(count):
         message.pose.position.x = float(number)
         message.header.stamp.sec = 1000 + number
         publisher.publish(message)
         time.sleep(0.002)
     last = serialize_message(message)[:8]  # with its seconds
-    recorder.wait_for(HAND, last)
+    wait_until(lambda: recorder.poses()[-1].startswith(last), "the last pose is in the file")
     return last
 
 
-def test_messages_are_in_the_file_to_the_byte_and_no_ros_is_needed_to_read_it(
-    recorder: RunningRecorder, node: Any, tmp_path: Path
-) -> None:
+def test_messages_are_in_the_file_to_the_byte_without_ros(recorder: RunningRecorder, node: Any, tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
     # Bytes between a message's fields are whatever the sender's memory held: compare with what another listener gets.
@@ -147,9 +108,7 @@ def test_messages_are_in_the_file_to_the_byte_and_no_ros_is_needed_to_read_it(
     assert Recording(folder).closed
 
 
-def test_a_hand_and_services_tell_of_episodes_and_each_learns_of_the_others(
-    node: Any, processes: Processes, tmp_path: Path
-) -> None:
+def test_hand_and_services_tell_of_episodes_to_each_other(node: Any, processes: Processes, tmp_path: Path) -> None:
     rig = ArmRig(node)
     rig.start(processes, {"teleop.bindings.grip": "record_toggle"})
     squeeze(rig)
@@ -174,10 +133,8 @@ def test_a_hand_and_services_tell_of_episodes_and_each_learns_of_the_others(
 
 
 def squeeze(rig: ArmRig) -> None:
-    rig.grip = 1.0
-    time.sleep(0.2)
-    rig.grip = 0.0
-    time.sleep(0.2)
+    for rig.grip in (1.0, 0.0):
+        time.sleep(0.2)
 
 
 def felt(rig: ArmRig, pulse: Pulse) -> None:
@@ -189,7 +146,7 @@ def felt(rig: ArmRig, pulse: Pulse) -> None:
 def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: RunningRecorder, node: Any) -> None:
     """A kill costs what the node has not handed over yet, and with the writer the chunk that it has not written yet."""
     record_poses(recorder, node, 100)
-    folder, written = recorder.folder, recorder.count(HAND)
+    folder, written = recorder.folder, len(recorder.poses())
     publisher = node.create_publisher(PoseStamped, HAND, STREAM_QOS)
     sent = time.time_ns()
     while time.time_ns() - sent < 1_000_000_000:
@@ -204,15 +161,12 @@ def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: Runnin
 
 
 def is_closed(folder: Path) -> bool:
-    try:
+    with suppress(RecordingError):  # of a file of which not even the head is written
         return Recording(folder).closed
-    except RecordingError:  # of a file of which not even the head is written
-        return False
+    return False
 
 
-def test_a_folder_that_cannot_be_written_is_an_error_and_the_node_goes_on(
-    node: Any, processes: Processes, tmp_path: Path
-) -> None:
+def test_a_folder_that_cannot_be_written_is_an_error(node: Any, processes: Processes, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     recorder = RunningRecorder(node, processes, tmp_path / "file")
     state = recorder.state("nothing is recorded any more")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import sys
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -17,55 +17,41 @@ from q2r2_control import load_config
 from q2r2_control.ros.watching.set_listener import SetListener
 from q2r2_control.ros.watching.set_view import NodeView, arm_views
 from tests.ros.conftest import need_ros, spun_node
-from tests.ros.processes import CONFIG, PATIENCE, Processes
-from tests.ros.waiting import States, wait_until
+from tests.ros.processes import CONFIG, PATIENCE, Processes, States, wait_until
 
 need_ros()
 
 
 # The command tries ROS in a process of its own first, and listens for seconds [s].
 LONG = 4.0 * PATIENCE
+COMMAND = (sys.executable, "-m", "q2r2_control", "ros")
+CELL = load_config(CONFIG)
 
 
-@pytest.fixture
-def listener(domain: int) -> Iterator[SetListener]:
-    with spun_node(domain, "watcher") as watcher:
-        yield SetListener(watcher, load_config(CONFIG))
-
-
-def test_what_one_may_listen_to_is_measured_and_what_not_is_what_the_sender_says(
-    node: Any, listener: SetListener
-) -> None:
+def test_rates_are_what_the_senders_say_and_no_topic_but_states_is_listened_to(node: Any, domain: int) -> None:
     state = node.create_publisher(String, "/test/state", 10)
     other = node.create_publisher(String, "/stranger/state", 10)
     sender = node.create_publisher(PoseStamped, "/target", 10)
-    counted = 0
+    counts = itertools.count()
 
     def publish() -> None:
-        nonlocal counted
-        counted += 1
-        state.publish(String(data=json.dumps({"level": "ok", "message": "here", "sent": {"/target": counted}})))
+        said = {"level": "ok", "message": "here", "sent": {"/target": next(counts)}}
+        state.publish(String(data=json.dumps(said)))
         for text in ("not JSON", "[1]", '{"level": 1}'):
             other.publish(String(data=text))
 
     timer = node.create_timer(0.01, publish)
+    with spun_node(domain, "watcher") as watcher:
+        listener = SetListener(watcher, CELL)
 
-    def views() -> Any:
-        listener.look()
-        time.sleep(0.05)
-        return listener.view()
+        def rates() -> dict[str, float | None]:
+            listener.look()
+            return {topic.name: topic.rate for topic in listener.view().topics}
 
-    def measured() -> bool:
-        return "/target" in {topic.name for topic in views().topics if topic.rate}
-
-    wait_until(measured, "the topics have rates")
-    view = views()
-    assert "/stranger" not in {one.name for one in view.nodes}  # which says something else
+        wait_until(lambda: (rates().get("/target") or 0.0) > 10.0, "the topics have rates")
+        assert "/stranger" not in {one.name for one in listener.view().nodes}  # which says something else
+        assert node.count_subscribers("/target") == 0
     node.destroy_timer(timer)
-    topics = {topic.name: topic for topic in view.topics}
-    assert topics["/target"].rate is not None
-    assert topics["/target"].rate > 0.0
-    assert node.count_subscribers("/target") == 0
     node.destroy_publisher(sender)
 
 
@@ -75,9 +61,7 @@ def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node
     States(node, "left_q2r2_arm_controller").wait_for("not known")
     states = States(node, "simulation_input")
     states.wait_for("waits for a subscriber of the right hand")
-    watch = processes.start(
-        sys.executable, "-m", "q2r2_control", "ros", "watch", "--json", "--duration", "8", name="watch"
-    )
+    watch = processes.start(*COMMAND, "watch", "--json", "--duration", "8", name="watch")
     name = f"q2r2_watch_{watch.pid}"
     taken: set[str] = set()
 
@@ -105,17 +89,14 @@ def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node
 
 
 @pytest.mark.slow
-def test_the_doctor_finds_two_inputs_and_an_arm_without_its_robot_and_says_what_helps(
-    node: Any, processes: Processes
-) -> None:
+def test_the_doctor_finds_two_inputs_and_an_arm_without_robot_and_their_cures(node: Any, processes: Processes) -> None:
     processes.start_node("left_arm_controller")
     for number in (1, 2):
-        processes.run_node("SimulationInput", "-r", f"__node:=input_{number}", "-p", "side:=left")
+        processes.start_node("SimulationInput", "side:=left", node=f"input_{number}")
     States(node, "left_q2r2_arm_controller").wait_for("not known")
     States(node, "input_1").wait_for("")
     States(node, "input_2").wait_for("")
-    arguments = ("ros", "doctor", "--duration", "6")
-    doctor = processes.start(sys.executable, "-m", "q2r2_control", *arguments, "--json", name="doctor")
+    doctor = processes.start(*COMMAND, "doctor", "--duration", "6", "--json", name="doctor")
     assert doctor.wait(LONG) == 1
     found = json.loads(doctor.output.splitlines()[-1])
     assert found["domain"] == os.environ["ROS_DOMAIN_ID"]
@@ -129,14 +110,12 @@ def test_the_doctor_finds_two_inputs_and_an_arm_without_its_robot_and_says_what_
 
 
 def test_the_doctor_says_why_no_node_can_start(processes: Processes) -> None:
-    command = (sys.executable, "-m", "q2r2_control", "ros", "doctor")
-    doctor = processes.start(*command, name="doctor", RMW_IMPLEMENTATION="rmw_nothing_cpp")
+    doctor = processes.start(*COMMAND, "doctor", name="doctor", RMW_IMPLEMENTATION="rmw_nothing_cpp")
     assert doctor.wait(LONG) == 1
     (line,) = (line for line in doctor.output.splitlines() if line.startswith("stops arms"))
     assert "no node can start" in line
 
 
-CELL = load_config(CONFIG)
 ARM = {"arm": "left", "hand": "left", "state": "idle", "ready": False, "hand_age": 0.01, "slip": 0.0}
 
 
@@ -154,32 +133,25 @@ CONTROLLER = node(
 REFUSING = node("/controller", "target of left not used: begins 4 cm off", "warn", phase="active")
 
 
-@pytest.mark.parametrize(
-    ("nodes", "why"),
-    [
-        pytest.param((), "no node teleoperates this arm", id="no node"),
-        pytest.param((arm(age=7.2),), "/left_arm is silent for 7 s", id="a silent node"),
-        pytest.param((arm("/target has no subscriber"),), "/target has no subscriber", id="something in the way"),
-        pytest.param(
-            (arm(ready=True, last_event="lost: cable"),),
-            "lower of the left hand engages (last: lost: cable)",
-            id="ready",
-        ),
-        pytest.param(
-            (arm("stopped: by the left hand", state="stopped"),), "/left_arm/reset, or", id="stopped by a person"
-        ),
-        pytest.param((arm(state="homing"),), "goes home", id="on the way home"),
-        pytest.param((arm(state="engaged"), CONTROLLER), "follows the hand", id="engaged"),
-        pytest.param((arm(state="engaged", hand_age=3.4),), "no pose of the left hand for 3 s", id="no hand"),
-        pytest.param(
-            (arm(state="engaged", slip=0.012), CONTROLLER),
-            "12 mm short of the hand; nearest pair a_0 | b_1, 21 mm",
-            id="held up",
-        ),
-        pytest.param((arm(state="engaged"), REFUSING), "/controller: target of left not used", id="refused"),
-        pytest.param((arm(state="engaged", hand_age="old", slip=None),), "follows the hand", id="strange values"),
-    ],
-)
+ENGAGED = arm(state="engaged")
+HELD_UP = arm(state="engaged", slip=0.012), CONTROLLER
+READY = arm(ready=True, last_event="lost: cable")
+WHY: dict[str, tuple[tuple[NodeView, ...], str]] = {
+    "no node": ((), "no node teleoperates this arm"),
+    "a silent node": ((arm(age=7.2),), "/left_arm is silent for 7 s"),
+    "something in the way": ((arm("/target has no subscriber"),), "/target has no subscriber"),
+    "ready": ((READY,), "lower of the left hand engages (last: lost: cable)"),
+    "stopped by a person": ((arm("stopped: by the left hand", state="stopped"),), "/left_arm/reset, or"),
+    "on the way home": ((arm(state="homing"),), "goes home"),
+    "engaged": ((ENGAGED, CONTROLLER), "follows the hand"),
+    "no hand": ((arm(state="engaged", hand_age=3.4),), "no pose of the left hand for 3 s"),
+    "held up": (HELD_UP, "12 mm short of the hand; nearest pair a_0 | b_1, 21 mm"),
+    "refused": ((ENGAGED, REFUSING), "/controller: target of left not used"),
+    "strange values": ((arm(state="engaged", hand_age="old", slip=None),), "follows the hand"),
+}
+
+
+@pytest.mark.parametrize(("nodes", "why"), WHY.values(), ids=WHY)
 def test_a_line_says_why_an_arm_is_where_it_is(nodes: tuple[NodeView, ...], why: str) -> None:
     left, right = arm_views(nodes, CELL)
     assert why in left.why

@@ -1,23 +1,23 @@
-"""The endpoint between a headset on a real TCP connection and this process on real topics."""
+"""The endpoint between a headset on a real TCP connection and this process on real topics; the view of both hands."""
 
 from __future__ import annotations
 
 import math
-import socket
+import re
 import struct
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from itertools import count as attempts
 from pathlib import Path
-from queue import Empty, Queue
+from queue import Empty
 from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
 
 from tests.ros.conftest import need_ros
-from tests.ros.processes import PATIENCE, Processes, RosProcess
-from tests.ros.waiting import States, drained
+from tests.ros.processes import PATIENCE, ROOT, Processes, RosProcess, States, drained, subscribed, wait_until
 from tests.support.fake_headset import KEEPALIVE, FakeHeadset
 
 need_ros()
@@ -26,12 +26,10 @@ from geometry_msgs.msg import PoseStamped, Twist
 from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 
 IDENTITY = (0.0, 0.0, 0.0, -1.0)
-ROOT = Path(__file__).resolve().parents[2]
 CDR = b"\0\1\0\0"
 
 
 def start_endpoint(processes: Processes, *parameters: str) -> tuple[RosProcess, tuple[str, int]]:
-    """The running node, and where it listens."""
     process = processes.start_node("tcp_endpoint", "port:=0", *parameters)
     host, port = process.wait_for("listening on ").rsplit(" ", 1)[-1].split(":")
     return process, (host, int(port))
@@ -42,8 +40,7 @@ class KeepaliveHeadset(FakeHeadset):
 
     def __init__(self, address: tuple[str, int], dialect: str = "ros2") -> None:
         super().__init__(address, dialect)
-        self._sending = Lock()
-        self._closed = Event()
+        self._sending, self._closed = Lock(), Event()
         self._thread = Thread(target=self._send_keepalives, daemon=True)
         self._thread.start()
 
@@ -63,19 +60,14 @@ class KeepaliveHeadset(FakeHeadset):
 
 
 class Hand:
-    """Receives all topics of one hand, reliably."""
-
     def __init__(self, node: Any, name: str) -> None:
+        kinds = {"pose": PoseStamped, "twist": Twist, "inputs": OVR2ROSInputs}
         self.name = name
-        self.queues: dict[str, Queue[Any]] = {}
-        for suffix, kind in (("pose", PoseStamped), ("twist", Twist), ("inputs", OVR2ROSInputs)):
-            self.queues[suffix] = Queue()
-            node.create_subscription(kind, f"q2r_{name}_hand_{suffix}", self.queues[suffix].put, 100)
+        self.queues = {what: subscribed(node, kind, f"q2r_{name}_hand_{what}") for what, kind in kinds.items()}
 
     def meet(self, headset: FakeHeadset) -> None:
         """Until publisher and subscriber know each other a message may be lost: send until each topic has come."""
         for suffix, queue in self.queues.items():
-            deadline = time.monotonic() + PATIENCE
             for attempt in attempts(1):
                 probe = {
                     "pose": headset.pose(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, float(attempt))),  # not frozen
@@ -83,11 +75,10 @@ class Hand:
                     "inputs": headset.inputs(self.name),
                 }[suffix]
                 headset.send(probe)
-                try:
+                with suppress(Empty):
                     queue.get(timeout=0.1)
                     break
-                except Empty:
-                    assert time.monotonic() < deadline, f"no {suffix} of the {self.name} hand"
+                assert attempt < 10.0 * PATIENCE, f"no {suffix} of the {self.name} hand"
 
     def next(self, suffix: str, count: int) -> list[Any]:
         """The next ``count`` messages that are no probes, some of which may still be on their way."""
@@ -161,35 +152,21 @@ def test_only_networks_that_the_cell_or_a_parameter_allows_are_served(processes:
     assert "parameter allow: 'the lab' is neither an address nor a network" in refused.output
 
 
-def send_until_received(publisher: Any, message: Any, headset: FakeHeadset) -> bytes:
-    """Publish until the headset gets it: both sides may not know each other yet. Fails when it gets anything else."""
-    deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline:
-        publisher.publish(message)
-        try:
-            frame = headset.read_frame(0.2)
-        except TimeoutError:
-            continue
-        assert frame is not None
-        assert frame[0] == publisher.topic_name.removeprefix("/")
-        return frame[1]
-    raise AssertionError(f"nothing arrived from {publisher.topic_name}")
-
-
 def test_vibrations_reach_a_headset_that_subscribed_byte_by_byte(node: Any, processes: Processes) -> None:
-    dialect = "ros2"
     _, address = start_endpoint(processes)
     haptic = node.create_publisher(OVR2ROSHapticFeedback, "q2r_right_hand_haptic_feedback", 10)
-    with KeepaliveHeadset(address, dialect) as headset:
+    with KeepaliveHeadset(address) as headset:
         headset.send(headset.registrations())
         headset.read_until("__topic_list")
-        payload = send_until_received(haptic, OVR2ROSHapticFeedback(frequency=0.25, amplitude=7.0), headset)
-        assert payload == CDR + struct.pack("<2f", 0.25, 1.0)
+        frame = None
+        while frame is None:  # both sides may not know each other yet
+            haptic.publish(OVR2ROSHapticFeedback(frequency=0.25, amplitude=7.0))
+            with suppress(TimeoutError):
+                frame = headset.read_frame(0.2)
+        assert frame == ("q2r_right_hand_haptic_feedback", CDR + struct.pack("<2f", 0.25, 1.0))
 
 
-def test_topics_are_silent_without_a_headset_and_a_headset_of_the_other_dialect_may_follow(
-    node: Any, processes: Processes
-) -> None:
+def test_topics_are_silent_without_a_headset_and_another_one_may_follow(node: Any, processes: Processes) -> None:
     process, address = start_endpoint(processes)
     states = States(node, "tcp_endpoint")
     assert states.wait_for("no headset is connected")["level"] == "warn"
@@ -218,7 +195,7 @@ def test_topics_are_silent_without_a_headset_and_a_headset_of_the_other_dialect_
 
 
 def test_frozen_poses_are_left_out_with_one_line(node: Any, processes: Processes) -> None:
-    process, address = start_endpoint(processes, "frozen_time:=0.3")
+    process, address = start_endpoint(processes)
     hand, deadline = Hand(node, "left"), time.monotonic() + PATIENCE
     with KeepaliveHeadset(address) as headset:
         headset.send(headset.registrations())
@@ -236,15 +213,41 @@ def test_frozen_poses_are_left_out_with_one_line(node: Any, processes: Processes
     assert process.output.count("frozen") == 1
 
 
-def test_an_address_that_cannot_be_bound_and_a_port_out_of_range_are_one_line(processes: Processes) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        taken = other.getsockname()[1]
-        complaints = {
-            f"port:={taken}": f"cannot listen on 127.0.0.1:{taken}",
-            "port:=65536": "allowed is 0 .. 65535",
-        }
-        started = [processes.start_node("tcp_endpoint", parameter) for parameter in complaints]
-        assert [process.wait(2.0 * PATIENCE) for process in started] == [2, 2]
-    for process, complaint in zip(started, complaints.values(), strict=True):
-        (line,) = process.output.splitlines()
-        assert complaint in line
+NAME = "CheckTCPconnection"
+LONG = 2.0 * PATIENCE
+
+
+@contextmanager
+def left_hand_publishing(node: Any) -> Iterator[None]:
+    """Pose, inputs and twist of the left hand with numbers of their own, for as long as the context lasts."""
+    from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, Vector3
+    from quest2ros.msg import OVR2ROSInputs
+
+    pose = PoseStamped(pose=Pose(position=Point(x=1.0, y=2.0, z=-3.0), orientation=Quaternion(w=-1.0)))
+    twist = Twist(linear=Vector3(x=0.5), angular=Vector3(z=-0.25))
+    inputs = OVR2ROSInputs(button_lower=True, press_index=0.75)
+    messages = {"pose": pose, "twist": twist, "inputs": inputs}
+    publishers = {name: node.create_publisher(type(m), f"q2r_left_hand_{name}", 10) for name, m in messages.items()}
+    timer = node.create_timer(0.02, lambda: [publishers[name].publish(m) for name, m in messages.items()])
+    try:
+        yield
+    finally:
+        node.destroy_timer(timer)
+
+
+def test_it_shows_values_rate_and_age_and_tells_a_timeout(node: Any, processes: Processes) -> None:
+    states = States(node, "check_tcp_connection")
+    check = processes.start_node(NAME)
+    with left_hand_publishing(node):
+        check.wait_for("s old: 1.00 2.00 -3.00 m, quaternion 0.00 0.00 0.00 -1.00")
+        check.wait_for("held: lower, triggers 0.8 0.0")
+        state = states.wait_for("timeout, nothing for 2 s: q2r_right_hand_pose")
+        assert state["level"] == "warn"
+        assert state["rate_hz"]["q2r_left_hand_pose"] > 0.0
+    wait_until(lambda: re.search(r"q2r_left_hand_pose: timeout, \d+ messages", check.output), "a timeout of the pose")
+    assert states.wait_for("q2r_left_hand_pose")["level"] == "error"
+    assert check.interrupt() == 0
+
+
+def test_after_its_duration_the_exit_code_says_that_nothing_has_arrived(processes: Processes) -> None:
+    assert processes.start_node(NAME, "duration:=2.5").wait(LONG) == 1

@@ -1,13 +1,16 @@
-"""What RViz, Foxglove and PlotJuggler are told to show is there, with the type and the fields that they expect."""
+"""What the views, the README and the docs show is there, and works as it stands there."""
 
 from __future__ import annotations
 
 import json
 import re
+import sys
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
@@ -16,26 +19,22 @@ from q2r2_control import Robot
 from q2r2_control.recording.topics import Topic, run_topics
 from tests.ros.cell import PATIENT, start_controller, start_robot
 from tests.ros.conftest import need_ros
-from tests.ros.processes import ROOT, Processes
-from tests.ros.waiting import wait_until
+from tests.ros.processes import PATIENCE, ROOT, Processes, as_arguments, wait_until
 
 need_ros()
 
+from q2r2_control.ros.base_node import LATCHED_QOS
+from q2r2_control.ros.bridge.messages import pose_of
+from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, patient, stamped_transform, target_of
+
 VIEWS = ROOT / "views"
+
 # The types that RViz's displays and Foxglove's panels take.
-KINDS = {
-    "RobotModel": "std_msgs/msg/String",
-    "Marker": "visualization_msgs/msg/Marker",
-    "Pose": "geometry_msgs/msg/PoseStamped",
-    "TF": "tf2_msgs/msg/TFMessage",
-    "DiagnosticSummary": "diagnostic_msgs/msg/DiagnosticArray",
-    "RawMessages": "std_msgs/msg/String",
-}
-POSE, MARKER = KINDS["Pose"], KINDS["Marker"]
+TEXT, POSE, MARKER = "std_msgs/msg/String", "geometry_msgs/msg/PoseStamped", "visualization_msgs/msg/Marker"
+KINDS = {"RobotModel": TEXT, "Marker": MARKER, "Pose": POSE, "TF": "tf2_msgs/msg/TFMessage"}
 
 
 def rviz_topics() -> dict[str, str]:
-    """Type by topic, of every display that shows one."""
     found = {}
     for display in yaml.safe_load((VIEWS / "q2r2.rviz").read_text())["Visualization Manager"]["Displays"]:
         kind = display["Class"].removeprefix("rviz_default_plugins/")
@@ -51,22 +50,16 @@ def foxglove_panels() -> dict[str, Any]:
 
 
 def foxglove_topics() -> dict[str, str]:
-    """Type by topic, of all but plots."""
     panels = foxglove_panels()
     found = {topic: POSE if "safe_target" in topic else MARKER for topic in panels["3D!arms"]["topics"]}
-    found[panels["3D!arms"]["layers"]["arms"]["topic"]] = KINDS["RobotModel"]
-    found[panels["RawMessages!controller"]["topicPath"].removesuffix(".data")] = KINDS["RawMessages"]
-    found[panels["DiagnosticSummary!nodes"]["topicToRender"]] = KINDS["DiagnosticSummary"]
+    found[panels["3D!arms"]["layers"]["arms"]["topic"]] = TEXT
+    found[panels["RawMessages!controller"]["topicPath"].removesuffix(".data")] = TEXT
+    found[panels["DiagnosticSummary!nodes"]["topicToRender"]] = "diagnostic_msgs/msg/DiagnosticArray"
     return found
 
 
 def foxglove_paths() -> list[str]:
     return [path["value"] for panel in foxglove_panels().values() for path in panel.get("paths", ())]
-
-
-@pytest.fixture(scope="module")
-def recorded(robot: Robot) -> dict[str, Topic]:
-    return run_topics(tuple(robot.arms), robot.joint_names)
 
 
 def check_field(topic: Topic, fields: list[str]) -> None:
@@ -83,7 +76,8 @@ def check_field(topic: Topic, fields: list[str]) -> None:
     assert kind == "float64"
 
 
-def test_every_plot_of_a_recording_has_its_field(recorded: dict[str, Topic]) -> None:
+def test_every_plot_of_a_recording_has_its_field(robot: Robot) -> None:
+    recorded = run_topics(tuple(robot.arms), robot.joint_names)
     curves = [curve.attrib["name"] for curve in ElementTree.parse(VIEWS / "plotjuggler.xml").iter("curve")]
     assert len(curves) > 20
     for curve in curves:
@@ -95,17 +89,12 @@ def test_every_plot_of_a_recording_has_its_field(recorded: dict[str, Topic]) -> 
 
 
 def test_no_view_of_a_running_set_listens_to_a_command() -> None:
-    shown = {
-        *recorded_by_hand(),
-        *rviz_topics(),
-        *foxglove_topics(),
-        *(path.partition(".")[0] for path in foxglove_paths()),
-    }
+    plotted = [path.partition(".")[0] for path in foxglove_paths()]
+    shown = {*recorded_by_hand(), *rviz_topics(), *foxglove_topics(), *plotted}
     assert not [name for name in shown if re.search(r"target_frame|trajectory|command|_hand_", name)]
 
 
 def recorded_by_hand() -> list[str]:
-    """The topics that the docs record a running set with."""
     (command,) = re.findall(r"ros2 bag record (.*)", (ROOT / "docs" / "ros.md").read_text())
     return list(command.split())
 
@@ -132,3 +121,42 @@ def test_every_display_shows_what_the_set_publishes(node: Any, robot: Robot, pro
     wait_until(lambda: markers, "the closest pair is shown")
     ends = [np.array([point.x, point.y, point.z]) for point in markers[-1].points]
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(min(robot.distance_values(robot.home)), abs=2e-3)
+
+
+MOVED = 0.05  # [rad]
+
+
+@pytest.mark.alone
+def test_the_documented_subclass_works_in_its_robots_frame(node: Any, processes: Processes, tmp_path: Path) -> None:
+    from tf2_msgs.msg import TFMessage
+    from visualization_msgs.msg import Marker
+
+    base = pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.2])), np.array([0.1, -0.4, 0.3]))
+    static = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
+    static.publish(TFMessage(transforms=[stamped_transform("world", "bh_robot_base", base)]))
+    shown: dict[str, Any] = {}
+    node.create_subscription(Marker, "/visualization_marker", lambda marker: shown.update({marker.ns: marker}), 10)
+
+    topic = "/bh_robot/right_arm_clik_controller/target_frame"
+    rig = ArmRig(node, "right", topic=topic, tool_frame="right_arm_link_ee", robot="bh_robot")
+    rig.follows = False
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "ros.md").read_text(), re.DOTALL)
+    (file := tmp_path / "right_arm.py").write_text(code)
+    given = patient({"world_frame_id": "world", "teleop.leash.distance": 0.0})
+    process = processes.start(sys.executable, str(file), *as_arguments(*given), name="right_arm")
+    rig.wait_until_connected()
+    rig.engage()
+    rig.wait(lambda: rig.targets, "targets come")
+    assert rig.state["preset"] == "kuka_lbr_clik", "not the terms of another controller"
+    assert rig.targets[0].header.frame_id == "bh_robot_base"
+    assert_same(base * target_of(rig), TOOL, 1e-9)
+    rig.move((0.0, 0.1, 0.0))
+    assert_same(base * rig.wait_for_rest(), offset(TOOL, (0.0, 0.1, 0.0)), 1e-3)
+
+    rig.wait(lambda: {"right_engaged", "right_axes", "right_path"} <= shown.keys(), "markers come")
+    assert shown["right_axes"].header.frame_id == "right_arm_link_ee"
+    assert_same(TOOL * (pose_of(shown["right_axes"].pose) or pin.SE3.Identity()), offset(TOOL, (0.0, 0.1, 0.0)), 2e-3)
+    rig.pause()
+    rig.wait(lambda: shown["right_engaged"].color.a < 1.0, "the marker fades")
+    assert_same(pose_of(shown["right_engaged"].pose), pin.SE3.Identity(), 1e-9)
+    assert process.interrupt(PATIENCE) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import deque
 from collections.abc import Callable
@@ -10,19 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, PoseStamped
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rclpy.node import Node
-from std_msgs.msg import ColorRGBA, String
+from std_msgs.msg import ColorRGBA, Float64MultiArray, String
 from visualization_msgs.msg import Marker
 
 from q2r2_control.events import Event
-from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
+from q2r2_control.recording.ros_topics import arm_events, arm_flags, asked_target
+from q2r2_control.recording.topics import WORLD
+from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.gripper_client import GripperClient
 from q2r2_control.ros.bridge.hand_topics import HandIntake
-from q2r2_control.ros.bridge.messages import pose_message, time_message
+from q2r2_control.ros.bridge.messages import pose_message, stamped_pose, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
-from q2r2_control.ros.bridge.reports import ArmReport
 from q2r2_control.teleop.arm_states import AT_REST, is_refusal
 from q2r2_control.teleop.hand_motion import with_offset
 from q2r2_control.teleop.haptics import ArmCondition, HapticPulses
@@ -32,14 +34,13 @@ from q2r2_control.wording import event_line
 if TYPE_CHECKING:
     from q2r2_control.loop.arm_conditions import ArmConditions
 
-
 _AXIS_LENGTH, _AXIS_WIDTH, _PATH_WIDTH, _BALL = 0.1, 0.008, 0.004, 0.04  # [m]
 _PATH_POINTS = 200
 _PATH_STEP = 0.005  # between two points of the path [m]
 _RGB = ((1.0, 0.1, 0.1), (0.1, 0.8, 0.1), (0.2, 0.3, 1.0))
 _SIDES = {"left": (0.1, 0.6, 1.0), "right": (1.0, 0.55, 0.1)}
-_OTHER_SIDE = (0.7, 0.3, 0.9)
 _PAUSED = 0.35  # opacity
+_MARKER_PERIOD, _CONDITION_PERIOD = 0.05, 0.04  # [s]
 
 
 class TargetMarkers:
@@ -47,7 +48,6 @@ class TargetMarkers:
 
     def __init__(self, arm: str, tool_frame: str, world_frame: str) -> None:
         self._arm, self._tool_frame, self._world_frame = arm, tool_frame, world_frame
-        self._colour = _SIDES.get(arm, _OTHER_SIDE)
         self._path: deque[Array] = deque(maxlen=_PATH_POINTS)
 
     def at(self, target: pin.SE3 | None, tool: pin.SE3 | None, engaged: bool, now: float) -> list[Marker]:
@@ -74,9 +74,9 @@ class TargetMarkers:
 
     def _marker(self, name: str, kind: int, frame: str, opacity: float, now: float) -> Marker:
         marker = Marker(ns=f"{self._arm}_{name}", id=0, type=kind, action=Marker.ADD, frame_locked=True)
-        marker.header.frame_id = frame
-        marker.header.stamp = time_message(now)
-        marker.color = ColorRGBA(r=self._colour[0], g=self._colour[1], b=self._colour[2], a=opacity)
+        marker.header.frame_id, marker.header.stamp = frame, time_message(now)
+        r, g, b = _SIDES[self._arm]
+        marker.color = ColorRGBA(r=r, g=g, b=b, a=opacity)
         marker.pose.orientation.w = 1.0
         return marker
 
@@ -86,11 +86,8 @@ def _point(position: Array) -> Point:
     return Point(x=x, y=y, z=z)
 
 
-_MARKER_PERIOD = 0.05  # [s]
-
-
 class ArmFeedback:
-    """Keeps what was told last."""
+    """Tells it, and keeps what was told last."""
 
     def __init__(self, node: BaseNode, arm: str, values: ArmParameters, hand: HandIntake) -> None:
         self._node, self._hand = node, hand
@@ -100,16 +97,18 @@ class ArmFeedback:
         self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
         self._markers = node.create_publisher(Marker, "/visualization_marker", 10)
         self._shown = 0.0
-        self._report = ArmReport(node, arm)
+        # For recordings.
+        self._flags = node.create_publisher(Float64MultiArray, arm_flags(arm), RECORDED_QOS)
+        self._events = node.create_publisher(String, arm_events(arm), RECORDED_QOS)
+        self._target = node.create_publisher(PoseStamped, asked_target(arm), RECORDED_QOS)
 
     def tell(self, event: Event) -> None:
-        """Report a change of the state: to the log, and to the hand as vibrations."""
         self.last_line, self.last_kind = event_line(event), str(event.reason.root.kind)
         if event.destination in AT_REST and not is_refusal(event):
             self.paused = self.last_line
         self._node.get_logger().info(self.last_line)
         self.haptics.tell(event)
-        self._report.tell(event)
+        self._events.publish(String(data=json.dumps(event.as_json())))
         self._node.report_health()
 
     def publish(
@@ -123,7 +122,11 @@ class ArmFeedback:
         now: float,
     ) -> None:
         """Of one tick at ``now`` [s]: what the ``target`` has become, ``sent`` to the controller, world frame."""
-        self._report.publish(engaged, target, gripper.opening, now)
+        if self._flags.get_subscription_count():
+            if (command := target.command) is not None:
+                self._target.publish(stamped_pose(command, WORLD, now))
+            numbers = (engaged, target.slip, target.slip_angle, target.gripper, gripper.opening)  # as ARM_FIELDS
+            self._flags.publish(Float64MultiArray(data=[float(number) for number in numbers]))
         self.haptics.slip(target.slip, target.slip_angle)
         self.haptics.grasps(gripper.holds)
         if (pulse := self.haptics.at(now, hand)) is not None:
@@ -135,9 +138,6 @@ class ArmFeedback:
             asked = None if sent is None else with_offset(sent, target.offset)  # where the tool is to be
             for marker in self._drawn.at(asked, tool, engaged, now):
                 self._markers.publish(marker)
-
-
-_PERIOD = 0.04  # [s]
 
 
 class _Condition(BaseModel):
@@ -157,20 +157,16 @@ class ConditionPublishers:
         self._due = -math.inf
 
     def update(self, report: StepReport, state: RobotState, now: float) -> None:
-        """After a tick at ``now`` [s]."""
         self._conditions.note(report, now)
-        if 0.0 <= self._due - now <= _PERIOD:
+        if 0.0 <= self._due - now <= _CONDITION_PERIOD:
             return
-        self._due = now + _PERIOD
+        self._due = now + _CONDITION_PERIOD
         if not any(publisher.get_subscription_count() for publisher in self._publishers.values()):
             return
         for arm, felt in self._conditions.look(state, now).items():
-            message = _Condition(
-                spare_distance=felt.spare if math.isfinite(felt.spare) else None,
-                joints_at_limit=felt.limits,
-                contact_force=felt.force,
-            )
-            self._publishers[arm].publish(String(data=message.model_dump_json()))
+            spare = felt.spare if math.isfinite(felt.spare) else None
+            told = _Condition(spare_distance=spare, joints_at_limit=felt.limits, contact_force=felt.force)
+            self._publishers[arm].publish(String(data=told.model_dump_json()))
 
 
 def listen_to_condition(node: Node, controller: str, arm: str, notice: Callable[[ArmCondition], None]) -> None:

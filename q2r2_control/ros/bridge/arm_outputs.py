@@ -24,8 +24,7 @@ from q2r2_control.teleop.hand_motion import MAX_OFFSET
 
 _POSE = 2  # of moveit_msgs/srv/ServoCommandType
 # What the built-in controller says of an arm that takes a stream of targets, and what helps where it takes none.
-_READY = ("holding", "following")
-_HOMING = "homing"
+_READY = ("holding", "following", "homing")
 _NO_FAULT = ("active", "paused")
 _CURES = {"stopped": "reset", "paused": "pause with data: false"}
 _ANSWER = 0.2  # the controller has told of all earlier streams by then [s]
@@ -55,14 +54,16 @@ class ArmOutputs:
                 self._last = theirs
             else:
                 self.first = theirs
+        self._all = [self.first] if self._last is None else [self.first, self._last]
         self._follows: FollowWatch | None = None
+        # The built-in controller's name, where hands' targets go to it; and where it moves the arm, also home.
+        self.builtin = values.builtin_node if self.first.preset is BUILTIN else None
+        self.home_controller = None if self._filtered else self.builtin
         if self.first.preset is BUILTIN:
             # Twice the usual timeout: the targets have to arrive first, and then the answer.
             self._follows = FollowWatch(node, values.builtin_node, arm, 2.0 * values.listener_timeout)
-        self._all = [self.first] if self._last is None else [self.first, self._last]
-        self._command_type: CommandType | None = None
-        if preset.command_type is not None:
-            self._command_type = CommandType(node, preset.command_type.format(ctrl=values.prefix))
+        service = preset.command_type
+        self._command_type = None if service is None else CommandType(node, service.format(ctrl=values.prefix))
         self._safe_problem: str | None = self._safe_target.problem  # why the relay could not begin now
         self._relaying = False
 
@@ -91,16 +92,6 @@ class ArmOutputs:
         return _refused(line)
 
     @property
-    def builtin(self) -> str | None:
-        """The name of the built-in controller, where the hand's targets go to it."""
-        return None if self._follows is None else self._follows.controller
-
-    @property
-    def home_controller(self) -> str | None:
-        """The name of the built-in controller, which knows a way home, where it moves the arm."""
-        return None if self._filtered else self.builtin
-
-    @property
     def homing(self) -> tuple[bool, str]:
         """Whether the built-in controller says that it goes home, and how the last way ended."""
         return (False, "") if self._follows is None else (self._follows.homing, self._follows.homing_ended)
@@ -113,7 +104,6 @@ class ArmOutputs:
 
     @property
     def sent(self) -> dict[str, int]:
-        """How many targets went out on each topic."""
         return {output.topic: output.sent for output in self._all}
 
     def take_fault(self, now: float) -> Reason | None:
@@ -136,9 +126,7 @@ class ArmOutputs:
         decided: float,
         state: ArmState,
     ) -> pin.SE3 | None:
-        """Send the hand's target, see :meth:`TargetOutput.step`."""
-        base = pin.SE3.Identity() if self._filtered else base
-        return self.first.step(target, tool, base, now, decided, state=state)
+        return self.first.step(target, tool, pin.SE3.Identity() if self._filtered else base, now, decided, state=state)
 
     def relay(
         self, engaged: bool, tool: pin.SE3 | None, base: pin.SE3 | None, now: float, decided: float
@@ -149,9 +137,8 @@ class ArmOutputs:
         safe, fault = self._safe_target.at(now), None
         self._safe_problem = self._safe_target.problem if safe is None else None
         if safe is not None and tool is not None and not near(safe, tool, *MAX_OFFSET):
-            self._safe_problem = (
-                f"{self._safe_target.topic} is not where the tool is: the arm moves, or tool_frame is wrong"
-            )
+            where = self._safe_target.topic
+            self._safe_problem = f"{where} is not where the tool is: the arm moves, or tool_frame is wrong"
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
@@ -160,7 +147,6 @@ class ArmOutputs:
         return _refused(fault)
 
     def forget(self, now: float) -> None:
-        """Drop all held targets."""
         for output in self._all:
             output.forget(now)
         self._relaying = False
@@ -183,7 +169,7 @@ class FollowWatch:
         self.homing, self.homing_ended = False, ""  # whether it says that it goes home; how the last way ended
         self.gripper_held = ""  # what keeps the gripper from going farther
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
-        node.create_subscription(String, f"{self.controller}/state", self._on_state, 1)
+        node.create_subscription(String, f"{controller}/state", self._on_state, 1)
 
     def refusal(self, sending: bool, now: float) -> str | None:
         """One line if targets are ``sending`` and are followed no more, or not yet after the timeout."""
@@ -205,25 +191,21 @@ class FollowWatch:
         self._follows = bool(message.data)
 
     def _on_state(self, message: String) -> None:
-        """What the controller says of this arm, twice a second and at every change."""
         try:
             said = json.loads(message.data)
             state, why = said[f"{self._arm}_state"], said["message"]
         except (ValueError, TypeError, KeyError):
             return  # some other node's
         self.unready, self.gripper_held = None, str(said.get(f"{self._arm}_gripper_held_by", ""))
-        self.homing, self.homing_ended = state == _HOMING, str(said.get("homing_ended", ""))
-        if state not in (*_READY, _HOMING):
+        self.homing, self.homing_ended = state == "homing", str(said.get("homing_ended", ""))
+        if state not in _READY:
             line = state if why in _NO_FAULT else f"{state}: {why}".replace("~", self.controller)
             cure = f"{self.controller}/{_CURES[state]}" if state in _CURES else ""
             self.unready = f"{self.controller} is {line}" + ("" if cure in line else f"; call {cure}")
 
 
 class CommandType:
-    """Tells MoveIt Servo that targets are poses, after each of its starts: it takes none before. Never waits.
-
-    Raises :class:`ConfigError` where moveit_msgs cannot be imported.
-    """
+    """Tells MoveIt Servo after each of its starts that targets are poses. :class:`ConfigError` without moveit_msgs."""
 
     def __init__(self, node: BaseNode, service: str) -> None:
         try:
@@ -236,7 +218,6 @@ class CommandType:
 
     @property
     def unready(self) -> str | None:
-        """One line while the service has not agreed to poses."""
         return None if self._agreed else f"{self._service} has not agreed to poses yet"
 
     def step(self, starts: int, now: float) -> None:

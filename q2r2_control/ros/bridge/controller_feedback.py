@@ -1,33 +1,53 @@
-"""What the built-in controller tells, besides joint commands: safe targets, what it follows, what hands feel."""
+"""What the built-in controller tells, besides joint commands: safe targets, what it follows, openings of grippers.
+
+Fingers and what they hold are bodies. A gripper's client tells the opening that is wanted, and the one that was
+commanded last, on the topic of the arm's targets with ``/wanted_opening`` after it. It commands what
+``~/opening/<arm>`` answers: the wanted opening, and the one that is proven, 0 closed .. 1 fully open. Without a client,
+measured fingers, or with another controller of the arms, fingers count as all of their way.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PoseStamped
-from std_msgs.msg import Bool, ColorRGBA
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, ColorRGBA, Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker
 
+from q2r2_control.config.cell import Config
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.loop.arm_conditions import ArmConditions
+from q2r2_control.loop.control_loop import ControlLoop
+from q2r2_control.recording.ros_topics import CONTROLLER_TICK
+from q2r2_control.recording.topics import REFERENCE
 from q2r2_control.robot.compose import WORLD
-from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
+from q2r2_control.ros.base_node import LATCHED_QOS, RECORDED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers
+from q2r2_control.ros.bridge.gripper_client import wanted_topic
 from q2r2_control.ros.bridge.intakes import TargetIntake
 from q2r2_control.ros.bridge.messages import stamped_pose, time_message
-from q2r2_control.ros.bridge.reports import TickReport
-from q2r2_control.ros.monitoring.endpoints import publish_in_time
-from q2r2_control.types import Array, Reference, RobotState
+from q2r2_control.ros.monitoring import publish_in_time
+from q2r2_control.types import Array, Reference, RobotState, StepStatus
 
+_STATUSES = tuple(StepStatus)
+# Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].
+GRIPPER_DELAY = 0.3
+_DISCOVERY = 1.0  # until what was published before this node began has arrived, on a busy machine too [s]
+_UNMEASURED = "its fingers are not in the joint states, or nothing is proven while the arms are stopped"
 _MARKER_PERIOD = 0.1  # [s]
-_WIDTH = 0.006  # [m]
 _FAR, _NEAR = 0.10, 0.02  # green beyond the first distance, red below the second [m]
-_LIFETIME = 1  # after which RViz drops the marker [s]
 
 
 class ControllerFeedback:
-    """Publishes it, tick by tick; each only while somebody listens."""
+    """Publishes all but openings, tick by tick; each only while somebody listens."""
 
     def __init__(self, node: BaseNode, controller: CartesianController, targets: TargetIntake, every: int) -> None:
         """``every``: ticks from one safe target to the next."""
@@ -41,17 +61,26 @@ class ControllerFeedback:
         self._following = {arm: node.create_publisher(Bool, f"~/following/{arm}", LATCHED_QOS) for arm in self._follows}
         self._conditions = ConditionPublishers(node, self._follows, ArmConditions(controller))
         self._distances = node.create_publisher(Marker, "~/distances", 10)
-        self._report = TickReport(node, list(controller.robot.joint_names), list(targets.topics))
+        self._recorded_reference = node.create_publisher(JointTrajectory, REFERENCE, RECORDED_QOS)
+        self._recorded_tick = node.create_publisher(Float64MultiArray, CONTROLLER_TICK, RECORDED_QOS)
+        self._last = 0.0  # tick [s]
         node.create_timer(_MARKER_PERIOD, self._show_distance)
 
     def publish(self, reference: Reference, state: RobotState, now: float, dt: float, decided: float) -> None:
         """Of one tick of ``dt`` at ``now`` [s]; see :func:`publish_in_time`."""
         self._reference = reference
         self._conditions.update(reference.report, state, now)
-        self._report.publish(reference, now, dt, decided)
         self._ticks += 1
-        if self._ticks % self._every == 0:
-            self._publish_safe_targets(now, decided)
+        if self._recorded_tick.get_subscription_count():
+            self._record(reference, now, dt, decided)
+        self._last = now
+        if self._ticks % self._every:
+            return
+        for arm, publisher in self._safe_targets.items():
+            if publisher.get_subscription_count():
+                frame = self._targets.frames[arm]
+                tool = frame.pose.actInv(self._controller.tool_pose(arm))
+                publish_in_time(publisher, stamped_pose(tool, frame.name, now), decided)
 
     def tell_followed(self, follows: Callable[[str], bool]) -> None:
         """Say of each arm whether its targets are followed, when that changes."""
@@ -60,29 +89,116 @@ class ControllerFeedback:
                 self._follows[arm] = followed
                 publisher.publish(Bool(data=followed))
 
-    def _publish_safe_targets(self, now: float, decided: float) -> None:
-        for arm, publisher in self._safe_targets.items():
-            if publisher.get_subscription_count():
-                frame = self._targets.frames[arm]
-                tool = frame.pose.actInv(self._controller.tool_pose(arm))
-                publish_in_time(publisher, stamped_pose(tool, frame.name, now), decided)
-
     def _show_distance(self) -> None:
         if self._reference is not None and self._distances.get_subscription_count():
-            now = self._node.now
             points = self._controller.robot.closest_points(self._reference.q, self._reference.report.closest_pair)
             if points is not None:
-                self._distances.publish(distance_marker(points, now))
+                self._distances.publish(_distance_marker(points, self._node.now))
+
+    def _record(self, reference: Reference, now: float, step: float, decided: float) -> None:
+        """The reference and how it came about."""
+        passed = now - self._last if self._ticks > 1 else step
+        point = JointTrajectoryPoint(
+            positions=reference.q.tolist(), velocities=reference.v.tolist(), accelerations=reference.a.tolist()
+        )
+        message = JointTrajectory(joint_names=list(self._controller.robot.joint_names), points=[point])
+        message.header.stamp = time_message(now)
+        self._recorded_reference.publish(message)
+        report = reference.report
+        # In the order of tick_fields.
+        numbers = (
+            *(self._ticks, now, passed, step, time.monotonic() - decided, report.solve_time),
+            *(_STATUSES.index(report.status), report.certified, report.fallback),
+            *(report.closest_distance, report.margin, report.slack),
+            *(arm in report.rejected for arm in self._targets.topics),
+        )
+        self._recorded_tick.publish(Float64MultiArray(data=[float(number) for number in numbers]))
 
 
-def distance_marker(points: Array, now: float) -> Marker:
-    """A line between two points (2, 3) [m] of the world at ``now`` [s]: green if they are far apart, red if near."""
+def _distance_marker(points: Array, now: float) -> Marker:
     share = float(np.clip((np.linalg.norm(points[1] - points[0]) - _NEAR) / (_FAR - _NEAR), 0.0, 1.0))
     marker = Marker(ns="closest_pair", type=Marker.LINE_LIST, action=Marker.ADD)
     marker.header.frame_id, marker.header.stamp = WORLD, time_message(now)
     marker.pose.orientation.w = 1.0
-    marker.scale.x = _WIDTH
+    marker.scale.x = 0.006
     marker.color = ColorRGBA(r=1.0 - share, g=share, b=0.0, a=1.0)
     marker.points = [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in points]
-    marker.lifetime.sec = _LIFETIME
+    marker.lifetime.sec = 1
     return marker
+
+
+class GripperLimits:
+    """Asks the control loop for openings, and answers with those that it grants."""
+
+    def __init__(self, node: BaseNode, config: Config, loop: ControlLoop, targets: Mapping[str, str]) -> None:
+        """``targets``: topic of the targets of each arm whose gripper may ask."""
+        self._node, self._loop, self._began = node, loop, time.monotonic()
+        robot = loop.controller.robot
+        self._grippers = {
+            str(arm): (robot.arms[arm].finger_joints, each.gripper.closed_position, each.gripper.open_position)
+            for arm, each in config.arms.items()
+            if robot.arms[arm].stroke > 0.0
+        }
+        self._measured: dict[str, tuple[float, float]] = {}  # arm -> opening, and when it was measured [s]
+        self.wanted: dict[str, float] = {}  # arm -> opening, 0 closed .. 1 fully open
+        self._answered: dict[str, tuple[float, float]] = {}
+        self._answers: dict[str, Any] = {}
+        for arm in (arm for arm in targets if arm in self._grippers or arm in robot.objects.by_arm):
+            self._answers[arm] = node.create_publisher(Float64MultiArray, f"~/opening/{arm}", LATCHED_QOS)
+            on_wanted = partial(self._on_wanted, arm)
+            node.create_subscription(Float64MultiArray, wanted_topic(targets[arm]), on_wanted, LATCHED_QOS)
+
+    @property
+    def held(self) -> dict[str, str]:
+        """Arm -> what keeps its gripper from the wanted opening."""
+        openings = self._loop.granted_openings.items()
+        held = {arm: _UNMEASURED for arm, (wanted, granted) in openings if granted != wanted}
+        pairs = self._loop.held_grippers.items()
+        return held | {arm: f"{'|'.join(pair)} would come too close" for arm, pair in pairs}
+
+    def take_joint_state(self, message: JointState) -> None:
+        """Note what a message says of fingers; what it says of other joints is not looked at."""
+        if not self._answers or len(message.position) != len(message.name):
+            return
+        positions = dict(zip(message.name, message.position, strict=True))
+        for arm, (joints, closed, opened) in self._grippers.items():
+            if positions.keys() >= set(joints):
+                position = sum(positions[joint] for joint in joints) / len(joints)
+                self._measured[arm] = (position - closed) / (opened - closed), self._node.now
+
+    def openings(self, now: float) -> dict[str, float]:
+        """Of the arms whose fingers were measured just now, 0 closed .. 1 fully open; a little beyond is possible."""
+        return {
+            arm: opening
+            for arm, (opening, at) in self._measured.items()
+            if now - at <= STREAM_TIMEOUT and math.isfinite(opening)
+        }
+
+    def awaits(self, now: float) -> bool:
+        """Whether the opening of a measured gripper may have been commanded, and is not known here yet.
+
+        Its fingers would count as all of their way: arms that rest near something with closed grippers would back off.
+        """
+        if time.monotonic() - self._began > _DISCOVERY:
+            return False
+        return any(arm in self._answers and arm not in self.wanted for arm in self.openings(now))
+
+    def answer(self) -> None:
+        for arm, answer in self._loop.granted_openings.items():
+            if self._answered.get(arm) != answer:
+                self._answered[arm] = answer
+                self._answers[arm].publish(Float64MultiArray(data=answer))
+
+    def _on_wanted(self, arm: str, message: Float64MultiArray) -> None:
+        told = list(message.data)
+        if len(told) != 2 or not 0.0 <= told[0] <= 1.0 or (told[1] == told[1] and not 0.0 <= told[1] <= 1.0):
+            allowed = "two, wanted and commanded last (or NaN), 0 closed .. 1 open"
+            self._node.get_logger().warning(f"{arm}: openings {told!s:.60} not used; allowed: {allowed}")
+            return
+        wanted, commanded = told
+        if arm not in self.wanted and commanded == commanded:
+            # Asked for before this node began, maybe long ago: the gripper is where it was commanded to be, and stays.
+            now = self._node.now
+            self._loop.resume_gripper(arm, wanted, commanded, self.openings(now), now)
+            self.answer()
+        self.wanted[arm] = wanted

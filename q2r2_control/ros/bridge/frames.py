@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import nanoseconds, pose_of, pose_of_numbers, time_message
-from q2r2_control.ros.monitoring.endpoints import Publishers
+from q2r2_control.ros.monitoring import Publishers
 from q2r2_control.supervision.message_watch import SequenceWatch
 from q2r2_control.supervision.target_stream import apart
 
@@ -40,21 +41,17 @@ class ReadTransform(NamedTuple):
 
 @lru_cache(maxsize=_KEPT)
 def read_transforms(message: bytes) -> Sequence[ReadTransform]:
-    """The transforms in a serialized TFMessage; none where it is no message.
-
-    A robot's message has dozens of transforms, fifty times a second; each is read once for all nodes of a process.
-    """
+    """The transforms in a serialized TFMessage, none where it is no message; read once for all nodes of a process."""
     try:
         transforms = deserialize_message(message, TFMessage).transforms
     except rclpy_implementation.RMWError:
         return ()  # which is some other node's fault
-    return tuple(_read(one) for one in transforms)
-
-
-def _read(transform: TransformStamped) -> ReadTransform:
-    p, o = transform.transform.translation, transform.transform.rotation
-    pose = pose_of_numbers((p.x, p.y, p.z, o.x, o.y, o.z, o.w))
-    return ReadTransform(_name(transform.child_frame_id), _name(transform.header.frame_id), pose)
+    read = []
+    for one in transforms:
+        p, o = one.transform.translation, one.transform.rotation
+        pose = pose_of_numbers((p.x, p.y, p.z, o.x, o.y, o.z, o.w))
+        read.append(ReadTransform(_name(one.child_frame_id), _name(one.header.frame_id), pose))
+    return tuple(read)
 
 
 class Placement(NamedTuple):
@@ -79,34 +76,26 @@ class FrameTree:
 
     def find(self, frame: str, within: str) -> Placement | None:
         """Pose of ``frame`` in ``within``; None if no chain of transforms connects them."""
-        found = self._found.get((frame, within))
-        if found is None and (found := self._search(frame, within)) is not None:
-            self._found[frame, within] = found
-        return found
-
-    def _search(self, frame: str, within: str) -> Placement | None:
-        up = dict(self._upwards(_name(within)))
-        for name, placement in self._upwards(_name(frame)):
+        if (found := self._found.get((frame, within))) is not None:
+            return found
+        up = dict(self.upwards(within))
+        for name, placement in self.upwards(frame):
             if name in up:
-                pose = up[name].pose.inverse() * placement.pose
-                return Placement(pose, min(up[name].received, placement.received))
+                pose, received = up[name].pose.inverse() * placement.pose, min(up[name].received, placement.received)
+                self._found[frame, within] = Placement(pose, received)
+                return self._found[frame, within]
         return None
-
-    def ancestors(self, frame: str) -> list[str]:
-        """The frame, and all those that it hangs on."""
-        return [name for name, _ in self._upwards(_name(frame))]
 
     def moves_far(self, transform: ReadTransform) -> bool:
         """Whether the frame is elsewhere in a transform than it was in the last one."""
         before = self._edges.get(transform.child_frame_id)
         if before is None or transform.pose is None:
             return False
-        distance, angle = apart(before[1].pose, transform.pose)
-        return distance > _SAME[0] or angle > _SAME[1]
+        return any(np.greater(apart(before[1].pose, transform.pose), _SAME))
 
-    def _upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
+    def upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
         """The frame and all its ancestors, with the frame's pose in each; ends also if parents form a ring."""
-        pose, received = pin.SE3.Identity(), math.inf
+        frame, pose, received = _name(frame), pin.SE3.Identity(), math.inf
         seen: set[str] = set()
         while frame not in seen:
             yield frame, Placement(pose, received)
@@ -127,7 +116,7 @@ class FrameListener:
     def __init__(self, node: Any) -> None:
         self.tree = FrameTree()
         self._node = node
-        self._numbers: dict[str, SequenceWatch] = {}  # of the messages that a frame comes in
+        self._numbers: defaultdict[str, SequenceWatch] = defaultdict(SequenceWatch)  # of messages with a frame
         self._publishers = Publishers(node, ["/tf"])
         self._disagree: dict[str, float] = {}  # frames of which two publishers say different things, and when [s]
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -136,27 +125,23 @@ class FrameListener:
 
     def conflict(self, frame: str) -> str | None:
         """One line while two publishers disagree about ``frame`` or what it hangs on."""
-        now = time.monotonic()
-        if not any(now - at <= _REMEMBERED for at in self._disagree.values()):
+        if not self._disagree:
             return None
-        for name in self.tree.ancestors(frame):
+        now = time.monotonic()
+        for name, _ in self.tree.upwards(frame):
             if now - self._disagree.get(name, -math.inf) <= _REMEMBERED:
-                senders = self._publishers.of("/tf")
-                return f"two publishers on /tf say different things of {name}: end one of {senders}"
+                return f"two publishers on /tf say different things of {name}: end one of {self._publishers.of('/tf')}"
         return None
 
     def _take(self, message: bytes, info: Mapping[str, int | None]) -> None:
         received, now, number = self._node.now, time.monotonic(), info["publication_sequence_number"]
         for transform in read_transforms(message):
             frame = transform.child_frame_id
-            if number is not None and self._sent_by_two(frame, number, now) and self.tree.moves_far(transform):
-                self._disagree[frame] = now
+            if number is not None:
+                senders = self._numbers[frame].take(number, now, _PAUSE)
+                if senders >= 2 and self.tree.moves_far(transform):
+                    self._disagree[frame] = now
             self.tree.set(transform, received)
-
-    def _sent_by_two(self, frame: str, number: int, now: float) -> bool:
-        if (watch := self._numbers.get(frame)) is None:
-            watch = self._numbers[frame] = SequenceWatch()
-        return watch.take(number, now, _PAUSE) >= 2
 
     def _take_fixed(self, message: bytes) -> None:
         for transform in read_transforms(message):
@@ -170,7 +155,7 @@ def _name(frame: str) -> str:
 class ToolFrame:
     """The pose of a frame of /tf in the world."""
 
-    def __init__(self, node: BaseNode, tree: FrameTree, frame: str, world: str, timeout: float) -> None:
+    def __init__(self, node: BaseNode, frame: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
         self._publishers = Publishers(node, ["/tf"])
         self.problem: str | None = None
@@ -178,13 +163,14 @@ class ToolFrame:
     def at(self, now: float) -> pin.SE3 | None:
         """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         placement = self._tree.find(self._frame, self._world)
-        self.problem = None
         if placement is None:
             self.problem = f"no transform from {self._frame} to {self._world} on /tf"
-        elif now - placement.received > self._timeout:
-            age = now - placement.received
+        elif (age := now - placement.received) > self._timeout:
             self.problem = f"{self._frame} on /tf{self._publishers.source('/tf')} is {age:.2f} s old"
-        return None if placement is None or self.problem else placement.pose
+        else:
+            self.problem = None
+            return placement.pose
+        return None
 
 
 class PoseTopic:
@@ -199,7 +185,6 @@ class PoseTopic:
         node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 
     def at(self, now: float) -> pin.SE3 | None:
-        """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         if self._newest is None:
             self.problem = f"nothing on {self.topic}"
             return None
@@ -236,21 +221,14 @@ class PoseTopic:
         self._pose = pose_of(message.pose)
 
 
-class LinkFrames:
-    """Links on a joint in ``moving``, all others in ``fixed``: what is on /tf_static is sent once."""
-
-    def __init__(self, model: Any, without: Collection[str]) -> None:
-        """Of a ``mujoco.MjModel``; bodies named in ``without`` are no links."""
-        links = [index for index in range(1, model.nbody) if model.body(index).name not in without]
-        on_joint = [index for index in links if model.body_jntnum[index]]
-        fixed = [index for index in links if not model.body_jntnum[index]]
-        self.moving = _Transforms(model, on_joint)
-        self.fixed = _Transforms(model, fixed)
+def link_transforms(model: Any, without: Collection[str]) -> tuple[LinkTransforms, LinkTransforms]:
+    """Of a ``mujoco.MjModel`` the links on a joint, and all others; bodies named in ``without`` are no links."""
+    links = [index for index in range(1, model.nbody) if model.body(index).name not in without]
+    moving = [index for index in links if model.body_jntnum[index]]
+    return LinkTransforms(model, moving), LinkTransforms(model, [index for index in links if index not in moving])
 
 
-class _Transforms:
-    """Transforms of some bodies."""
-
+class LinkTransforms:
     def __init__(self, model: Any, bodies: list[int]) -> None:
         self._bodies, self._parents = bodies, model.body_parentid[bodies].tolist()
         self._message = TFMessage()

@@ -14,6 +14,10 @@ from std_msgs.msg import Float64MultiArray
 from q2r2_control.config.external import GripperSettings, GripperType
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
 
+_RESULT_TIMEOUT = 10.0  # of a goal [s]
+_ANSWER_TIMEOUT = 1.0  # of the controller that grants openings [s]
+_MOVE_PERIOD, _MOVE_STEP = 0.1, 0.01  # between two goals of a gripper that follows a trigger [s], of the stroke
+
 
 def wanted_topic(target_topic: str) -> str:
     """Where the sender of an arm's targets asks for openings."""
@@ -37,15 +41,12 @@ class OpeningGrants:
 
     @property
     def answered(self) -> bool:
-        """Whether there is a controller that answers."""
         return int(self._node.count_publishers(self._topic)) > 0
 
     @property
     def granted(self) -> float | None:
         """The opening that may be commanded now, on the way to the one that was asked for; None: not answered yet."""
-        if self._answer is None or self._answer[0] != self._wanted:
-            return None
-        return self._answer[1]
+        return None if self._answer is None or self._answer[0] != self._wanted else self._answer[1]
 
     def ask(self, opening: float) -> None:
         """Ask for an opening, until another one is asked for."""
@@ -53,7 +54,6 @@ class OpeningGrants:
         self._tell()
 
     def commanded(self, opening: float) -> None:
-        """Say what the gripper is commanded to."""
         self._commanded = opening
         self._tell()
 
@@ -65,20 +65,12 @@ class OpeningGrants:
             self._answer = message.data[0], message.data[1]
 
 
-_RESULT_TIMEOUT = 10.0  # of a goal [s]
-_ANSWER_TIMEOUT = 1.0  # of the controller that grants openings [s]
-_MOVE_PERIOD, _MOVE_STEP = 0.1, 0.01  # between two goals of a gripper that follows a trigger [s], of the stroke
-
-
 class GripperClient:
     """Opens and closes one gripper; no call waits.
 
-    ``closed`` is the known state of the gripper. It changes with the result of a goal; a gripper that has stalled holds
-    an object, which is success whatever the status of the goal. A topic gives no result, so there it changes with the
-    command. Before the first result the gripper counts as open.
-
-    With ``grants`` it is commanded no farther than the built-in controller allows, on and on until it is where it was
-    asked to be.
+    ``closed`` is its known state, open before the first result. A gripper that has stalled holds an object, which is
+    success whatever the status of the goal. A topic gives no result: there the state changes with the command. With
+    ``grants`` it is commanded no farther than the built-in controller allows, until it is where it was asked to be.
     """
 
     def __init__(self, node: Node, name: str, settings: GripperSettings, grants: OpeningGrants | None = None) -> None:
@@ -95,17 +87,16 @@ class GripperClient:
         self._waits = False  # for more to be granted
         self._closes = False  # it is a smaller one than that of the goal before
         self._goals = 0
-        kind = settings.action_type
         self._publisher = self._client = None
-        if kind is GripperType.FLOAT64_MULTI_ARRAY:
+        if settings.action_type is GripperType.FLOAT64_MULTI_ARRAY:
             self._publisher = node.create_publisher(Float64MultiArray, name, COMMAND_QOS)
         else:
-            self._action = GripperCommand if kind is GripperType.GRIPPER_COMMAND else ParallelGripperCommand
+            simple = settings.action_type is GripperType.GRIPPER_COMMAND
+            self._action = GripperCommand if simple else ParallelGripperCommand
             self._client = ActionClient(node, self._action, name)
 
     @property
     def state(self) -> str:
-        """One word: open, closed, opening or closing."""
         if self._goal_closed is None:
             return "closed" if self.closed else "open"
         return "closing" if self._goal_closed else "opening"
@@ -113,10 +104,8 @@ class GripperClient:
     @property
     def opening(self) -> float:
         """0 closed .. 1 open, as the gripper told with its last goal; 1 before the first, -inf where it cannot tell."""
-        if self._client is None:
-            return -math.inf
-        if self._position is None:
-            return 1.0
+        if self._client is None or self._position is None:
+            return -math.inf if self._client is None else 1.0
         closed, opened = self._settings.closed_position, self._settings.open_position
         return min(max((self._position - closed) / (opened - closed), 0.0), 1.0)
 
@@ -126,7 +115,6 @@ class GripperClient:
         self.command(not closed, now)
 
     def command(self, close: bool, now: float) -> None:
-        """Ask to close or open, see :meth:`move`."""
         self._ask(0.0 if close else 1.0, now)
 
     def move(self, opening: float, now: float) -> None:
@@ -136,10 +124,7 @@ class GripperClient:
             self._ask(opening, now)
 
     def _ask(self, opening: float, now: float) -> None:
-        """Ask for an opening. If there is no server, ``problem`` says so and the request is dropped.
-
-        It is not kept for later: a gripper that moves when its server starts would be a surprise.
-        """
+        """Ask for an opening; without a server ``problem`` says so, and nothing is kept for later."""
         self._closes = opening < self._asked or (opening == self._asked and self._closes)
         self.holds = self.holds and self._closes
         self.problem, self._asked, self._sent, self._waits = None, opening, now, False
@@ -178,17 +163,14 @@ class GripperClient:
         return self._client is None or self._client.server_is_ready()
 
     def _give_up(self, why: str) -> None:
-        """Go no farther."""
         self._end(f"{self._name} goes no farther: {why}")
         self._ask_to_stay()
 
     def _ask_to_stay(self) -> None:
-        """What was asked for is not wanted any more."""
         if self._grants is not None and self._commanded is not None:
             self._grants.ask(self._commanded)
 
     def _command(self, opening: float, now: float) -> None:
-        """Send a goal, or a message."""
         self._commanded, self._commanded_at, self._begins, settings = opening, now, False, self._settings
         if self._grants is not None:
             self._grants.commanded(opening)
@@ -198,8 +180,7 @@ class GripperClient:
             self.closed = self._asked < 0.5
             return
         assert self._client is not None
-        self._goals += 1
-        number = self._goals
+        self._goals = number = self._goals + 1
         answer = self._client.send_goal_async(
             self._goal(position), feedback_callback=lambda told: self._note(told.feedback)
         )
@@ -213,14 +194,12 @@ class GripperClient:
             self._end(f"no result from {self._name} for {_RESULT_TIMEOUT:g} s")
 
     def _goal(self, position: float) -> Any:
-        goal = self._action.Goal()
+        goal, effort = self._action.Goal(), self._settings.max_effort
         if self._action is GripperCommand:
-            goal.command.position = position
-            goal.command.max_effort = self._settings.max_effort
+            goal.command.position, goal.command.max_effort = position, effort
         else:
             goal.command.name = [self._settings.joint_name]
-            goal.command.position = [position]
-            goal.command.effort = [self._settings.max_effort]
+            goal.command.position, goal.command.effort = [position], [effort]
         return goal
 
     def _answered(self, handle: Any, number: int) -> None:
@@ -244,11 +223,7 @@ class GripperClient:
         else:
             self._end(f"{self._name} ended with status {answer.status}, neither stalled nor at its goal")
 
-    def _hear(self, message: Any) -> None:
-        self._note(message.feedback)
-
     def _note(self, told: Any) -> None:
-        """Where the gripper is, of a feedback or a result."""
         if self._action is GripperCommand:
             self._position = float(told.position)
         elif len(told.state.position):

@@ -10,43 +10,27 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped, Twist
 from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
 from q2r2_control.recording.ros_topics import RECORDER
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import (
-    age,
-    hand_inputs,
-    hand_pose,
-    hand_pose_message,
-    hand_sample,
-    hand_twist,
-    hand_twist_message,
-    inputs_message,
-)
-from q2r2_control.ros.monitoring.endpoints import Publishers, node_of
-from q2r2_control.types import SIDES, HandSample, HapticFeedback
+from q2r2_control.ros.bridge import messages as convert
+from q2r2_control.ros.monitoring import Publishers, node_of
+from q2r2_control.types import SIDES, HandInputs, HandSample, HapticFeedback
 
-# Reliable, so that any subscriber matches: a best-effort publisher does not match reliable subscribers.
-PUBLISHED_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=10,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
+_DEPTH = 10  # of publishers that are reliable, so that any subscriber matches
 _TYPES = {MessageType.POSE: PoseStamped, MessageType.TWIST: Twist, MessageType.INPUTS: OVR2ROSInputs}
 _READERS: dict[MessageType, Callable[[Any], HandMessage]] = {
-    MessageType.POSE: hand_pose,
-    MessageType.TWIST: hand_twist,
-    MessageType.INPUTS: hand_inputs,
+    MessageType.POSE: convert.hand_pose,
+    MessageType.TWIST: convert.hand_twist,
+    MessageType.INPUTS: convert.hand_inputs,
 }
 
 
 class HandPublishers:
-    """Publishes the messages of a headset on topics of the same names. May be used by any single thread."""
+    """Publishes the messages of a headset on topics of the same names; used by one thread."""
 
     def __init__(self, node: Node, hands: Iterable[str] = SIDES, kinds: Iterable[MessageType] = tuple(_TYPES)) -> None:
         self._node = node
@@ -54,7 +38,7 @@ class HandPublishers:
         topics = {name: topic for name, topic in HAND_TOPICS.items() if (topic.hand, topic.kind) in wanted}
         self._topics = {(topic.hand, topic.kind): name for name, topic in topics.items()}
         self._publishers = {
-            name: node.create_publisher(_TYPES[topic.kind], name, PUBLISHED_QOS) for name, topic in topics.items()
+            name: node.create_publisher(_TYPES[topic.kind], name, _DEPTH) for name, topic in topics.items()
         }
         self.sent: dict[str, int] = {publisher.topic_name: 0 for publisher in self._publishers.values()}
 
@@ -63,11 +47,11 @@ class HandPublishers:
         publisher = self._publishers[topic]
         self.sent[publisher.topic_name] += 1
         if isinstance(message, HandPose):
-            publisher.publish(hand_pose_message(message, frame, t))
+            publisher.publish(convert.hand_pose_message(message, frame, t))
         elif isinstance(message, HandTwist):
-            publisher.publish(hand_twist_message(message))
+            publisher.publish(convert.hand_twist_message(message))
         else:
-            publisher.publish(inputs_message(message))
+            publisher.publish(convert.inputs_message(message))
 
     def publish_sample(self, sample: HandSample, frame: str = "", twist: HandTwist | None = None) -> None:
         """Publish a sample's messages on those topics that there are; a pose with a fault is left out."""
@@ -83,8 +67,6 @@ class HandPublishers:
         """How many subscribers the topics of ``hand`` have, a recorder aside."""
         publishers = [publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand]
         matched = sum(publisher.get_subscription_count() for publisher in publishers)
-        if not matched:
-            return 0
         listed = (self._node.get_subscriptions_info_by_topic(publisher.topic_name) for publisher in publishers)
         return min(matched, sum(node_of(info) not in (None, RECORDER) for infos in listed for info in infos))
 
@@ -101,7 +83,6 @@ def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None])
 
 
 def subscribe_to_haptics(node: Node, vibrate: Callable[[HapticFeedback], None]) -> None:
-    """Call ``vibrate`` with what either hand is to feel."""
     for hand, topic in HAPTIC_TOPICS.items():
 
         def feel(message: OVR2ROSHapticFeedback, hand: str = hand) -> None:
@@ -136,8 +117,8 @@ class HandIntake:
         """Take what this hand sends from now on; nothing that came before counts."""
         self.hand = hand
         self._samples.take()
-        self._pose: tuple[PoseStamped, float] | None = None
-        self._inputs: tuple[OVR2ROSInputs | None, float] = (None, -math.inf)
+        self._pose: tuple[HandPose, float] | None = None
+        self._inputs = HandInputs(), -math.inf
         if hand in self._publishers:
             return
         self._publishers[hand] = Publishers(self._node, (_topic(hand, "pose"), _topic(hand, "inputs")))
@@ -147,17 +128,14 @@ class HandIntake:
             self._node.create_subscription(kind, _topic(hand, what), take, STREAM_QOS)
 
     def put_pose(self, message: PoseStamped) -> None:
-        """Take a pose of the hand."""
-        self._pose = message, self._received
+        self._pose = convert.hand_pose(message), self._received
         self._put()
 
     def put_inputs(self, message: OVR2ROSInputs) -> None:
-        """Take buttons, triggers and stick of the hand."""
-        self._inputs = message, self._received
+        self._inputs = convert.hand_inputs(message), self._received
         self._put()
 
     def take(self) -> list[HandSample]:
-        """All samples since the last call, oldest first."""
         return self._samples.take()
 
     @property
@@ -172,24 +150,24 @@ class HandIntake:
         if not missing:
             return None
         first = next(iter(missing))
-        what = "data" if len(missing) == len(ages) else {"pose": "pose", "inputs": "button data"}[first]
+        what = "data" if len(missing) == len(ages) else "pose" if first == "pose" else "button data"
         source = self._publishers[self.hand].source(_topic(self.hand, first))
         age = min(missing.values())
         return f"no {what} of the {self.hand} hand{source} " + (f"for {age:.2f} s" if age < math.inf else "yet")
 
     def feel(self, pulse: HapticFeedback) -> None:
-        """Let a hand that drives this arm, or did, feel something."""
-        message = OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude)
-        self._haptics[pulse.hand].publish(message)
+        feedback = OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude)
+        self._haptics[pulse.hand].publish(feedback)
 
     def _take(self, hand: str, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
         if hand == self.hand:
-            self._received = self._node.now - age(info)
+            self._received = self._node.now - convert.age(info)
             callback(message)
 
     def _put(self) -> None:
         if self._pose is not None:
-            self._samples.put(hand_sample(self.hand, *self._pose, *self._inputs))
+            pose, stamp = self._pose
+            self._samples.put(HandSample(self.hand, pose.position, pose.quaternion, stamp, *self._inputs))
 
 
 def _topic(hand: str, what: str) -> str:

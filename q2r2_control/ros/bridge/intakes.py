@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -22,7 +22,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.joint_outputs import joints_of
 from q2r2_control.ros.bridge.messages import age, delay, ended_topic, nanoseconds, pose_of, robot_state
-from q2r2_control.ros.monitoring.endpoints import Publishers
+from q2r2_control.ros.monitoring import Publishers
 from q2r2_control.supervision.message_watch import DelayWatch
 from q2r2_control.types import Array, RobotState
 from q2r2_control.wording import sentence
@@ -32,10 +32,10 @@ _WARNING_TIME = 1.0  # refused targets are reported for this long [s]
 # Takes an arm's target in the world frame, or None if it is no pose, the time [s], the message's number, and when the
 # target is due [s], or None.
 Take = Callable[[str, pin.SE3 | None, float, int | None, float | None], Reason | None]
+TakeState = Callable[[RobotState | Reason, float], None]
 
 
-@dataclass(frozen=True, slots=True)
-class TargetFrame:
+class TargetFrame(NamedTuple):
     """The frame of target poses."""
 
     name: str
@@ -65,10 +65,10 @@ class TargetIntake:
         for arm, topic in self.topics.items():
             on_target = partial(self._on_target, take, arm)
             self._node.create_subscription(PoseStamped, topic, on_target, COMMAND_QOS)
-            self._node.create_subscription(Empty, ended_topic(topic), partial(_on_end, release, arm), COMMAND_QOS)
+            on_end = partial(lambda arm, _: release(arm), arm)
+            self._node.create_subscription(Empty, ended_topic(topic), on_end, COMMAND_QOS)
 
     def source(self, arm: str) -> str:
-        """The nodes that publish an arm's targets, for the middle of a sentence."""
         return self.publishers.source(self.topics[arm])
 
     def faults(self) -> list[str]:
@@ -96,10 +96,7 @@ class TargetIntake:
             self._refused.pop(arm, None)
 
     def _due(self, arm: str, made: int, received: float) -> float | None:
-        """When a target is due that was received then [s], by its stamp [ns]; None where the stamp does not say.
-
-        What is made once a tick is sent a little later at one tick than at another.
-        """
+        """When a target is due that was received then [s], by its stamp [ns]; None where the stamp does not say."""
         stamp, stamps = 1e-9 * made, self._stamps[arm]
         known = stamp > 0.0 and stamps.take(received - stamp, received) == 0.0
         return stamp + stamps.usual if known else None
@@ -114,18 +111,10 @@ class TargetIntake:
             self._changed()
 
 
-def _on_end(release: Callable[[str], None], arm: str, _: Empty) -> None:
-    release(arm)
-
-
 def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
     """An arm's frame of targets. Raises :class:`ConfigError` for a link that moves."""
-    name = node.parameter(
-        f"{arm}.target_frame_id",
-        WORLD,
-        "frame_id that targets have to have: a link that does not move, or any other name for the cell's world",
-    )
-    model = robot.model
+    what = "frame_id that targets have to have: a link that does not move, or any other name for the cell's world"
+    name, model = node.parameter(f"{arm}.target_frame_id", WORLD, what), robot.model
     if name == WORLD or not model.existFrame(name, pin.FrameType.BODY):
         return TargetFrame(name, pin.SE3.Identity())
     frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
@@ -135,10 +124,7 @@ def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
 
 
 class JointIntake:
-    """Makes one state of all arms from joint states on one topic, or on one topic for each arm.
-
-    The state is as old as the oldest of its parts.
-    """
+    """Makes one state of all arms from joint states on one topic or several; it is as old as its oldest part."""
 
     def __init__(self, node: BaseNode, robot: Robot, needs_external_torque: bool = False) -> None:
         """``needs_external_torque``: no state is good without it. Raises :class:`ConfigError` without its topic."""
@@ -161,11 +147,8 @@ class JointIntake:
         self._values = np.zeros((3, len(robot.joint_names)))
         self.state: RobotState | None = None  # the newest of all arms
 
-    def subscribe(self, take: Callable[[RobotState | Reason, float], None], look: Callable[[JointState], None]) -> None:
-        """Pass each state of all arms, or what is wrong with a message, to ``take``, with the time [s].
-
-        ``look`` gets every message as it is first: there may be fingers in it.
-        """
+    def subscribe(self, take: TakeState, look: Callable[[JointState], None]) -> None:
+        """Pass states of all arms, or what is wrong, to ``take`` with the time [s], and each message to ``look``."""
         for topic in self._topics:
             on_message = partial(self._on_message, take, look, topic)
             self._node.create_subscription(JointState, topic, on_message, STREAM_QOS)
@@ -178,15 +161,9 @@ class JointIntake:
         where = f" on {topic}" if len(self._topics) > 1 else ""
         return self._publishers.source(topic) + where
 
-    def _on_message(
-        self,
-        take: Callable[[RobotState | Reason, float], None],
-        look: Callable[[JointState], None],
-        topic: str,
-        message: JointState,
-    ) -> None:
+    def _on_message(self, take: TakeState, look: Callable[[JointState], None], topic: str, message: JointState) -> None:
         look(message)
-        joints, names = self._joints[topic], self._names[topic]
+        names = self._names[topic]
         if set(names).isdisjoint(message.name):
             return  # of a gripper or another robot
         now = self._node.now
@@ -197,20 +174,20 @@ class JointIntake:
             return
         self._stamps[topic] = now
         oldest = min(self._stamps.values())
-        self._values[:, joints] = part.q, part.v, part.tau
+        self._values[:, self._joints[topic]] = part.q, part.v, part.tau
         q, v, tau = self._values.copy()
-        if oldest > -math.inf:
-            silent = now - self._external_stamp > STREAM_TIMEOUT
-            external = None if silent else self._external
-            self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest)
-            if silent and self._needs_external_torque:
-                take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=f"no external torques on {self._external_topic}"), now)
-            else:
-                take(self.state, now)
+        if oldest == -math.inf:
+            return
+        silent = now - self._external_stamp > STREAM_TIMEOUT
+        self.state = RobotState(q=q, v=v, tau=tau, tau_external=None if silent else self._external, stamp=oldest)
+        if silent and self._needs_external_torque:
+            take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=f"no external torques on {self._external_topic}"), now)
+        else:
+            take(self.state, now)
 
     def _on_external(self, message: JointState) -> None:
-        columns = {name: index for index, name in enumerate(message.name)}
-        if len(message.effort) == len(message.name) and all(name in columns for name in self._joint_names):
-            torques = np.array([message.effort[columns[name]] for name in self._joint_names])
+        if len(message.effort) == len(message.name) and set(message.name) >= set(self._joint_names):
+            effort = dict(zip(message.name, message.effort, strict=True))
+            torques = np.array([effort[name] for name in self._joint_names])
             if np.isfinite(torques).all():
                 self._external, self._external_stamp = torques, self._node.now

@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -23,11 +22,10 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.messages import joint_state_message
-from q2r2_control.ros.monitoring.endpoints import CommandWatch, WatchedPublisher
+from q2r2_control.ros.monitoring import CommandWatch, WatchedPublisher
 from q2r2_control.types import Command, CommandMode, RobotState
 
 NONE = "none"
-_LBR_JOINTS = 7
 
 
 class Kind(ABC):
@@ -36,18 +34,14 @@ class Kind(ABC):
     topic: ClassVar[str]  # where no other is asked for
     mode = CommandMode.POSITION  # of the drive whose commands it carries
     joints_each: int | None = None  # that a message has to have; None: any number
-    message: type  # of ROS
+    message: Any  # its type
 
     def __init__(self, period: float, robot: Robot) -> None:
-        self._due = Duration(sec=int(period), nanosec=int(1e9 * (period % 1.0)))
-        self._model = robot.model
+        self._due, self._model = Duration(sec=int(period), nanosec=int(1e9 * (period % 1.0))), robot.model
 
     @abstractmethod
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
-        """A message about the joints with these names and velocity indices.
-
-        ``command`` was made for ``state`` at ``t`` [s] of the node's clock.
-        """
+        """A message about the joints with these names and velocity indices; ``t``: of the node's clock [s]."""
 
 
 class TrajectoryOutput(Kind):
@@ -59,34 +53,28 @@ class TrajectoryOutput(Kind):
     def encode(
         self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray
     ) -> JointTrajectory:
-        """See :class:`Kind`. A stamp of 0 means now, whatever the receiver's clock says."""
         q, v = command.q[joints].tolist(), command.v[joints].tolist()
         point = JointTrajectoryPoint(positions=q, velocities=v, time_from_start=self._due)
-        return JointTrajectory(joint_names=names, points=[point])
+        return JointTrajectory(joint_names=names, points=[point])  # stamp 0 is now, whatever the receiver's clock says
 
 
 class PositionArray(Kind):
-    """Float64MultiArray of positions in the order of the joints, as forward_command_controller takes them."""
+    """Float64MultiArray in the order of the joints, as forward_command_controller takes them."""
 
     topic = "position_commands"
     message = Float64MultiArray
     field: ClassVar[str] = "q"
 
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
-        """See :class:`Kind`."""
         return Float64MultiArray(data=getattr(command, self.field)[joints].tolist())
 
 
 class VelocityArray(PositionArray):
-    """Float64MultiArray of velocities, as a velocity forward_command_controller takes them."""
-
     topic, mode, field = "velocity_commands", CommandMode.VELOCITY, "v"
 
 
 class TorqueArray(PositionArray):
-    """Float64MultiArray of torques; gravity and Coriolis are in them."""
-
-    topic, mode, field = "torque_commands", CommandMode.TORQUE, "tau"
+    topic, mode, field = "torque_commands", CommandMode.TORQUE, "tau"  # gravity and Coriolis are in them
 
 
 class JointStates(Kind):
@@ -96,43 +84,38 @@ class JointStates(Kind):
     message = JointState
 
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
-        """See :class:`Kind`."""
-        q, v = command.q[joints], command.v[joints]
-        return joint_state_message(names, q, v, np.zeros(0), t)
+        return joint_state_message(names, command.q[joints], command.v[joints], np.zeros(0), t)
 
 
 class LbrPosition(Kind):
     """LBRJointPositionCommand of lbr_fri_idl, one topic an arm."""
 
-    topic, joints_each = "/{arm}/command/joint_position", _LBR_JOINTS
+    topic, joints_each = "/{arm}/command/joint_position", 7
+    type_name = "LBRJointPositionCommand"
 
     def __init__(self, period: float, robot: Robot) -> None:
         super().__init__(period, robot)
-        self.message = _lbr_message("LBRJointPositionCommand")
+        self.message = _lbr_message(self.type_name)
 
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
-        """See :class:`Kind`."""
         return self.message(joint_position=command.q[joints].tolist())
 
 
-class LbrTorque(Kind):
+class LbrTorque(LbrPosition):
     """LBRTorqueCommand of lbr_fri_idl: torques without gravity, which the KUKA bears itself.
 
     Each carries the measured position, since the driver ignores torques beside a position that is NaN.
     """
 
-    topic, mode, joints_each = "/{arm}/command/torque", CommandMode.TORQUE, _LBR_JOINTS
+    topic, mode, type_name = "/{arm}/command/torque", CommandMode.TORQUE, "LBRTorqueCommand"
 
     def __init__(self, period: float, robot: Robot) -> None:
         super().__init__(period, robot)
-        self.message = _lbr_message("LBRTorqueCommand")
         self._data = robot.model.createData()
 
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
-        """See :class:`Kind`."""
-        q = state.q
-        overlay = command.tau - pin.computeGeneralizedGravity(self._model, self._data, q)
-        return self.message(joint_position=q[joints].tolist(), torque=overlay[joints].tolist())
+        overlay = command.tau - pin.computeGeneralizedGravity(self._model, self._data, state.q)
+        return self.message(joint_position=state.q[joints].tolist(), torque=overlay[joints].tolist())
 
 
 KINDS: dict[str, type[Kind]] = {
@@ -147,7 +130,6 @@ KINDS: dict[str, type[Kind]] = {
 
 
 def _lbr_message(name: str) -> Any:
-    """A message type of lbr_fri_idl. Raises :class:`ConfigError` where that package is not to be had."""
     try:
         return getattr(import_module("lbr_fri_idl.msg"), name)
     except (ImportError, AttributeError) as error:
@@ -157,11 +139,7 @@ def _lbr_message(name: str) -> Any:
         ) from error
 
 
-_ARM = "{arm}"  # where an arm's name goes in a topic
-
-
-@dataclass(frozen=True, slots=True)
-class Channel:
+class Channel(NamedTuple):
     """One topic and the joints that its messages are about."""
 
     names: list[str]
@@ -173,12 +151,9 @@ class JointOutput:
     """Where references go. Without channels, ``output: none``, another controller moves the arms."""
 
     def __init__(self, drive: Drive, kind: Kind, channels: list[Channel]) -> None:
-        self.drive = drive
-        self._kind, self._channels = kind, channels
-        self._listeners = 0
+        self.drive, self._kind, self._channels, self._listeners = drive, kind, channels, 0
 
     def watch(self, node: BaseNode) -> CommandWatch:
-        """What tells whether another node sends such commands."""
         return CommandWatch(node, self._kind.message, [channel.publisher.topic_name for channel in self._channels])
 
     def send(self, command: Command, state: RobotState, t: float, decided: float) -> None:
@@ -189,22 +164,20 @@ class JointOutput:
 
     @property
     def sent(self) -> dict[str, int]:
-        """How many messages went out on each topic."""
         return {channel.publisher.topic_name: channel.publisher.sent for channel in self._channels}
 
     def end(self, state: RobotState, t: float) -> None:
-        """What holds the arms where no more commands come, for drives that need it."""
+        """Send what holds the arms where no more commands come, for drives that need it."""
         command = self.drive.last_command(state, {})
         if command is not None and command.mode is self.drive.mode:
             self.send(command, state, t, time.monotonic())
 
     def waits(self) -> bool:
-        """Whether nothing should be sent now, so that the last command can be acknowledged; to be asked once a tick.
+        """Whether nothing should be sent in this tick, so that the last command can be acknowledged.
 
         The reference must not go on meanwhile: it would leave as one jump afterwards.
         """
-        waiting = [channel.publisher.waits() for channel in self._channels]  # asked all: each has a gap of its own
-        return True in waiting
+        return True in [channel.publisher.waits() for channel in self._channels]  # all are asked: each has its own gap
 
     def listener_fault(self, off_reference: bool) -> str | None:
         """One line where what took the commands is gone, or is not alone any more; to be asked before each is sent.
@@ -228,20 +201,10 @@ def joints_of(robot: Robot, arms: Iterable[str]) -> np.ndarray:
     return np.unique(np.concatenate([robot.arms[arm].joints for arm in arms]))
 
 
-def output_name(node: BaseNode) -> str:
-    """Declare the parameter ``output`` and return it."""
-    allowed = (*KINDS, NONE)
-    name: str = node.parameter("output", "trajectory", "what the arms are commanded with", one_of=allowed)
-    return name
-
-
 def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period: float) -> JointOutput:
-    """The output called ``name`` on the topics that the parameters ask for; ``period`` [s] of the control loop.
-
-    Raises :class:`ConfigError`.
-    """
+    """The output called ``name`` on its parameters' topics; ``period`` of the loop [s]. Raises :class:`ConfigError`."""
     what = "arms that do not follow and whose joint positions nobody acknowledges are given up after [s]"
-    listener_timeout = node.parameter("listener_timeout", STREAM_TIMEOUT, what, within=(0.1, 5.0))
+    timeout = node.parameter("listener_timeout", STREAM_TIMEOUT, what, within=(0.1, 5.0))
     topics = _topics(name, node, robot)
     if name == NONE:
         return JointOutput(make_drive(CommandMode.POSITION, robot, config), KINDS["trajectory"](period, robot), [])
@@ -256,16 +219,16 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
                 f"output: {topic} carries {len(names)} joints; {name} has {kind.joints_each} a message, and each arm "
                 "needs a topic of its own"
             )
-        channels.append(Channel(names, joints, WatchedPublisher(node, kind.message, topic, listener_timeout)))
+        channels.append(Channel(names, joints, WatchedPublisher(node, kind.message, topic, timeout)))
     return JointOutput(drive, kind, channels)
 
 
 def _topics(name: str, node: BaseNode, robot: Robot) -> dict[str, str]:
     """The topic that carries each arm's joints; arms with the same one share its messages."""
-    what = f"joint commands of all arms, {_ARM} stands for an arm's name; \"\": the output's usual one"
+    what = "joint commands of all arms, {arm} stands for an arm's name; \"\": the output's usual one"
     shared = node.parameter("output_topic", "", what) or ("" if name == NONE else KINDS[name].topic)
     topics: dict[str, str] = {}
     for arm in robot.arms:
         its = node.parameter(f"{arm}.output_topic", "", 'joint commands of this arm alone; "": output_topic')
-        topics[arm] = (its or shared).replace(_ARM, arm)
+        topics[arm] = (its or shared).replace("{arm}", arm)
     return topics

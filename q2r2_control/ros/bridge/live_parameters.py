@@ -1,14 +1,10 @@
-"""Settings that change while a node runs: by ``ros2 param set``, rqt, or a service of rcl_interfaces.
-
-What is set together is one change, which is done as a whole or not at all, with the reason.
-"""
+"""Settings that change while a node runs. What is set together is done as a whole or not at all, with the reason."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
@@ -17,7 +13,7 @@ from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.ros.base_node import BaseNode
-from q2r2_control.ros.bridge.parameters import Model, may_be_none, none_of_zero, range_of, stance_of, validated
+from q2r2_control.ros.bridge.parameters import Model, may_be_none, range_of, stance_of, validated
 
 if TYPE_CHECKING:  # arms' nodes have no controller, and need not wait for its kernels
     from q2r2_control.compliance.impedance import ImpedanceController
@@ -42,7 +38,6 @@ _WATCH: _Table = (
 _EXTERNAL: _Table = (
     ("tolerance", "distance_tolerance", "output none: measured pairs may be closer than min_distance [m]", 0.0, 0.1),
 )
-_DONE = SetParametersResult(successful=True)
 _MIRROR = ("mirror", "mirror_reflected")
 
 
@@ -62,22 +57,18 @@ class LiveArmParameters:
 
     def _on_set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         changes = {one.name: one.value for one in parameters}
-        teleop_changes, guard_changes = _within("teleop", changes), _within("guard", changes)
-        mirror = {name: value for name, value in changes.items() if name in _MIRROR}
-        if not (teleop_changes or guard_changes or mirror):
-            return _DONE
+        if not any(is_of_teleop(name) or name.startswith("guard.") for name in changes):
+            return SetParametersResult(successful=True)
         try:
-            teleop = _changed(self._teleop, "teleop", teleop_changes)
-            if mirror:
-                wanted = [bool(mirror.get(name, self._node.get_parameter(name).value)) for name in _MIRROR]
-                teleop = teleop.model_copy(update={"stance": stance_of(*wanted)})
-            guard = _changed(self._guard, "guard", guard_changes)
+            mirror = [bool(changes.get(name, self._node.get_parameter(name).value)) for name in _MIRROR]
+            teleop = _changed(self._teleop, "teleop", changes).model_copy(update={"stance": stance_of(*mirror)})
+            guard = _changed(self._guard, "guard", changes)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if (problem := self._apply(teleop, guard)) is not None:
             return SetParametersResult(successful=False, reason=f"{', '.join(changes)}: {problem}")
         self._teleop, self._guard = teleop, guard
-        return _DONE
+        return SetParametersResult(successful=True)
 
 
 def make_control_live(node: BaseNode, controller: CartesianController) -> None:
@@ -92,7 +83,7 @@ def make_control_live(node: BaseNode, controller: CartesianController) -> None:
     def on_set(parameters: Sequence[Parameter]) -> SetParametersResult:
         values = _within("control", {one.name: one.value for one in parameters})
         problem = controller.change(values) if values else None
-        return _DONE if problem is None else SetParametersResult(successful=False, reason=problem)
+        return SetParametersResult(successful=problem is None, reason=problem or "")
 
     node.add_on_set_parameters_callback(on_set)
 
@@ -141,21 +132,17 @@ def is_of_teleop(name: str) -> bool:
 
 
 def _within(prefix: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Of ``changes`` those of names under ``prefix``, without it."""
     begin = f"{prefix}."
     return {name.removeprefix(begin): value for name, value in changes.items() if name.startswith(begin)}
 
 
 def _changed(settings: Model, prefix: str, changes: Mapping[str, Any]) -> Model:
-    """The same settings with some fields changed. Raises :class:`ConfigError` that names the parameter."""
+    """The same settings with those changed that are under ``prefix``. Raises :class:`ConfigError`."""
     values = settings.model_dump()
-    for name, value in changes.items():
-        _put(values, type(settings), name.split("."), value)
+    for name, value in _within(prefix, changes).items():
+        *path, last = name.split(".")  # the parameter was declared from the model, so the field is there
+        part, model = values, type(settings)
+        for each in path:
+            part, model = part[each], model.model_fields[each].annotation  # type: ignore[assignment]
+        part[last] = value or None if may_be_none(model.model_fields[last]) else value
     return validated(type(settings), prefix, values)
-
-
-def _put(values: dict[str, Any], model: type[BaseModel], path: Sequence[str], value: Any) -> None:
-    """Set one field of nested values; the parameter was declared from the model, so the field is there."""
-    for name in path[:-1]:
-        values, model = values[name], model.model_fields[name].annotation  # type: ignore[assignment]
-    values[path[-1]] = none_of_zero(value) if may_be_none(model.model_fields[path[-1]]) else value

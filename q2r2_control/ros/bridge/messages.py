@@ -1,8 +1,4 @@
-"""Conversion between ROS messages and the dataclasses of ``types.py``, and nothing else.
-
-Joints are matched by name, never by order. Stamps of messages are the sender's clock and stay with the message; times
-inside are receipt times on the node's own clock, given in seconds.
-"""
+"""Conversion between ROS messages and the dataclasses of ``types.py``; times inside are receipt times [s]."""
 
 from __future__ import annotations
 
@@ -20,7 +16,7 @@ from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
 from q2r2_control.inputs.messages import HandPose, HandTwist
-from q2r2_control.types import Array, HandInputs, HandSample, RobotState
+from q2r2_control.types import Array, HandInputs, RobotState
 
 _UNIT = 1e-3  # a quaternion's norm may be off by this
 _OLDEST = 0.1  # a message waits for the next tick, and no longer: more is a clock that was set [s]
@@ -37,7 +33,6 @@ def seconds(stamp: Time) -> float:
 
 
 def nanoseconds(stamp: Time) -> int:
-    """The same in nanoseconds, exactly."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
@@ -47,18 +42,15 @@ def age(info: Mapping[str, Any]) -> float:
 
 
 def delay(info: Mapping[str, Any]) -> float:
-    """How long a message took from being sent to being received [s], by the clocks of the two hosts.
-
-    Not finite where the middleware does not know.
-    """
+    """How long a message was on its way [s], by the clocks of both hosts; NaN where the middleware does not know."""
     sent, received = int(info["source_timestamp"]), int(info["received_timestamp"])
     return (received - sent) * 1e-9 if sent and received else math.nan
 
 
 def time_message(t: float) -> Time:
     """``t`` [s] as a stamp; not negative."""
-    whole = math.floor(max(t, 0.0))
-    return Time(sec=int(whole), nanosec=min(round((max(t, 0.0) - whole) * 1e9), 999_999_999))
+    whole, part = divmod(max(t, 0.0), 1.0)
+    return Time(sec=int(whole), nanosec=min(round(part * 1e9), 999_999_999))
 
 
 def pose_message(pose: pin.SE3) -> Pose:
@@ -71,8 +63,7 @@ def pose_message(pose: pin.SE3) -> Pose:
 def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
     """A pose in ``frame`` at ``t`` [s]."""
     message = PoseStamped(pose=pose_message(pose))
-    message.header.frame_id = frame
-    message.header.stamp = time_message(t)
+    message.header.frame_id, message.header.stamp = frame, time_message(t)
     return message
 
 
@@ -84,31 +75,16 @@ def pose_of(message: Pose) -> pin.SE3 | None:
 
 def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
     """The pose of a position and a quaternion x y z w; None as in :func:`pose_of`."""
+    norm = math.hypot(*numbers[3:])
     # A sum or a norm with NaN or infinity in it is not finite.
-    if not (math.isfinite(sum(numbers[:3])) and abs(math.hypot(*numbers[3:]) - 1.0) <= _UNIT):
+    if not (math.isfinite(sum(numbers[:3])) and abs(norm - 1.0) <= _UNIT):
         return None
     pose = np.array(numbers)
-    pose[3:] /= math.hypot(*numbers[3:])
+    pose[3:] /= norm
     return pin.XYZQUATToSE3(pose)
 
 
-def hand_sample(
-    hand: str, pose: PoseStamped, pose_stamp: float, inputs: OVR2ROSInputs | None, inputs_stamp: float
-) -> HandSample:
-    """One reading of a hand, unchecked, from its newest messages and their receipt times [s]."""
-    placed = hand_pose(pose)
-    return HandSample(
-        hand=hand,
-        position=placed.position,
-        quaternion=placed.quaternion,
-        pose_stamp=pose_stamp,
-        inputs=HandInputs() if inputs is None else hand_inputs(inputs),
-        inputs_stamp=inputs_stamp,
-    )
-
-
 def hand_pose(message: PoseStamped) -> HandPose:
-    """A hand's pose, unchecked."""
     p, o = message.pose.position, message.pose.orientation
     return HandPose(
         position=np.array([p.x, p.y, p.z]),
@@ -120,12 +96,10 @@ def hand_pose(message: PoseStamped) -> HandPose:
 
 def hand_pose_message(pose: HandPose, frame: str, t: float) -> PoseStamped:
     """The same as a message in ``frame`` at ``t`` [s], all numbers as they are: the quaternion may be no unit one."""
-    message = PoseStamped()
-    message.header.frame_id = frame
-    message.header.stamp = time_message(t)
-    position, orientation = message.pose.position, message.pose.orientation
-    position.x, position.y, position.z = pose.position.tolist()
-    orientation.x, orientation.y, orientation.z, orientation.w = pose.quaternion.tolist()
+    x, y, z = pose.position.tolist()
+    qx, qy, qz, qw = pose.quaternion.tolist()
+    message = PoseStamped(pose=Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw)))
+    message.header.frame_id, message.header.stamp = frame, time_message(t)
     return message
 
 
@@ -135,18 +109,15 @@ def hand_twist(message: Twist) -> HandTwist:
 
 
 def hand_twist_message(twist: HandTwist) -> Twist:
-    """The same as a message."""
     linear, angular = (Vector3(x=v[0], y=v[1], z=v[2]) for v in (twist.linear.tolist(), twist.angular.tolist()))
     return Twist(linear=linear, angular=angular)
 
 
 def hand_inputs(message: OVR2ROSInputs) -> HandInputs:
-    """Buttons, triggers and stick of one hand."""
     return HandInputs(**{name: getattr(message, name) for name in HandInputs.__slots__})
 
 
 def inputs_message(inputs: HandInputs) -> OVR2ROSInputs:
-    """The same as a message."""
     return OVR2ROSInputs(**{name: getattr(inputs, name) for name in HandInputs.__slots__})
 
 
@@ -175,18 +146,16 @@ def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotSta
             return f"{len(numbers)} {field} values for {len(message.name)} joints"
         numbers = numbers[order]
         if not math.isfinite(sum(numbers.tolist())) and not np.isfinite(numbers).all():
-            return f"{field} of {names[int(np.flatnonzero(~np.isfinite(numbers))[0])]} is not finite"
+            return f"{field} of {names[int(np.argmin(np.isfinite(numbers)))]} is not finite"
         values.append(numbers)
     return RobotState(q=values[0], v=values[1], tau=values[2], tau_external=None, stamp=t)
 
 
 @lru_cache(maxsize=64)  # publishers send the same names again and again
 def _order(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
-    """Where each of ``names`` is among those of a message; or what is wrong with these, in one line."""
-    columns: Mapping[str, int] = {name: index for index, name in enumerate(given)}
-    if len(columns) != len(given):
+    """Where each of ``names`` is among those that were given; or what is wrong with these, in one line."""
+    if len(set(given)) != len(given):
         return "a joint is named twice"
-    missing = [name for name in names if name not in columns]
-    if missing:
+    if missing := [name for name in names if name not in given]:
         return f"no joint {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
-    return np.array([columns[name] for name in names], dtype=np.intp)
+    return np.array([given.index(name) for name in names], dtype=np.intp)

@@ -18,7 +18,6 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import BaseNode
 
 Model = TypeVar("Model", bound=BaseModel)
-_NONE = 0.0  # stands for no number; no field that may be none allows zero
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +64,7 @@ class ArmParameters:
 
 
 def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
-    """Declare all parameters and check them together. Raises :class:`ConfigError` for what is not allowed.
+    """Declare all parameters and check them together. Raises :class:`ConfigError`.
 
     Defaults are the cell's where the parameter ``config`` names one, and else the ones that are ``given``.
     """
@@ -83,6 +82,10 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
     topic = declare("target_topic", given.target_topic, 'where targets go; "": as the preset says')
     builtin = declare("builtin_node", "/cartesian_controller", "the built-in controller's node")
     controller = declare("controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix')
+    rate = declare("rate", given.rate or preset.rate, "of targets [Hz]", within=(1.0, 1000.0))
+    if rate < preset.lowest_rate:
+        allowed = f"at least {preset.lowest_rate:g}, better {preset.rate:g}"
+        raise ConfigError(f"parameter rate = {rate:g}: preset {preset.name} needs {allowed}")
     return ArmParameters(
         base_frame=base,
         world_frame=world or base,
@@ -93,11 +96,9 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
         current_pose_topic=declare("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
         builtin_node=builtin,
         builtin_prefix=declare("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
-        tool_timeout=_timeout(
-            node, "tool_timeout", "an older pose of the tool, or safe target, does not count", 0.01, 2.0
-        ),
-        listener_timeout=_timeout(node, "listener_timeout", "targets may not be acknowledged", 0.1, 10.0),
-        rate=_rate(node, preset, given.rate),
+        tool_timeout=declare("tool_timeout", STREAM_TIMEOUT, "of poses of tool and safe target [s]", within=(0.01, 2)),
+        listener_timeout=declare("listener_timeout", STREAM_TIMEOUT, "of acknowledgements [s]", within=(0.1, 10)),
+        rate=rate,
         preset=preset,
         mode=mode,
         gripper_topic=declare("gripper_action_topic", given.gripper_action_topic, "action or topic"),
@@ -105,10 +106,6 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
         guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), read_only=False),
         teleop=_teleop_settings(node, given.teleop),
     )
-
-
-def _timeout(node: BaseNode, name: str, description: str, least: float, greatest: float) -> float:
-    return float(node.parameter(name, STREAM_TIMEOUT, f"{description} [s]", within=(least, greatest)))
 
 
 def teleop_defaults(mirror: bool, filter_window_size: int | None) -> TeleopSettings:
@@ -122,7 +119,6 @@ def teleop_defaults(mirror: bool, filter_window_size: int | None) -> TeleopSetti
 
 
 def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
-    """The cell's, and the ones given where the cell says nothing."""
     cell, side = load_config(path), given.arm_name
     if side not in cell.arms:
         raise ConfigError(f"parameter config: {path} has no arm {side}; allowed: {', '.join(cell.arms)}")
@@ -148,16 +144,6 @@ def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
     )
 
 
-def _rate(node: BaseNode, preset: Preset, wanted: float | None) -> float:
-    rate = float(node.parameter("rate", wanted or preset.rate, "of targets [Hz]", within=(1.0, 1000.0)))
-    if rate < preset.lowest_rate:
-        raise ConfigError(
-            f"parameter rate = {rate:g}: preset {preset.name} needs at least {preset.lowest_rate:g}, "
-            f"better {preset.rate:g}"
-        )
-    return rate
-
-
 def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
     swapped = default.stance is not Stance.SIDE_BY_SIDE
     mirror = node.parameter(
@@ -170,12 +156,11 @@ def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
         read_only=False,
     )
     default = default.model_copy(update={"stance": stance_of(mirror, reflected)})
-    left_out = frozenset({"stance", "workspace"})
-    return settings_from_parameters(node, "teleop", default, left_out, read_only=False)
+    return settings_from_parameters(node, "teleop", default, frozenset({"stance", "workspace"}), read_only=False)
 
 
 def stance_of(mirror: bool, reflected: bool) -> Stance:
-    """What the parameters ``mirror`` and ``mirror_reflected`` say. Raises :class:`ConfigError`."""
+    """What ``mirror`` and ``mirror_reflected`` say. Raises :class:`ConfigError`."""
     if reflected and not mirror:
         raise ConfigError("parameter mirror_reflected = True: allowed with mirror = True only")
     return Stance.SIDE_BY_SIDE if not mirror else Stance.MIRROR_REFLECTED if reflected else Stance.MIRROR
@@ -184,11 +169,7 @@ def stance_of(mirror: bool, reflected: bool) -> Stance:
 def settings_from_parameters(
     node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str] = frozenset(), *, read_only: bool = True
 ) -> Model:
-    """Declare ``prefix.field`` for every field of ``default`` but those left out; returns the settings they make.
-
-    Nested models become nested names; a number that may be none is none where the parameter is 0.
-    Raises :class:`ConfigError` that names the parameter.
-    """
+    """Declare ``prefix.field`` for every field of ``default`` but those left out; returns the settings they make."""
     return validated(type(default), prefix, _values(node, prefix, default, leave_out, read_only))
 
 
@@ -221,8 +202,7 @@ def _values(
 def _value(node: BaseNode, name: str, default: Any, field: FieldInfo, read_only: bool) -> Any:
     description = field.description or name
     if may_be_none(field):
-        given = _NONE if default is None else default
-        return none_of_zero(node.parameter(name, given, f"{description}; here 0", read_only=read_only))
+        return node.parameter(name, default or 0.0, f"{description}; here 0", read_only=read_only) or None
     if isinstance(default, Enum):
         return node.parameter(name, str(default.value), description, read_only=read_only)
     if isinstance(default, tuple):
@@ -231,13 +211,8 @@ def _value(node: BaseNode, name: str, default: Any, field: FieldInfo, read_only:
 
 
 def may_be_none(field: FieldInfo) -> bool:
-    """Whether a setting may be none, for which its parameter is 0."""
+    """Whether a setting may be none; its parameter then is 0, which no such field allows."""
     return type(None) in getattr(field.annotation, "__args__", ())
-
-
-def none_of_zero(value: Any) -> Any:
-    """A setting that may be none, of its parameter."""
-    return None if value == _NONE else value
 
 
 def range_of(field: FieldInfo) -> tuple[float, float] | None:

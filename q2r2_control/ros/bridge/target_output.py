@@ -13,7 +13,7 @@ from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import ended_topic, stamped_pose, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
-from q2r2_control.ros.monitoring.endpoints import WatchedPublisher, node_of
+from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.arm_states import ArmState
@@ -29,11 +29,11 @@ _HELD = 0.15, 0.6  # [m, rad]
 
 
 class TargetOutput:
-    """Publishes one arm's target to one controller.
+    """Publishes one arm's target to one controller, through a :class:`PoseRateLimiter`.
 
-    A :class:`PoseRateLimiter` follows the target. It starts at the tool, so engaging moves nothing. When the target
-    ends the limiter brakes, and then the last pose is repeated or not, as the preset says. It is never repeated when
-    the tool is elsewhere, nor to a controller that was restarted: both would be a jump.
+    The limiter starts at the tool, so engaging moves nothing. When the target ends the limiter brakes, and then the
+    last pose is repeated or not, as the preset says. It is never repeated when the tool is elsewhere, nor to a
+    controller that was restarted: both would be a jump.
     """
 
     def __init__(
@@ -50,7 +50,8 @@ class TargetOutput:
         self.guard = PoseRateLimiter(guard, 1.0 / values.rate)
         self._node, self._controller, self._frame = node, controller, frame
         self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
-        self._topic = self._publisher.topic_name  # as the graph knows it: asked in each tick, without a look at names
+        self.topic = self._publisher.topic_name  # as the graph knows it
+        self._unknown_node = f"{self.topic} has a subscriber whose node is not known yet"
         self._wrench = None
         if preset.zero_wrench is not None:
             wrench = preset.zero_wrench.format(ctrl=values.prefix)
@@ -67,19 +68,13 @@ class TargetOutput:
         self.starts = 0  # how often the controller has appeared
 
     @property
-    def topic(self) -> str:
-        """Where the targets go."""
-        return self._topic
-
-    @property
     def sent(self) -> int:
-        """How many targets went out."""
         return self._publisher.sent
 
     @property
     def conflict(self) -> str | None:
         """One line if there are other publishers of the same topic."""
-        if (count := self._node.handle.get_count_publishers(self._topic)) <= 1:
+        if (count := self._node.handle.get_count_publishers(self.topic)) <= 1:
             return None
         return f"{count} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
 
@@ -106,13 +101,10 @@ class TargetOutput:
             self.forget(now)
             return self._unknown_node
         fault, self._fault = self._fault, None
-        if fault is not None:
-            return fault
-        silence = self._publisher.silence() if self.following else None
-        if silence is not None:
+        if fault is None and self.following and (silence := self._publisher.silence()) is not None:
             self.forget(now)  # the controller is gone, and its successor must not get an old target
             return f"{self._controller}: {silence}"
-        return None
+        return fault
 
     def step(
         self,
@@ -165,11 +157,10 @@ class TargetOutput:
         self.guard.reset(None, now)
 
     def _present(self) -> int:
-        """Number of subscribers; the graph lists one before the publisher can send to it."""
-        return max(self._publisher.listeners, self._node.handle.get_count_subscribers(self._topic))
+        """Number of subscribers, also those that the graph lists before the publisher can send to them."""
+        return max(self._publisher.listeners, self._node.handle.get_count_subscribers(self.topic))
 
     def _holds(self, tool: pin.SE3 | None, state: ArmState, now: float) -> bool:
-        """Whether the last target may be repeated."""
         if self.guard.pose is None:
             return False
         if tool is None or not near(self.guard.pose, tool, *_HELD):
@@ -177,10 +168,6 @@ class TargetOutput:
             return False
         pausing = self.preset is BUILTIN and state is ArmState.PAUSING
         return self.preset.hold is Hold.REPEAT or pausing
-
-    @property
-    def _unknown_node(self) -> str:
-        return f"{self.topic} has a subscriber whose node is not known yet"
 
     def _ask_graph(self, now: float) -> None:
         """Notice a controller that has appeared, or is gone: others that listen may acknowledge in its place."""
@@ -200,8 +187,7 @@ class TargetOutput:
     def _send_zero_wrench(self, now: float) -> None:
         if self._wrench is not None:
             message = WrenchStamped()
-            message.header.frame_id = self._frame
-            message.header.stamp = time_message(now)
+            message.header.frame_id, message.header.stamp = self._frame, time_message(now)
             self._wrench.publish(message)
 
 

@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pinocchio as pin
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.ros.bridge.reports import RecorderLink
+from q2r2_control.recording.ros_topics import RECORDER
+from q2r2_control.ros.base_node import STEADY
 from q2r2_control.teleop.arm_states import HOLDING
+from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.teleop.teleop import Teleop
 
 if TYPE_CHECKING:
     from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
 
 
-_PATIENCE = 2.0  # with an answer, and until the controller says that it is on its way [s]
+_TIME_PERIOD = 0.05  # of looking whether time stands still [s]
+_PATIENCE = 2.0  # with an answer, with a controller that is to go home, with a recorder that says nothing [s]
 
 
 class HomeClient:
@@ -77,8 +79,7 @@ class HomeClient:
         elif not self._home.service_is_ready():
             self._end(teleop, now, f"there is no service {self._name}/home")
         else:
-            self._since, self._seen = now, False
-            self._answer = self._home.call_async(Trigger.Request())
+            self._since, self._seen, self._answer = now, False, self._home.call_async(Trigger.Request())
 
     def _call_hold(self) -> None:
         if self._hold is not None:
@@ -90,7 +91,32 @@ class HomeClient:
         teleop.end_homing(now, reason if arrived else Reason(ReasonKind.NOT_HOMING, cause=reason), arrived)
 
 
-_TIME_PERIOD = 0.05  # [s]
+class RecorderLink:
+    """What the recorder's node says: whether it records, and whether an episode is open, whoever began it."""
+
+    def __init__(self, node: Node) -> None:
+        self._state: dict[str, Any] | None = None  # the newest that has not been used
+        self._heard = 0.0  # [s] of steady time
+        self._served: int | None = None  # services that it has answered
+        self._reasons: list[Reason] = []
+        node.create_subscription(String, f"{RECORDER}/state", self._on_state, 10)
+
+    def update(self, marks: EpisodeMarks) -> list[Reason]:
+        """Once a tick, before the teleoperation; returns the reasons of new events of its services."""
+        if (state := self._state) is not None:
+            marks.recorded, marks.open, marks.any = state["records"], state["episode_open"], state["any_episode"]
+            self._state = None
+        if marks.recorded and time.monotonic() - self._heard > _PATIENCE:
+            marks.recorded = False
+        reasons, self._reasons = self._reasons, []
+        return reasons
+
+    def _on_state(self, message: String) -> None:
+        self._state = state = json.loads(message.data)
+        self._heard = time.monotonic()
+        if self._served is not None and state["served"] != self._served:
+            self._reasons.append(Reason.from_json(state["served_last"]))
+        self._served = state["served"]
 
 
 class TickInputs(NamedTuple):
@@ -103,36 +129,25 @@ class TickInputs(NamedTuple):
 
 
 class TeleopLoop:
-    """Ticks the node of one arm, or of both: the same object of the package then decides for both at one moment.
-
-    Pausing both arms, the operator's stop, the alignment chord, the way home and two arms that carry
-    therefore need no messages between nodes. Timers and clock are the first node's.
-    """
+    """Ticks the node of one arm, or of both, for which one :class:`Teleop` decides at one moment."""
 
     def __init__(self) -> None:
         self.nodes: list[BaseArmController] = []
         self.teleop: Teleop
 
     def join(self, node: BaseArmController) -> None:
-        """Teleoperate this node's arm too. Raises :class:`ConfigError` where both arms cannot share one teleoperation.
-
-        Called before the first tick.
-        """
+        """Before the first tick: teleoperate this node's arm too. Raises :class:`ConfigError` where nodes differ."""
         ours, first = node.parameters, (self.nodes or [node])[0]
         theirs = first.parameters
-        for what, differ in (
-            ("teleop, mirror and mirror_reflected", ours.teleop != theirs.teleop),
-            ("rate", ours.rate != theirs.rate),
-            ("mode", ours.mode != theirs.mode),
-            ("builtin_node", ours.builtin_node != theirs.builtin_node),
-        ):
-            if differ:
+        for name in ("teleop", "rate", "mode", "builtin_node"):
+            if getattr(ours, name) != getattr(theirs, name):
+                what = "teleop, mirror and mirror_reflected" if name == "teleop" else name
                 raise ConfigError(f"{what}: {first.get_name()} and {node.get_name()} differ; allowed: the same in both")
         self.nodes.append(node)
         self.teleop = Teleop(theirs.teleop, [one.arm_name for one in self.nodes])
 
     def connect(self, node: BaseArmController) -> None:
-        """The node's publishers and subscriptions are there."""
+        """After the node's publishers and subscriptions were made."""
         if node is not self.nodes[0]:
             return
         self._recorder = RecorderLink(node)
@@ -141,7 +156,7 @@ class TeleopLoop:
         self._without_time: Reason | None = None
         node.create_tick(1.0 / node.parameters.rate, self.tick)
         # Without time there are no ticks, and so nothing else that would pause the arms.
-        node.create_timer(_TIME_PERIOD, self._watch_time, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node.create_timer(_TIME_PERIOD, self._watch_time, clock=STEADY)
 
     def tick(self) -> None:
         """Process what arrived, and publish where the tools should go."""
@@ -180,12 +195,7 @@ class TeleopLoop:
         self._publish_events()
 
     def change(self, settings: TeleopSettings) -> Reason | None:
-        """See :meth:`Teleop.change`."""
         return None if settings == self.teleop.settings else self.teleop.change(settings, self.nodes[0].now)
-
-    def others(self, node: BaseArmController) -> Sequence[BaseArmController]:
-        """The other nodes of this loop."""
-        return [one for one in self.nodes if one is not node]
 
     def _pause(self, now: float, reason: Reason) -> None:
         if any(state not in HOLDING for state in self.teleop.states.values()):

@@ -19,7 +19,6 @@ from q2r2_control.errors import Q2R2Error
 INTERFACES = Path(__file__).parents[1] / "interfaces"
 # What the generators and ament import while CMake runs; rclpy is what the result is for.
 _PYTHON_TOOLS = ("rclpy", "rosidl_adapter", "rosidl_generator_py", "catkin_pkg", "em", "lark", "numpy")
-_COMPILERS = ("c++", "g++", "clang++")
 
 
 class BuildError(Q2R2Error):
@@ -28,8 +27,6 @@ class BuildError(Q2R2Error):
 
 @dataclass(frozen=True, slots=True)
 class Interfaces:
-    """One interface package: where its definitions are, and the types that they make."""
-
     source: Path
 
     @property
@@ -47,8 +44,7 @@ class Interfaces:
 
     def found_in(self) -> Path | None:
         """The folder that a fresh Python imports all types from, or None."""
-        # Where a ROS is sourced, this environment's libraries are found once its own setup file is sourced too; the
-        # user is told so, and here the path does the same.
+        # As where this environment's own setup file is sourced after that of a ROS.
         libraries = os.pathsep.join(filter(None, [str(Path(sys.prefix, "lib")), os.environ.get("LD_LIBRARY_PATH")]))
         command = [sys.executable, "-c", f"{self.proof}\nprint({self.name}.__path__[0])"]
         environment = os.environ | {"LD_LIBRARY_PATH": libraries}
@@ -57,15 +53,13 @@ class Interfaces:
 
 
 def interface_packages() -> list[Interfaces]:
-    """All packages that ship with this one, by name."""
     return [Interfaces(file.parent) for file in sorted(INTERFACES.glob("*/package.xml"))]
 
 
 def build_interfaces(report: Callable[[str], None], force: bool = False) -> None:
-    """Build what cannot be imported and ``report`` one line a package.
+    """Build what cannot be imported and ``report`` one line a package. Raises :class:`BuildError`.
 
-    ``force`` builds again what this environment holds; what another install has, such as one that apt made and that is
-    sourced, is always left alone. Raises :class:`BuildError`.
+    ``force`` builds again what this environment holds; what another install has, such as one that is sourced, stays.
     """
     prefix = Path(sys.prefix)
     held = []  # by this environment
@@ -97,12 +91,11 @@ def missing_tools(prefix: Path) -> list[str]:
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
     if Path(sysconfig.get_path("purelib")) != packages or not os.access(packages, os.W_OK):
         missing.append(f"a virtual environment that can be written to, since {prefix} is none")
-    compilers = [os.environ["CXX"].split()[0]] if os.environ.get("CXX", "").strip() else _COMPILERS
+    compilers = [os.environ["CXX"].split()[0]] if os.environ.get("CXX", "").strip() else ["c++", "g++", "clang++"]
     if not any(map(_found, compilers)):
         missing.append(f"a C++ compiler ({' or '.join(compilers)}; Debian, Ubuntu: g++)")
-    for tool, source in {"make": "make", "cmake": "cmake (pip install cmake)"}.items():
-        if not _found(tool):
-            missing.append(source)
+    tools = {"make": "make", "cmake": "cmake (pip install cmake)"}
+    missing += [source for tool, source in tools.items() if not _found(tool)]
     if not Path(sysconfig.get_path("include"), "Python.h").is_file():
         missing.append("Python's headers (Debian, Ubuntu: python3-dev)")
     absent = [name for name in _PYTHON_TOOLS if importlib.util.find_spec(name) is None]
@@ -115,10 +108,7 @@ def missing_tools(prefix: Path) -> list[str]:
 
 
 def build(package: Interfaces, prefix: Path, log: Path) -> None:
-    """Configure, compile and install ``package`` into ``prefix``; all output goes to ``log``.
-
-    Raises :class:`BuildError`.
-    """
+    """Compile and install ``package`` into ``prefix``; all output goes to ``log``. Raises :class:`BuildError`."""
     cmake = _found("cmake") or "cmake"
     path = os.pathsep.join(map(str, _prefix_path(prefix)))
     environment = os.environ | {"AMENT_PREFIX_PATH": path, "CMAKE_PREFIX_PATH": path}
@@ -141,13 +131,11 @@ def build(package: Interfaces, prefix: Path, log: Path) -> None:
 
 
 def _found(program: str) -> str | None:
-    """A program that is beside the running Python or on the PATH."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     return shutil.which(program, path=path)
 
 
 def _sourced() -> list[Path]:
-    """The ROS installs that are sourced; none where ROS is part of the environment."""
     return [Path(root) for root in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if root]
 
 

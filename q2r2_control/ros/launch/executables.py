@@ -1,7 +1,7 @@
 """The executables of the nodes. One that is still importing ends on Ctrl-C at once and without a traceback.
 
-Imports take seconds, and what they run in C turns Ctrl-C into errors of many kinds. There is nothing to clean up yet,
-so the system's own answer to the signal is the right one, until :func:`run_node` takes it over.
+Imports take seconds, and turn Ctrl-C into errors of many kinds. There is nothing to clean up yet, so the system's own
+answer to the signal is the right one, until :func:`run_node` takes it over.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from importlib import import_module
 NODES = {
     "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),
     "SimulationInput": ("simulation_input", "SimulationInput"),
-    "hand_input": ("hand_input", "HandInput"),
-    "CheckTCPconnection": ("check_tcp_connection", "CheckTcpConnection"),
+    "hand_input": ("simulation_input", "HandInput"),
+    "CheckTCPconnection": ("tcp_endpoint", "CheckTcpConnection"),
     "cartesian_controller": ("cartesian_controller", "CartesianControllerNode"),
     "mujoco_robot": ("mujoco_robot", "MujocoRobot"),
     "recorder": ("recorder", "RecorderNode"),

@@ -1,9 +1,8 @@
-"""Sets up Fast DDS, the middleware of ROS 2 Jazzy, unless the user has done so.
+"""Sets up Fast DDS, the middleware of ROS 2 Jazzy, unless the user has done so; each process for itself.
 
 Shared memory is switched off: a process that is killed while it holds a lock there delays all writers to the same
 memory, and all their subscribers, for about a second. And a node that died leaves the graph after 3 s instead of 20,
-so that its successor counts as a second publisher for no longer. Each process sets this for itself; nodes of other
-packages keep their own settings.
+so that its successor counts as a second publisher for no longer.
 """
 
 from __future__ import annotations
@@ -18,10 +17,7 @@ _RANGE, _PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
 
 
 def set_up_middleware(environment: MutableMapping[str, str]) -> None:
-    """Add the variables that a process needs before it calls ``rclpy.init``; Fast DDS settings of the user are kept.
-
-    Nothing is added for another middleware, because the changed discovery range would apply to it too.
-    """
+    """Add what a process needs before ``rclpy.init``; the user's Fast DDS settings and another middleware stay."""
     if not environment.get("RMW_IMPLEMENTATION", _FAST_DDS).startswith(_FAST_DDS):
         return
     # ROS_LOCALHOST_ONLY overrides the range, and brings shared memory whatever a profile says.

@@ -56,12 +56,11 @@ def nodes_of(
     recording: Mapping[str, str] | None = None,
     separate: bool = False,
 ) -> list[NodeProcess]:
-    """The processes for a cell's YAML, in the order of their start: one for both arms, one for each other node.
+    """The processes for a cell's YAML, in the order of their start. Raises :class:`ConfigError`.
 
-    ``separate``: one for each arm, each with a teleoperation of its own. ``source`` of the hands: an installed input,
-    "none", or None for the cell's. ``robot``: mujoco, none, or auto, which is mujoco for ``controller: builtin`` only.
-    ``recording``: parameters of the recorder, which starts first and so ends last; None without one.
-    Raises :class:`ConfigError`.
+    ``source`` of the hands: an installed input, "none", or None for the cell's. ``robot``: mujoco, none, or auto:
+    mujoco for ``controller: builtin`` only. ``recording``: parameters of the recorder, which starts first and ends
+    last. ``separate``: each arm is a process with a teleoperation of its own.
     """
     if robot not in ROBOTS:
         raise ConfigError(f"robot = {robot!r:.60}: allowed are {', '.join(ROBOTS)}")
@@ -71,23 +70,19 @@ def nodes_of(
         check_installed(INPUTS, source)
     config: dict[str, str | float] = {"config": path}
     nodes = [] if recording is None else [NodeProcess("recorder", {**config, **recording})]
-    felt: dict[str, str | float] = {}
+    controller: dict[str, str | float] = {} if cell.external is None else _relayed(cell.external)
     if robot == "mujoco" or (robot == "auto" and cell.controller is ControllerKind.BUILTIN):
         nodes.append(NodeProcess("mujoco_robot", config))
-        felt["external_torque_topic"] = "/mujoco_robot/external_torque"
-    if cell.external is None:
-        nodes.append(NodeProcess("cartesian_controller", config | felt))
-    elif cell.external.filtered:
-        nodes.append(NodeProcess("cartesian_controller", config | _relayed(cell.external)))
+        if cell.external is None:
+            controller["external_torque_topic"] = "/mujoco_robot/external_torque"
+    if cell.external is None or cell.external.filtered:
+        nodes.append(NodeProcess("cartesian_controller", config | controller))
     arms = [f"{arm}_arm_controller" for arm in SIDES if arm in cell.arms]
     together = not separate and len(arms) == len(SIDES)
     nodes += [NodeProcess(name, config) for name in (["arm_controllers"] if together else arms)]
-    if source == "scripted":
-        nodes.append(NodeProcess("SimulationInput"))
-    elif source == "headset":
-        nodes.append(NodeProcess("tcp_endpoint", config))
-    elif source != NO_INPUT:
-        nodes.append(NodeProcess("hand_input", config | {"input": source}))
+    if source != NO_INPUT:
+        known = {"scripted": NodeProcess("SimulationInput"), "headset": NodeProcess("tcp_endpoint", config)}
+        nodes.append(known.get(source) or NodeProcess("hand_input", config | {"input": source}))
     return nodes
 
 
@@ -176,8 +171,7 @@ def _end_with(parent: int) -> None:
 
 
 def _read(name: str, process: subprocess.Popen[str], say: Callable[[str], None]) -> None:
-    assert process.stdout is not None
-    for line in process.stdout:
+    for line in process.stdout or ():
         say(f"[{name}] {line.rstrip()}")
 
 

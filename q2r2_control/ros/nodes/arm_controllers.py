@@ -24,10 +24,7 @@ class RightArmController(BaseArmController):
 
 
 def run_arms(left: Callable[..., BaseArmController], right: Callable[..., BaseArmController]) -> int:
-    """Main function of an executable of both arms, whose nodes share one teleoperation; see :func:`run_node`.
-
-    Each argument is a class of nodes that passes keyword arguments on, or makes such a node.
-    """
+    """Main function of an executable of both arms, nodes of two classes that share one teleoperation."""
     made: list[BaseArmController] = []
 
     def make_left() -> BaseArmController:

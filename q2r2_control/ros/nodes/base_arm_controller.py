@@ -110,14 +110,12 @@ class BaseArmController(BaseNode):
         """Make publishers, subscriptions, services, the action client and the timer."""
         values = self.parameters
         self._frames = FrameListener(self)
-        tree, world = self._frames.tree, values.world_frame
-        self._tool: ToolFrame | PoseTopic
-        if values.current_pose_topic:
-            self._tool = PoseTopic(self, values.current_pose_topic, tree, world, values.tool_timeout)
-        else:
-            self._tool = ToolFrame(self, tree, values.tool_frame, world, values.tool_timeout)
-        topic = f"{values.builtin_node}/safe_target/{self.arm_name}"
-        self._safe_target = PoseTopic(self, topic, tree, world, values.tool_timeout)
+        within = self._frames.tree, values.world_frame, values.tool_timeout
+        topic = values.current_pose_topic
+        self._tool: PoseTopic | ToolFrame = (
+            PoseTopic(self, topic, *within) if topic else ToolFrame(self, values.tool_frame, *within)
+        )
+        self._safe_target = PoseTopic(self, f"{values.builtin_node}/safe_target/{self.arm_name}", *within)
         timeout = values.teleop.gate.timeout
         self.intake = HandIntake(self, self.hand, timeout, self.pose_callback, self.inputs_callback)
         self.outputs = ArmOutputs(self, self.arm_name, values, self._safe_target)
@@ -160,10 +158,8 @@ class BaseArmController(BaseNode):
         commanded = None if tool is None else self._commanded(tool, controlled)
         self._base_pose = base
         self.inputs = TickInputs(tool, commanded, reference, None if obstacle is None else obstacle[1])
-        fault = self.outputs.take_fault(now)
-        if self.state in HOLDING:
-            return None
-        return fault or (None if self._refusal is None else self._refusal[1])
+        fault = self.outputs.take_fault(now) or (None if self._refusal is None else self._refusal[1])
+        return None if self.state in HOLDING else fault
 
     def follow(self, target: ArmTarget, now: float, decided: float) -> Reason | None:
         """Publish the ``target`` that was ``decided`` on then [s], command the gripper; why the arm has to hold."""
@@ -188,21 +184,17 @@ class BaseArmController(BaseNode):
 
     @property
     def hand(self) -> str:
-        """The hand that drives the arm."""
         return self.loop.teleop.hand_of(self.arm_name)
 
     @property
     def state(self) -> ArmState:
-        """State of the teleop layer."""
         return self.loop.teleop.states[self.arm_name]
 
     @property
     def engaged(self) -> bool:
-        """Whether the arm follows a hand."""
         return self.loop.teleop.engaged[self.arm_name]
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """State, the reason why the arm cannot be engaged, and figures."""
         output = self.outputs.first
         values = {
             "arm": self.arm_name,
@@ -235,7 +227,6 @@ class BaseArmController(BaseNode):
         return OK, self.feedback.last_line, values
 
     def _base(self) -> pin.SE3 | None:
-        """The frame that targets are published in, in the world frame."""
         if self.parameters.base_frame == self.parameters.world_frame:
             return pin.SE3.Identity()
         placement = self._frames.tree.find(self.parameters.base_frame, self.parameters.world_frame)
@@ -247,17 +238,13 @@ class BaseArmController(BaseNode):
         if (line := self.outputs.conflict or self._frames.conflict(values.tool_frame)) is not None:
             return ERROR, Reason.of(ReasonKind.SEVERAL_PUBLISHERS, text=line)
         if tool is None:
-            why = self._tool.problem or "current_pose() gives none"
-            return WARN, Reason.of(ReasonKind.NO_TOOL_POSE, text=why)
+            return WARN, Reason.of(ReasonKind.NO_TOOL_POSE, text=self._tool.problem or "current_pose() gives none")
         if base is None:
             return WARN, Reason.of(ReasonKind.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         return None if (unready := self.outputs.unready) is None else (WARN, unready)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
-        """The commanded tool pose, for the leash and for anchors.
-
-        Another controller's is not known: then the tool's, and while the arm is paused the last target counts.
-        """
+        """For the leash and for anchors. Another controller's is not known: then the tool's, or the last target's."""
         if self.engaged:
             return self._target.command_for(tool) if reference is None else reference
         reference = reference or self.outputs.first.last_sent
@@ -274,7 +261,7 @@ class BaseArmController(BaseNode):
     def _share_parameters(self, parameters: Sequence[Parameter]) -> None:
         """The nodes of one teleoperation have one value of its parameters."""
         shared = [one for one in parameters if is_of_teleop(one.name)]
-        for node in self.loop.others(self):
+        for node in [node for node in self.loop.nodes if node is not self]:
             changed = [one for one in shared if node.get_parameter(one.name).value != one.value]
             if changed:
                 node.set_parameters_atomically(changed)

@@ -2,9 +2,8 @@
 
 Every topic is one of all arms or one an arm, as the robot's layout asks for: targets on ``/q2r2/left/target_frame`` or
 ``left.target_topic``, joint states on ``joint_states`` or ``left.joint_states_topic``, commands on ``output_topic`` or
-``left.output_topic``. So a controller an arm in one namespace (``/robot/left_arm_controller/joint_trajectory``) and a
-namespace an arm (``/left/joint_states``) both work. With output ``none`` another controller moves the arms and only
-``~/safe_target/left`` is published for it. What is done with targets: :mod:`supervisor`.
+``left.output_topic``. With output ``none`` another controller moves the arms, for which ``~/safe_target/left`` is
+published. What is done with targets: :mod:`supervisor`.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-import pinocchio as pin
 from std_srvs.srv import SetBool, Trigger
 
 from q2r2_control.config.cell import load_config
@@ -23,14 +21,12 @@ from q2r2_control.drives.base import TorqueDrive, permitted
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import ERROR, OK, WARN
-from q2r2_control.ros.bridge.controller_feedback import ControllerFeedback
-from q2r2_control.ros.bridge.gripper_limits import GRIPPER_DELAY, GripperLimits
+from q2r2_control.ros.base_node import ERROR, OK, WARN, ManagedNode
+from q2r2_control.ros.bridge.controller_feedback import GRIPPER_DELAY, ControllerFeedback, GripperLimits
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
-from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
+from q2r2_control.ros.bridge.joint_outputs import KINDS, NONE, make_output
 from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live, make_watching_live
 from q2r2_control.ros.executor import TickExecutor
-from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase
@@ -57,7 +53,7 @@ class CartesianControllerNode(ManagedNode):
         super().__init__("cartesian_controller")
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
         rate = self.parameter("rate", 250.0, "of the control loop [Hz]", within=(20, 1000))
-        output = output_name(self)
+        output = self.parameter("output", "trajectory", "what the arms are commanded with", one_of=(*KINDS, NONE))
         if output == NONE:
             config = settings_for_external_arms(config)
         robot = Robot.from_config(config)
@@ -92,8 +88,7 @@ class CartesianControllerNode(ManagedNode):
         self._grippers = GripperLimits(self, config, self._loop, asking)
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
-        self._commanding = False
-        self._advances = 0  # ticks that have gone by some time
+        self._commanding, self._advances = False, 0  # ticks that have gone by some time
         # Another controller follows every safe target; arms that listen take a hundred a second.
         every = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
@@ -104,23 +99,13 @@ class CartesianControllerNode(ManagedNode):
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
     def _connect(self) -> None:
-        self._targets.subscribe(self._take_target, self._supervisor.targets.release)
+        self._targets.subscribe(self._supervisor.update_target, self._supervisor.targets.release)
         self._joints.subscribe(self._loop.observe, self._grippers.take_joint_state)
         self.create_service(SetBool, "~/pause", self._on_pause)
-        services: dict[str, Callable[[], Reason | None]] = {
-            "home": self._supervisor.go_home,
-            "hold": self._supervisor.homing.hold,
-            "reset": self._supervisor.reset,
-            "stop": self._stop,
-        }
-        for name, act in services.items():
+        home, hold = self._supervisor.go_home, self._supervisor.homing.hold
+        for name, act in (("home", home), ("hold", hold), ("reset", self._supervisor.reset), ("stop", self._stop)):
             self.create_service(Trigger, f"~/{name}", partial(self._serve, act))
         self.create_tick(self._period, self._tick)
-
-    def _take_target(
-        self, arm: str, pose: pin.SE3 | None, now: float, number: int | None, due: float | None
-    ) -> Reason | None:
-        return self._supervisor.update_target(arm, pose, now, number, due=due)
 
     def _tick(self) -> None:
         decided = time.monotonic()
@@ -167,8 +152,8 @@ class CartesianControllerNode(ManagedNode):
         return _answer(response, None)
 
     def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
-        active = self.is_active or act == self._stop
-        refusal = act() if active else Reason.in_words(f"{_DEACTIVATED}: {_CURE}")
+        served = self.is_active or act == self._stop
+        refusal = act() if served else Reason.in_words(f"{_DEACTIVATED}: {_CURE}")
         self.report_health()
         return _answer(response, refusal)
 
@@ -178,10 +163,11 @@ class CartesianControllerNode(ManagedNode):
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         supervisor, now = self._supervisor, self.now
+        homed = supervisor.homing.outcome
         values: dict[str, Any] = {
             "phase": supervisor.phase,
             "lifecycle": self.lifecycle_state,
-            "homing_ended": "" if supervisor.homing.outcome is None else sentence(supervisor.homing.outcome),
+            "homing_ended": "" if homed is None else sentence(homed),
             "loop_rate_hz": self.tick_rate(),
             "missed_ticks": self._loop.pacer.missed_ticks,
             "sent": self._output.sent,
@@ -205,18 +191,12 @@ class CartesianControllerNode(ManagedNode):
             values["closest_distance_m"] = round(report.closest_distance, 4)
         if supervisor.state_fault is not None:
             values["kind"] = str(ReasonKind.BAD_JOINT_STATES)
-        level, line = self._judge()
-        return level, line, values
-
-    def _judge(self) -> tuple[bytes, str]:
-        if not self.is_active:
-            return WARN, _CURE if self._supervisor.fault is None else sentence(self._supervisor.fault)
-        if self._supervisor.fault is not None:
-            return ERROR, sentence(self._supervisor.fault)
-        ended = list(map(sentence, self._supervisor.targets.ended.values()))
-        if faults := self._targets.faults():
-            return WARN, "; ".join(faults + ended)
-        return OK, "; ".join(["paused" if self._supervisor.paused else "active", *ended])
+        fault = _CURE if supervisor.fault is None else sentence(supervisor.fault)
+        if not self.is_active or supervisor.fault is not None:
+            return ERROR if self.is_active else WARN, fault, values
+        ended, faults = list(map(sentence, supervisor.targets.ended.values())), self._targets.faults()
+        doing = faults or ["paused" if supervisor.paused else "active"]
+        return WARN if faults else OK, "; ".join(doing + ended), values
 
     def begin(self) -> str | None:
         """Take over where the arms stand, if they do and nobody else commands them."""
@@ -254,8 +234,8 @@ class CartesianControllerNode(ManagedNode):
 
     def _come_to_rest(self, why: str, go_on: Callable[[], None]) -> None:
         self._supervisor.stop(Reason.in_words(why))
-        deadline = last = time.monotonic()
-        deadline += _LONGEST_STOP
+        last = time.monotonic()
+        deadline = last + _LONGEST_STOP
         advances = self._advances
         try:
             while self._supervisor.phase is Phase.BRAKING and (now := time.monotonic()) < deadline:
@@ -278,7 +258,6 @@ class CartesianControllerNode(ManagedNode):
         self._tick()
 
     def _tick_until(self, condition: Callable[[], bool], longest: float) -> bool:
-        """Tick on until ``condition`` holds, for ``longest`` [s] at most; whether it does."""
         deadline = time.monotonic() + longest
         while not (fulfilled := condition()) and time.monotonic() < deadline:
             self._tick_on()

@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
+from control_msgs.action import GripperCommand
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
@@ -27,20 +30,96 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN
-from q2r2_control.ros.bridge.frames import LinkFrames
-from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
+from q2r2_control.ros.base_node import LATCHED_QOS, OK, STEADY, WARN, BaseNode
+from q2r2_control.ros.bridge.frames import link_transforms
 from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
-from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.message_watch import DelayWatch
-from q2r2_control.types import Array, RobotState
 
 _LOG_PERIOD = 1.0  # of lines about refusals [s]
 _TRAJECTORY = "joint_trajectory"
-_STROKE = Stroke(open_position=0.0, closed_position=0.05)  # in goals, as Quest2ROS2 has them [m]
+_REACHED = 0.02  # of the stroke
+_STALLED_AFTER = 0.3  # without moving by the following [s]
+_MOVES = 0.004  # of the stroke
+_OUTSIDE = 0.02  # a goal this much beyond the stroke still counts as its end
+_CLOSED = 0.05  # in goals, as Quest2ROS2 has it; 0 is fully open [m]
 
 
-class MujocoRobot(ManagedNode):
+@dataclass(slots=True)
+class _Motion:
+    handle: ServerGoalHandle
+    goal: float  # opening, 0 closed .. 1 open
+    seen: float  # opening when it last moved
+    moved_at: float  # [s]
+
+
+class GripperServer:
+    """Serves ``topic``. A newer goal aborts the older one; fingers that stop on something have succeeded: stalled.
+
+    A goal's ``max_effort`` is not used. :meth:`update` works on goals: a callback that waits would block the node.
+    """
+
+    def __init__(self, node: Node, topic: str, command: Callable[[float], None], refuse: Callable[[str], None]) -> None:
+        self._command, self._refuse = command, refuse
+        self._motion: _Motion | None = None
+        self._newest: ServerGoalHandle | None = None
+        self._server = ActionServer(
+            node,
+            GripperCommand,
+            topic,
+            execute_callback=lambda _: GripperCommand.Result(),  # each goal gets its own when it ends
+            goal_callback=self._check,
+            handle_accepted_callback=self._accept,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )
+
+    def update(self, now: float, opening: float, effort: float) -> None:
+        """Go on with the goal at ``now`` [s]: the gripper is open by ``opening`` 0..1 and presses by ``effort`` [N]."""
+        position = _CLOSED * (1.0 - opening)
+        if self._newest is not None:
+            if self._motion is not None:
+                self._end(self._motion.handle, "abort", GripperCommand.Result(position=position, effort=effort))
+            goal = 1.0 - self._newest.request.command.position / _CLOSED
+            self._motion = _Motion(self._newest, min(max(goal, 0.0), 1.0), opening, now)
+            self._newest = None
+            self._command(self._motion.goal)
+        motion = self._motion
+        if motion is None:
+            return
+        if abs(opening - motion.seen) > _MOVES:
+            motion.seen, motion.moved_at = opening, now
+        reached = abs(opening - motion.goal) <= _REACHED
+        stalled = not reached and now - motion.moved_at > _STALLED_AFTER
+        if motion.handle.is_cancel_requested:
+            self._command(opening)
+        elif not (reached or stalled):
+            motion.handle.publish_feedback(GripperCommand.Feedback(position=position, effort=effort))
+            return
+        told = GripperCommand.Result(position=position, effort=effort, reached_goal=reached, stalled=stalled)
+        self._end(motion.handle, "succeed", told)
+        self._motion = None
+
+    def _check(self, goal: GripperCommand.Goal) -> GoalResponse:
+        position = goal.command.position
+        if -_OUTSIDE <= position / _CLOSED <= 1.0 + _OUTSIDE:  # which is not so of NaN
+            return GoalResponse.ACCEPT
+        self._refuse(f"gripper position {position:g} m; allowed: 0 .. {_CLOSED:g}")
+        return GoalResponse.REJECT
+
+    def _accept(self, handle: ServerGoalHandle) -> None:
+        if self._newest is not None:
+            self._end(self._newest, "abort", GripperCommand.Result())
+        self._newest = handle
+
+    def _end(self, handle: ServerGoalHandle, outcome: str, result: GripperCommand.Result) -> None:
+        def conclude(handle: ServerGoalHandle) -> GripperCommand.Result:
+            # A goal that is being cancelled can end as canceled only.
+            getattr(handle, "canceled" if handle.is_cancel_requested else outcome)()
+            return result
+
+        handle.execute(conclude)
+
+
+class MujocoRobot(BaseNode):
     """Runs a :class:`SimulatedCell` in real time between its topics, services and actions."""
 
     ticks = True
@@ -53,8 +132,7 @@ class MujocoRobot(ManagedNode):
         tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", within=(1, 1000))
         # Hands feel it fifty times a second; an admittance needs it in every tick.
         felt = rate if config.admittance.enabled else 50.0
-        self._external_period = 1.0 / felt
-        self._external_due = 0.0  # [s]
+        self._external_period, self._external_due = 1.0 / felt, 0.0  # [s]
         hold_after = self.parameter("hold_after", 0.1, "without commands [s]", within=(0.01, 1))
         max_jump = self.parameter("max_jump", 0.1, "of a commanded position [rad]", within=(0.001, 7))
         self._robot = Robot.from_config(config)
@@ -66,12 +144,19 @@ class MujocoRobot(ManagedNode):
         self._delays: dict[tuple[str, ...], DelayWatch] = {}  # by topic and first joint
         self._make_publishers()
         self._make_subscriptions()
-        self._grippers = {arm: self._gripper(arm) for arm in self._cell.plant.gripper_openings()}
+        self._grippers = {
+            arm: GripperServer(
+                self,
+                f"/q2r2/{arm}_gripper/gripper_cmd",
+                partial(self._cell.command_gripper, arm),
+                partial(self._note, f"{arm}_gripper"),
+            )
+            for arm in self._cell.plant.gripper_openings()
+        }
         self.create_service(Trigger, "~/reset", self._reset)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # the simulation makes its own time, whatever /clock says
-        self.create_tick(self._period, self._tick, clock=steady)
-        self.create_tick(1.0 / tf_rate, self._publish_transforms, clock=steady)
-        self.start_active()
+        # The simulation makes its own time, whatever /clock says.
+        self.create_tick(self._period, self._tick, clock=STEADY)
+        self.create_tick(1.0 / tf_rate, self._publish_transforms, clock=STEADY)
         self.get_logger().info(f"{config.name}: {', '.join(self._robot.joint_names)}")
 
     def _make_publishers(self) -> None:
@@ -82,35 +167,24 @@ class MujocoRobot(ManagedNode):
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
         self._description = self.create_publisher(String, "robot_description", LATCHED_QOS)
         self._description.publish(String(data=self._robot.urdf))
-        self._frames = LinkFrames(self._cell.plant.model, self._cell.loose_objects)
-        self._tf_static.publish(self._frames.fixed.at(self._cell.plant.data, self.now))
+        self._moving, fixed = link_transforms(self._cell.plant.model, self._cell.loose_objects)
+        self._tf_static.publish(fixed.at(self._cell.plant.data, self.now))
 
     def _make_subscriptions(self) -> None:
         # Each arm may have a sender of its own, and the one's message is not to take the place of the other's.
         commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
-        for kind, topic, callback in (
-            (JointTrajectory, _TRAJECTORY, self._on_trajectory),
-            (JointState, "joint_commands", self._on_joint_state),
-            (Float64MultiArray, "position_commands", self._on_positions),
-            (Float64MultiArray, "velocity_commands", self._on_velocities),
-            (Float64MultiArray, "torque_commands", self._on_torques),
-        ):
-            self.create_subscription(kind, topic, partial(self._take, topic, callback), commands)
-
-    def _gripper(self, arm: str) -> GripperServer:
-        return GripperServer(
-            self,
-            f"/q2r2/{arm}_gripper/gripper_cmd",
-            _STROKE,
-            lambda opening: self._cell.command_gripper(arm, opening),
-            lambda fault: self._note(f"{arm}_gripper", fault),
+        names, move, push = self._robot.joint_names, self._cell.command_velocities, self._cell.command_torques
+        kinds: tuple[tuple[type, str, Callable[[Any], str | None]], ...] = (
+            (JointTrajectory, _TRAJECTORY, self._follow_trajectory),
+            (JointState, "joint_commands", lambda m: self._follow(m.name, m.position, m.velocity)),
+            (Float64MultiArray, "position_commands", lambda m: self._follow(names, m.data, ())),
+            (Float64MultiArray, "velocity_commands", lambda m: move(np.array(m.data), self._received)),
+            (Float64MultiArray, "torque_commands", lambda m: push(np.array(m.data), self._received)),
         )
+        for kind, topic, command in kinds:
+            self.create_subscription(kind, topic, partial(self._take, topic, command), commands)
 
-    def _take(self, topic: str, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
-        """Use a message now, or note why not."""
-        if not self.is_active:
-            self._note(topic, "the robot is deactivated; ros2 lifecycle set /cartesian_controller activate")
-            return
+    def _take(self, topic: str, command: Callable[[Any], str | None], message: Any, info: Mapping[str, Any]) -> None:
         # Two controllers of an arm each may send on one topic, from hosts with clocks of their own.
         names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
@@ -119,35 +193,21 @@ class MujocoRobot(ManagedNode):
             return
         # What came while this process stood still is as new as what came since the last tick.
         self._received = time.monotonic() - min(age(info), self._period)
-        callback(message)
+        self._note(topic, command(message))
 
-    def _on_trajectory(self, message: JointTrajectory) -> None:
-        points = message.points
-        if len(points) != 1:
-            self._note(_TRAJECTORY, f"{len(points)} points; allowed: one, a setpoint of a stream")
-            return
-        point = points[0]
-        self._follow(_TRAJECTORY, message.joint_names, point.positions, point.velocities, point.time_from_start)
+    def _follow_trajectory(self, message: JointTrajectory) -> str | None:
+        if len(message.points) != 1:
+            return f"{len(message.points)} points; allowed: one, a setpoint of a stream"
+        point = message.points[0]
+        return self._follow(message.joint_names, point.positions, point.velocities, seconds(point.time_from_start))
 
-    def _on_joint_state(self, message: JointState) -> None:
-        self._follow("joint_commands", message.name, message.position, message.velocity)
-
-    def _on_positions(self, message: Float64MultiArray) -> None:
-        self._follow("position_commands", self._robot.joint_names, message.data, ())
-
-    def _on_velocities(self, message: Float64MultiArray) -> None:
-        self._note("velocity_commands", self._cell.command_velocities(np.array(message.data, float), self._received))
-
-    def _on_torques(self, message: Float64MultiArray) -> None:
-        self._note("torque_commands", self._cell.command_torques(np.array(message.data, float), self._received))
-
-    def _follow(self, topic: str, names: Any, positions: Any, velocities: Any, delay: Any = None) -> None:
+    def _follow(self, names: Any, positions: Any, velocities: Any, delay: float = 0.0) -> str | None:
         v = np.asarray(velocities, float) if len(velocities) else None
-        setpoint = JointSetpoint(names, np.asarray(positions, float), v, 0.0 if delay is None else seconds(delay))
-        self._note(topic, self._cell.command_positions(setpoint, self._received))
+        return self._cell.command_positions(
+            JointSetpoint(names, np.asarray(positions, float), v, delay), self._received
+        )
 
     def _note(self, topic: str, fault: str | None) -> None:
-        """Say what was refused, until the topic brings something good again."""
         if fault is None:
             self._refused.pop(topic, None)
             return
@@ -163,55 +223,40 @@ class MujocoRobot(ManagedNode):
         state = cell.advance(now)
         self.ticked += 1
         stamp = self.now
-        self._publish_measured(state, stamp)
+        q = np.concatenate([state.q, cell.finger_positions()])
+        v = np.concatenate([state.v, cell.finger_velocities()])
+        tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])  # fingers' efforts are not measured
+        self._joint_states.publish(joint_state_message(self._measured_names, q, v, tau, stamp))
         if state.tau_external is not None and now >= self._external_due:
             # On a grid, half a tick early so that no tick of the grid is too early by its jitter.
             self._external_due = max(self._external_due + self._external_period, now - 0.5 * self._period)
-            self._publish_external(state.tau_external, stamp)
+            if self._external.get_subscription_count():
+                none = np.zeros(0)
+                torques = joint_state_message(self._robot.joint_names, none, none, state.tau_external, stamp)
+                self._external.publish(torques)
         openings = cell.plant.gripper_openings()
         for arm, gripper in self._grippers.items():
             gripper.update(now, openings[arm], cell.gripper_force(arm))
 
-    def _publish_external(self, torques: Array, stamp: float) -> None:
-        if self._external.get_subscription_count():
-            none = np.zeros(0)
-            self._external.publish(joint_state_message(self._robot.joint_names, none, none, torques, stamp))
-
-    def _publish_measured(self, state: RobotState, stamp: float) -> None:
-        q = np.concatenate([state.q, self._cell.finger_positions()])
-        v = np.concatenate([state.v, self._cell.finger_velocities()])
-        tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])  # fingers' efforts are not measured
-        self._joint_states.publish(joint_state_message(self._measured_names, q, v, tau, stamp))
-
     def _publish_transforms(self) -> None:
-        self._tf.publish(self._frames.moving.at(self._cell.plant.data, self.now))
+        self._tf.publish(self._moving.at(self._cell.plant.data, self.now))
 
-    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._cell.reset()
         response.success, response.message = True, "at home"
         return response
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        now = time.monotonic()
-        mode = self._cell.mode(now)
+        mode = self._cell.mode(time.monotonic())
         values = {
             "mode": mode,
-            "lifecycle": self.lifecycle_state,
             "loop_rate_hz": self.tick_rate(),
             "time_dropped_s": round(self._cell.dropped, 3),
             "refused_commands": self._refusals,
         }
         if self._refused:
             return WARN, "; ".join(f"{topic}: refused: {fault}" for topic, fault in self._refused.items()), values
-        if not self.is_active:
-            return WARN, "deactivated: takes no commands; ros2 lifecycle set /cartesian_controller activate", values
         return OK, mode, values
 
-    def begin(self) -> str | None:
-        """Take commands again; the first has to be where the arms are, as any has."""
-        self._refused.clear()
-        return None
-
     def close(self) -> None:
-        """Give the plant back."""
         self._cell.plant.close()

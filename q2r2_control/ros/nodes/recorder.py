@@ -2,28 +2,25 @@
 
 It listens to no topic that commands, where it would count as a receiver: an arm without a controller could be engaged
 then, and arms that are off their reference would be stopped. What arms ask for, and the reference that joint commands
-are made of, their nodes publish once more for it. On ``carry``, where arms' nodes talk to each other, nobody counts
-receivers, so it listens there too. Streams reach it by best effort, so no sender waits for it.
+are made of, their nodes publish once more for it. Streams reach it by best effort, so no sender waits for it.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
@@ -33,7 +30,7 @@ from q2r2_control.recording.messages import Message
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS, arm_events, heard_on, is_latched, is_reliable, ros_topics
 from q2r2_control.recording.topics import Topic
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, RECORDED_QOS, WARN, BaseNode
+from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, RECORDED_QOS, STEADY, WARN, BaseNode
 from q2r2_control.ros.bridge.messages import age
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.wording import sentence
@@ -47,7 +44,7 @@ _SERVICES = {
     "mark": ReasonKind.MARK,
 }
 HANDOVER_PERIOD = 0.02  # between two looks at what has arrived; a message waits for two of them at most [s]
-_STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+_STREAM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class RecorderNode(BaseNode):
@@ -77,25 +74,8 @@ class RecorderNode(BaseNode):
         self._waiting: list[Message] = []
         self._events = self.create_publisher(String, RECORDER_EVENTS, RECORDED_QOS)
         topics = ros_topics(tuple(robot.arms), cameras)
-        self._begun = time.monotonic_ns()
-        self._epoch, self._looked = time.time_ns(), 0
-        self._recorder.begin(self._about(config, robot, rate, notes, tuple(cameras)), topics)
-        told = {arm_events(arm) for arm in robot.arms}
-        for topic in topics:
-            qos = LATCHED_QOS if is_latched(topic.name) else RECORDED_QOS if is_reliable(topic) else _STREAM_QOS
-            take = partial(self._take, topic, topic.name in told)
-            self.create_subscription(_class_of(topic.type), heard_on(topic.name), take, qos, raw=True)
-        for name, kind in _SERVICES.items():
-            self.create_service(Trigger, f"~/{name}", partial(self._serve, kind))
-        self.create_tick(HANDOVER_PERIOD, self._write, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._marks.recorded = self._recorder.fault is None
-        if self._marks.recorded:
-            self.get_logger().info(f"records to {self._recorder.file}")
-
-    def _about(
-        self, config: Config, robot: Robot, rate: float, notes: Mapping[str, str], cameras: tuple[str, ...]
-    ) -> About:
-        return About(
+        self._begun, self._epoch, self._looked = time.monotonic_ns(), time.time_ns(), 0
+        about = About(
             arms=tuple(robot.arms),
             joints=tuple(robot.joint_names),
             mode="",
@@ -104,10 +84,26 @@ class RecorderNode(BaseNode):
             realtime=True,
             cell=as_yaml(config.model_copy(update={"loop_rate_hz": rate})),
             robot=robot.urdf,
-            cameras=cameras,
+            cameras=tuple(cameras),
             source=ROS,
             notes={**program(), **{name: text for name, text in notes.items() if text}},
         )
+        self._recorder.begin(about, topics)
+        self._listen(topics, {arm_events(arm) for arm in robot.arms})
+        for name, kind in _SERVICES.items():
+            self.create_service(Trigger, f"~/{name}", partial(self._serve, kind))
+        self.create_tick(HANDOVER_PERIOD, self._write, clock=STEADY)
+        self._marks.recorded = self._recorder.fault is None
+        if self._marks.recorded:
+            self.get_logger().info(f"records to {self._recorder.file}")
+
+    def _listen(self, topics: Iterable[Topic], told: set[str]) -> None:
+        for topic in topics:
+            qos = LATCHED_QOS if is_latched(topic.name) else RECORDED_QOS if is_reliable(topic) else _STREAM_QOS
+            take = partial(self._take, topic, topic.name in told)
+            package, _, kind = topic.type.split("/")
+            message = getattr(import_module(f"{package}.msg"), kind)
+            self.create_subscription(message, heard_on(topic.name), take, qos, raw=True)
 
     def _take(self, topic: Topic, told: bool, payload: bytes, info: Mapping[str, Any]) -> None:
         """Keep a message until :meth:`_write`; ``told``: it is an arm's event, which may be about an episode."""
@@ -139,7 +135,6 @@ class RecorderNode(BaseNode):
             self._tell(Reason.of(ReasonKind.RECORDING_ENDED, text=self._recorder.fault))
 
     def _serve(self, kind: ReasonKind, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Tell an event of the recording, unless it makes no sense now."""
         refusal, reason = self._refusal(kind), Reason(kind)
         response.success, response.message = refusal is None, refusal or sentence(reason)
         if refusal is None:
@@ -162,12 +157,11 @@ class RecorderNode(BaseNode):
             return f"{sentence(Reason(ReasonKind.NO_RECORDING))}: {self._recorder.fault}"
         if kind is ReasonKind.EPISODE_BEGINS and self._marks.open:
             return "an episode has begun and not ended"
-        if kind is ReasonKind.EPISODE_ENDS and not self._marks.open:
-            return "no episode has begun"
-        return "no episode has begun" if kind is ReasonKind.EPISODE_DISCARDED and not self._marks.any else None
+        none_open = kind is ReasonKind.EPISODE_ENDS and not self._marks.open
+        none_begun = kind is ReasonKind.EPISODE_DISCARDED and not self._marks.any
+        return "no episode has begun" if none_open or none_begun else None
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """What is recorded where, what was lost, and whether an episode is open, which arms' nodes read here."""
         recorder = self._recorder
         values = {
             "records": self._marks.recorded,
@@ -187,17 +181,11 @@ class RecorderNode(BaseNode):
 
     def close(self) -> None:
         """Write what there is, and say what became of it."""
-        self._judge.close()
-        self._recorder.record(self._waiting)
-        self._recorder.finish()
         recorder = self._recorder
+        self._judge.close()
+        recorder.record(self._waiting)
+        recorder.finish()
         lost = recorder.count - recorder.written.messages
         if recorder.file is not None:
             written = f"{recorder.file}: {recorder.written.messages} messages"
             self.get_logger().info(written + (f", {lost} lost" if lost else ""))
-
-
-def _class_of(name: str) -> Any:
-    """The Python class of a type such as std_msgs/msg/String."""
-    package, _, kind = name.split("/")
-    return getattr(import_module(f"{package}.msg"), kind)

@@ -1,20 +1,24 @@
-"""``SimulationInput``: publishes the messages of a headset from a script, for tests with an input free of tremor."""
+"""``SimulationInput`` publishes a headset's messages from a script free of tremor, ``hand_input`` from any input."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
+from q2r2_control.config.cell import load_config
+from q2r2_control.inputs.base import make_input
 from q2r2_control.inputs.messages import HandTwist, MessageType
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.inputs.trajectories import FIRST_PRESS, START, TRAJECTORIES
 from q2r2_control.ros.base_node import OK, WARN, BaseNode
-from q2r2_control.ros.bridge.hand_topics import HandPublishers
-from q2r2_control.ros.monitoring.node_states import HandListeners
+from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_haptics
+from q2r2_control.ros.monitoring import HandListeners
 from q2r2_control.types import SIDES, HandSample
 
+_PERIOD = 0.002  # between two polls of another input [s]
 _SHORTEST, _LONGEST = 0.001, 0.02  # between two looks at what has come due [s]
 # Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
@@ -41,19 +45,17 @@ class SimulationInput(BaseNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("simulation_input", **kwargs)
         side = self.parameter("side", "both", "Which hands move.", one_of=(*SIDES, "both"))
-        mode = self.parameter(
-            "mode", "all", "teleop: poses and inputs; velocity: twists; all: all three.", one_of=tuple(_MODES)
-        )
+        what = "teleop: poses and inputs; velocity: twists; all: all three."
+        mode = self.parameter("mode", "all", what, one_of=tuple(_MODES))
         trajectory = self.parameter("trajectory", "circle", "What the hands do.", one_of=tuple(TRAJECTORIES))
         rate = self.parameter("rate", 75.0, "Samples of each hand [Hz].", within=(1.0, 250.0))
         jitter = self.parameter("jitter", 0.0, "Samples come later by up to this, at random [s].", within=(0.0, 0.01))
         self._frame = self.parameter("frame_id", "", "Frame of the poses; a headset gives none.")
         self._waits_for_subscribers = True
         self._hands = SIDES if side == "both" else (side,)
-        self._title = f"{trajectory} of {' and '.join(self._hands)}"
+        self._title, self._samples = f"{trajectory} of {' and '.join(self._hands)}", 0
         self._hand_publishers = HandPublishers(self, self._hands, _MODES[mode])
-        self._samples = 0
-        self._trajectory, self._rate, self._jitter = trajectory, rate, jitter
+        self._make_script = partial(ScriptedInput, trajectory, self._hands, rate_hz=rate, jitter=jitter)
         self._listeners = HandListeners(self, self._hands if MessageType.INPUTS in _MODES[mode] else ())
         self._starts = True  # until nothing is pressed again to engage the arms
         self._moves = False  # whether the hands do
@@ -63,7 +65,6 @@ class SimulationInput(BaseNode):
         self._timer = self.create_tick(_LONGEST, self._tick)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """What is played, or which subscriber is missing."""
         values = {"samples": self._samples, "sent": self._hand_publishers.sent}
         if self._waits_for_subscribers:
             return WARN, f"waits for a subscriber of {' and '.join(self._missing())}", values
@@ -76,12 +77,6 @@ class SimulationInput(BaseNode):
 
     def _tick(self) -> None:
         """Play, and come again when the next sample is due."""
-        self._play()
-        wait = min(max(self._script.due() - self.now, _SHORTEST), _LONGEST)
-        self._timer.timer_period_ns = int(1e9 * wait)
-        self._timer.reset()
-
-    def _play(self) -> None:
         if self._waits_for_subscribers:
             if self._missing():
                 return
@@ -93,6 +88,9 @@ class SimulationInput(BaseNode):
             self._engage(now)
         for sample in self._script.poll(now):
             self._publish(sample)
+        wait = min(max(self._script.due() - self.now, _SHORTEST), _LONGEST)
+        self._timer.timer_period_ns = int(1e9 * wait)
+        self._timer.reset()
 
     def _engage(self, now: float) -> None:
         """Begin the script anew, where its hands rest, until the arms are ready, and then until they follow."""
@@ -119,7 +117,7 @@ class SimulationInput(BaseNode):
             self._rewind(now)
 
     def _rewind(self, now: float) -> None:
-        self._script = ScriptedInput(self._trajectory, self._hands, rate_hz=self._rate, jitter=self._jitter)
+        self._script = self._make_script()
         self._script.start()
         self._began, self._not_to_press, self._moves = now, None, False
 
@@ -129,3 +127,38 @@ class SimulationInput(BaseNode):
         twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
         self._hand_publishers.publish_sample(sample, self._frame, HandTwist(twist.linear, twist.angular))
         self._samples += 1
+
+
+class HandInput(BaseNode):
+    """Polls an input and publishes each sample. A pose with a fault is left out, so that its arm pauses.
+
+    Raises :class:`ConfigError` for an unknown input or control.
+    """
+
+    ticks = True
+    priority = 37
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("hand_input", **kwargs)
+        config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
+        name = self.parameter("input", config.input, "An installed input.")
+        self._input = make_input(name, config)
+        config.teleop.bindings.check_device(self._input.controls)
+        self._title, self._samples = name, 0
+        self._hand_publishers = HandPublishers(self, kinds=(MessageType.POSE, MessageType.INPUTS))
+        subscribe_to_haptics(self, self._input.send_haptic)
+        self._input.start()
+        self.create_timer(_PERIOD, self._tick)
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        values = {"samples": self._samples, "sent": self._hand_publishers.sent}
+        connected = self._input.connected
+        return OK if connected else WARN, self._title if connected else f"{self._title} is not connected", values
+
+    def close(self) -> None:
+        self._input.close()
+
+    def _tick(self) -> None:
+        for sample in self._input.poll(self.now):
+            self._hand_publishers.publish_sample(sample)
+            self._samples += 1

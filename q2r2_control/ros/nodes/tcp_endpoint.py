@@ -1,38 +1,40 @@
-"""``tcp_endpoint``: the TCP server of the Quest2ROS app, between its connection and ROS topics.
-
-Each message is published by the thread that receives it: polling would add its period, and drop twists.
-"""
+"""``tcp_endpoint``: the TCP server of the Quest2ROS app; ``CheckTCPconnection``: a live view of what it publishes."""
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Mapping
 from typing import Any
 
+from rich.console import Console
+from rich.live import Live
+
 from q2r2_control.config.cell import HeadsetConfig, load_config
-from q2r2_control.config.strict import Network, network_of
-from q2r2_control.config.teleop import GateSettings
+from q2r2_control.config.strict import network_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.addresses import access_lines, written
 from q2r2_control.inputs.hands_watch import HandsWatch, Watched
-from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.headset import HeadsetServer, watch_of
 from q2r2_control.inputs.headset_check import SILENCE
-from q2r2_control.inputs.messages import HandPose
-from q2r2_control.ros.base_node import OK, WARN, BaseNode
-from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_haptics
+from q2r2_control.inputs.messages import HandMessage, HandPose
+from q2r2_control.inputs.session import HAND_TOPICS, TopicRecorder, TopicStatistics
+from q2r2_control.ros.base_node import ERROR, OK, STEADY, WARN, BaseNode
+from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_hands, subscribe_to_haptics
 from q2r2_control.types import SIDES, HandFault
+from q2r2_control.viewer.headset_table import topic_line, topic_table
 from q2r2_control.wording import sentence
 
+_TABLE_PERIOD, _LINES_PERIOD = 0.2, 1.0  # [s]
 _SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
 
 
 class TcpEndpoint(BaseNode):
-    """Serves one headset at a time. Numbers are passed on unchanged, and so is the frame unless one is configured.
+    """Serves one headset at a time. Each message is published as it is by the thread that receives it.
 
     Poses are stamped with this node's clock when they are received, since the headset has a clock of its own. Poses
     that no arm may follow, frozen ones and those of a frame that moved, are left out, so that arms pause.
-
     Raises :class:`InputError` when host and port cannot be bound, :class:`ConfigError` for what ``allow`` cannot be.
     """
 
@@ -40,32 +42,28 @@ class TcpEndpoint(BaseNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("tcp_endpoint", **kwargs)
-        config = self.parameter("config", "", 'YAML of the cell, whose block headset are defaults of these; "": none')
+        config = self.parameter("config", "", 'YAML of the cell, whose block headset counts; "": none')
         cell = load_config(config) if config else None
-        headset, gate = (cell.headset, cell.teleop.gate) if cell else (HeadsetConfig(), GateSettings())
+        headset = cell.headset if cell else HeadsetConfig()
         host = self.parameter("host", headset.host, "Address to listen on; 0.0.0.0 admits the network.")
         port = self.parameter("port", headset.port, "TCP port; 0 takes any free one.", within=(0, 65535))
-        allow = self.parameter(
-            "allow", ",".join(headset.allow or ()), "Addresses and networks that may connect, by commas; empty: all."
-        )
-        networks = _networks(allow)
+        what = "Addresses and networks that may connect, by commas; empty: all."
+        allow = self.parameter("allow", ",".join(headset.allow or ()), what)
+        try:
+            networks = tuple(network_of(text.strip()) for text in allow.split(",")) if allow.strip() else None
+        except ValueError as error:
+            raise ConfigError(f"parameter allow: {error}") from None
         self._frames = {
             hand: self.parameter(f"{hand}_frame_id", "", f"Frame of {hand} poses; empty: what the headset says.")
             for hand in SIDES
         }
         self._hand_publishers = HandPublishers(self)
-        frozen_time = self.parameter(
-            "frozen_time",
-            headset.frozen_time or 0.0,
-            "Poses the same to the last bit for this long are left out [s]; 0: never.",
-            within=(0.0, 10.0),
-        )
-        frame = self.parameter("watch_frame", headset.watch_frame, "Leave out poses of a frame that moved.")
-        watch = HandsWatch(frozen_time or None, frame, gate.timeout)
+        watch = watch_of(cell) if cell else HandsWatch()
         self._faults: dict[str, HandFault | None] = dict.fromkeys(SIDES)
         self._server = HeadsetServer(host, port, listener=self._publish, allow=networks, watch=watch)
         subscribe_to_haptics(self, self._server.send_haptic)
-        self._log = _ToRosLog(self.get_logger())
+        self._log = logging.Handler()
+        self._log.emit = self._pass_on  # type: ignore[method-assign]
         _SERVER_LOG.addHandler(self._log)
         _SERVER_LOG.setLevel(logging.INFO)
         self._server.start()
@@ -74,7 +72,6 @@ class TcpEndpoint(BaseNode):
             self.get_logger().info(line)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """Which headset is connected, and the rate of each topic."""
         statistics = self._server.statistics
         address = written(*statistics.address)
         values = {
@@ -94,7 +91,6 @@ class TcpEndpoint(BaseNode):
         return OK, f"{statistics.peer} is connected", values
 
     def close(self) -> None:
-        """Drop the headset and stop listening."""
         self._server.close()
         _SERVER_LOG.removeHandler(self._log)
 
@@ -104,31 +100,72 @@ class TcpEndpoint(BaseNode):
             before, self._faults[reception.hand] = self._faults[reception.hand], watched.fault
             if watched.fault is not None:
                 if before is not watched.fault:
-                    self.get_logger().warning(
-                        f"{reception.hand} hand: {sentence(Reason(ReasonKind(watched.fault)))}; its poses are left out"
-                    )
+                    why = sentence(Reason(ReasonKind(watched.fault)))
+                    self.get_logger().warning(f"{reception.hand} hand: {why}; its poses are left out")
                 return
         frame = self._frames[reception.hand] or (message.frame_id if isinstance(message, HandPose) else "")
         self._hand_publishers.publish(reception.topic, message, frame, self.now)
 
-
-def _networks(allow: str) -> tuple[Network, ...] | None:
-    try:
-        return tuple(network_of(text.strip()) for text in allow.split(",")) if allow.strip() else None
-    except ValueError as error:
-        raise ConfigError(f"parameter allow: {error}") from None
-
-
-class _ToRosLog(logging.Handler):
-    """Passes the log of the server on to the log of the node."""
-
-    def __init__(self, logger: Any) -> None:
-        super().__init__()
-        self._logger = logger
-
-    def emit(self, record: logging.LogRecord) -> None:
+    def _pass_on(self, record: logging.LogRecord) -> None:
         # rclpy allows one severity for each line of code.
         if record.levelno >= logging.WARNING:
-            self._logger.warning(self.format(record))
+            self.get_logger().warning(self._log.format(record))
         else:
-            self._logger.info(self.format(record))
+            self.get_logger().info(self._log.format(record))
+
+
+class CheckTcpConnection(BaseNode):
+    """Shows pose, inputs and twist of both hands with rate and age: a table on a terminal, else a line a topic.
+
+    A topic that is silent for 2 s has timed out. Ages are measured with the machine's steady clock, not in ROS time.
+    After ``duration`` it ends, with exit code 1 when every topic has timed out.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("check_tcp_connection", **kwargs)
+        duration = self.parameter("duration", 0.0, "Ends after this time; 0: on Ctrl-C [s].", within=(0.0, 86400.0))
+        self._recorders: dict[str, TopicRecorder] = {}
+        self._start, self._console = time.monotonic(), Console()
+        self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
+        if self._live is not None:
+            self._live.start()
+        subscribe_to_hands(self, self._hear)
+        self.create_timer(_TABLE_PERIOD if self._live else _LINES_PERIOD, self._show, clock=STEADY)
+        if duration > 0.0:
+            self.create_timer(duration, self._finish, clock=STEADY)
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        topics, silent = self._topics()
+        values = {name: topic.rate for name, topic in topics.items() if topic is not None}
+        if not silent:
+            return OK, "no timeout", {"rate_hz": values}
+        level = ERROR if len(silent) == len(topics) else WARN
+        return level, f"timeout, nothing for {SILENCE:g} s: {', '.join(silent)}", {"rate_hz": values}
+
+    def close(self) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def _hear(self, topic: str, message: HandMessage) -> None:
+        self._recorders.setdefault(topic, TopicRecorder()).record(message, time.monotonic())
+
+    def _topics(self) -> tuple[dict[str, TopicStatistics | None], list[str]]:
+        """Of each topic what came, and the topics that are silent."""
+        now, heard = time.monotonic(), self._recorders
+        topics = {name: heard[name].snapshot(now) if name in heard else None for name in HAND_TOPICS}
+        ages = {name: now - self._start if topic is None else topic.age for name, topic in topics.items()}
+        return topics, [name for name, age in ages.items() if age > SILENCE]
+
+    def _show(self) -> None:
+        topics, silent = self._topics()
+        if self._live is not None:
+            title = f"timeout, nothing for {SILENCE:g} s" if len(silent) == len(topics) else "hands"
+            self._live.update(topic_table(title, topics, silent), refresh=True)
+            return
+        for name, topic in topics.items():
+            line = topic_line(name, topic, name in silent)
+            self._console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+    def _finish(self) -> None:
+        topics, silent = self._topics()
+        self.exit_code = int(len(silent) == len(topics))

@@ -1,13 +1,22 @@
-"""What is wrong with a set of nodes, and what helps: from what the graph and the nodes say at one moment."""
+"""What is wrong with a set of nodes or with the environment, and what helps; found out without importing rclpy here.
+
+A middleware that is not installed ends the process that asks for it, so another process tries.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import json
+import subprocess
+import sys
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 from q2r2_control.events import ReasonKind
-from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView, TopicView
+from q2r2_control.ros.launch.build import interface_packages
+from q2r2_control.ros.launch.middleware import set_up_middleware
+from q2r2_control.ros.watching.set_view import SILENT, NodeView, SetView
 from q2r2_control.teleop.arm_states import ArmState
 
 _ONE = "end all but one (a killed one counts for some seconds)"
@@ -30,54 +39,32 @@ _SEE = "docs/ros.md, What moves an arm, and what stops it"
 class Finding:
     """Something that is wrong, and what helps, in a line each."""
 
-    stops_arms: bool
+    stops_arms: bool  # keeps them from moving, or stops them
     what: str
     cure: str
 
 
 def error(what: str, cure: str) -> Finding:
-    """A finding that keeps arms from moving, or stops them."""
     return Finding(True, what, cure)
 
 
-def warning(what: str, cure: str) -> Finding:
-    """One that does not, or not yet."""
-    return Finding(False, what, cure)
-
-
 def examine_set(view: SetView, expected: Collection[str]) -> list[Finding]:
-    """Findings of a set; ``expected``: names that its nodes end with, such as ``left_arm_controller``.
-
-    None where no node of a set runs: that is no fault.
-    """
+    """Findings of a set, none where none runs; ``expected``: names that nodes end with, as ``left_arm_controller``."""
     if not view.nodes:
         return []
-    return [
-        *_twice(view),
-        *_missing(view, expected),
-        *_node_findings(view.nodes),
-        *_senders(view),
-        *_takers(view),
-        *_arm_findings(view.arms, view.nodes),
-    ]
+    return [*_nodes(view, expected), *_senders(view), *_receivers(view), *_arms(view)]
 
 
-def _twice(view: SetView) -> Iterator[Finding]:
+def _nodes(view: SetView, expected: Collection[str]) -> Iterator[Finding]:
     for name, count in Counter(view.names).items():
         if count > 1:
             yield error(f"{count} nodes are called {name}", _ONE)
-
-
-def _missing(view: SetView, expected: Collection[str]) -> Iterator[Finding]:
-    controllers = [node for node in view.nodes if node.is_controller]
-    if "cartesian_controller" in expected and not controllers:
+    if "cartesian_controller" in expected and not any(node.is_controller for node in view.nodes):
         yield error("no built-in controller runs", "start cartesian_controller, or q2r2 ros up")
-    if "mujoco_robot" in expected and not _publishers(view, "joint_states"):
+    states = [topic for topic in view.topics if topic.name.rpartition("/")[2] == "joint_states"]
+    if "mujoco_robot" in expected and not any(topic.publishers for topic in states):
         yield error("nothing publishes joint states", "start the robot's driver, or mujoco_robot")
-
-
-def _node_findings(nodes: Iterable[NodeView]) -> Iterator[Finding]:
-    for node in nodes:
+    for node in view.nodes:
         if node.age > SILENT:
             yield error(f"{node.name} is silent for {node.age:.0f} s", "restart it; its log says how it ended")
         elif node.clock_problem:
@@ -88,14 +75,12 @@ def _node_findings(nodes: Iterable[NodeView]) -> Iterator[Finding]:
 
 
 def _senders(view: SetView) -> Iterator[Finding]:
-    """Commands, targets and hands come from one node each."""
     controllers = {node.name: node for node in view.nodes if node.is_controller}
     counted = {topic for node in view.nodes for topic in node.sent}
     for topic in view.topics:
         if len(topic.types) > 1:
-            yield error(
-                f"{topic.name} has {len(topic.types)} types: {', '.join(topic.types)}", "rename one of the topics"
-            )
+            types = ", ".join(topic.types)
+            yield error(f"{topic.name} has {len(topic.types)} types: {types}", "rename one of the topics")
         if topic.name not in counted or len(topic.publishers) < 2:
             continue
         arms = [controllers[name].arms for name in topic.publishers if name in controllers]
@@ -109,8 +94,7 @@ def _senders(view: SetView) -> Iterator[Finding]:
             yield error(f"{robot} is commanded by several: {names}", _ONE)
 
 
-def _takers(view: SetView) -> Iterator[Finding]:
-    """Targets and commands are for one node each."""
+def _receivers(view: SetView) -> Iterator[Finding]:
     controllers = {node.name for node in view.nodes if node.is_controller}
     senders = [node for node in view.nodes if node.arm is not None or node.is_controller]
     counted = {topic for node in senders for topic in node.sent}
@@ -122,22 +106,17 @@ def _takers(view: SetView) -> Iterator[Finding]:
             yield error(f"two controllers take {topic.name}: {names}", _ONE)
         else:
             what = f"{topic.name} has {len(topic.subscribers)} takers: {names}"
-            yield warning(what, "end those that only look: a listener counts as a controller or driver")
+            yield Finding(False, what, "end those that only look: a listener counts as a controller or driver")
 
 
-def _arm_findings(arms: Iterable[ArmView], nodes: Iterable[NodeView]) -> Iterator[Finding]:
-    said = {node.name: node for node in nodes}
-    for arm in arms:
+def _arms(view: SetView) -> Iterator[Finding]:
+    said = {node.name: node for node in view.nodes}
+    for arm in view.arms:
         node = said.get(arm.node)
         if node is None:
             yield error(f"the {arm.name} arm: {arm.why}", f"start {arm.name}_arm_controller, or q2r2 ros up")
         elif not (node.age > SILENT or node.clock_problem or node.values.get("ready") or node.values.get("engaged")):
             yield error(f"the {arm.name} arm: {arm.why}", _cure(node, arm.why))
-
-
-def _publishers(view: SetView, base: str) -> tuple[str, ...]:
-    found: Iterable[TopicView] = (topic for topic in view.topics if topic.name.rpartition("/")[2] == base)
-    return tuple(dict.fromkeys(name for topic in found for name in topic.publishers))
 
 
 def _cure(node: NodeView, line: str) -> str:
@@ -146,3 +125,82 @@ def _cure(node: NodeView, line: str) -> str:
     if kind == ReasonKind.CONTROLLER_REFUSES or node.values.get("state") == ArmState.STOPPED:
         return line
     return next((cure for known, cure in _CURES.items() if known == kind), _SEE)
+
+
+# What the nodes import, besides the packages under ``interfaces``.
+PACKAGES = (
+    *("rclpy", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "rcl_interfaces"),
+    *("sensor_msgs", "std_msgs", "std_srvs", "trajectory_msgs", "visualization_msgs"),
+)
+_GREATEST_DOMAIN = 232
+# Also tries each package of messages, whose code is given; the last line is the middleware's name.
+_TRY = """
+import json, sys
+import rclpy
+from rclpy.utilities import get_rmw_implementation_identifier
+rclpy.init(args=[])
+rclpy.create_node("q2r2_doctor_try", enable_rosout=False)
+for name, proof in json.loads(sys.argv[1]).items():
+    try:
+        exec(proof)
+    except Exception:
+        print("lacks", name)
+print(get_rmw_implementation_identifier())
+"""
+_INSTALL = "pip install 'q2r2_control[ros]', or source a ROS 2 Jazzy"
+
+
+def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str], list[Finding]]:
+    """Facts by name, and what is wrong; ``environment``: of the process, as the user has set it."""
+    findings = []
+    domain = environment.get("ROS_DOMAIN_ID") or "0"
+    if not (domain.isdecimal() and int(domain) <= _GREATEST_DOMAIN):
+        cure = f"export ROS_DOMAIN_ID=<0 .. {_GREATEST_DOMAIN}>, the same in every terminal"
+        findings.append(error(f"ROS_DOMAIN_ID is {domain!r:.40}", cure))
+    if (distribution := environment.get("ROS_DISTRO", "jazzy")) != "jazzy":
+        what = f"ROS {distribution} is sourced; the nodes are made for jazzy"
+        findings.append(Finding(False, what, "source a ROS 2 Jazzy"))
+    peers = environment.get("ROS_STATIC_PEERS")
+    reaches = (environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET") + (f", and {peers}" if peers else "")
+    if environment.get("ROS_LOCALHOST_ONLY") == "1":
+        reaches = "this machine only (ROS_LOCALHOST_ONLY)"
+    facts = {
+        "python": f"{sys.version_info.major}.{sys.version_info.minor}",
+        "ros": environment.get("ROS_DISTRO") or "not sourced: from this Python environment",
+        "domain": domain,
+        "middleware": environment.get("RMW_IMPLEMENTATION") or "the default",
+        "reaches": reaches,
+    }
+    if missing := [name for name in PACKAGES if importlib.util.find_spec(name) is None]:
+        findings.append(error(f"Python cannot import {', '.join(missing)}", _INSTALL))
+    packages = {package.name: package.proof for package in interface_packages()}
+    lacking = [name for name in packages if importlib.util.find_spec(name) is None]
+    if "rclpy" not in missing and not any(finding.stops_arms for finding in findings):
+        answer = _try_ros(environment, packages)
+        if isinstance(answer, Finding):
+            findings.append(answer)
+        else:
+            *lines, facts["middleware"] = answer
+            lacking = [line.removeprefix("lacks ") for line in lines if line.startswith("lacks ")]
+    if lacking:
+        what = f"the messages of {', '.join(lacking)} cannot be imported"
+        findings.append(error(what, "q2r2 ros build-interfaces"))
+    return facts, findings
+
+
+def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> list[str] | Finding:
+    """What a node prints that tries ROS and the code of ``packages``, or why there is no node."""
+    own = dict(environment)
+    set_up_middleware(own)
+    try:
+        run = subprocess.run(
+            [sys.executable, "-c", _TRY, json.dumps(packages)], env=own, capture_output=True, text=True, timeout=60.0
+        )
+    except subprocess.TimeoutExpired:
+        return error("a node does not start within 60 s", "look for what else takes this machine's processors")
+    if run.returncode == 0:
+        return run.stdout.splitlines()
+    lines = [line for line in run.stderr.splitlines() if line.strip()]
+    wanted = environment.get("RMW_IMPLEMENTATION")
+    cure = f"unset RMW_IMPLEMENTATION, or install {wanted}" if wanted else _INSTALL
+    return error(f"no node can start: {lines[-1] if lines else f'exit code {run.returncode}'}"[:300], cure)

@@ -20,8 +20,7 @@ from rclpy.node import Node
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.ros.launch.middleware import set_up_middleware
-from q2r2_control.ros.monitoring.endpoints import node_of
-from q2r2_control.ros.monitoring.node_states import NodeStates
+from q2r2_control.ros.monitoring import NodeStates, node_of
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
 
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]
@@ -46,9 +45,7 @@ class SetListener:
         self._names: tuple[str, ...] = ()
 
     def look(self) -> None:
-        """Ask the graph; listen to what has appeared."""
-        node = self._node
-        own = node.get_fully_qualified_name()
+        node, own = self._node, self._node.get_fully_qualified_name()
         self._topics = {name: tuple(types) for name, types in node.get_topic_names_and_types()}
         for topic in self._topics:
             self._publishers[topic] = _names(node.get_publishers_info_by_topic(topic), own)
@@ -58,14 +55,17 @@ class SetListener:
         self._names = tuple(sorted(name for name in found if name != own))
 
     def view(self) -> SetView:
-        """All that is known now."""
         now = time.monotonic()
         nodes = tuple(
             NodeView(name, state["level"], state["message"], now - at, state)
             for name, (state, at) in sorted(self._states.newest.items())
         )
         members = {node.name for node in nodes}
-        topics = tuple(self._topic(name) for name in sorted(self._topics) if self._is_shown(name, members))
+        topics = tuple(
+            TopicView(name, types, self._publishers[name], self._subscribers[name], self._rate(name))
+            for name, types in sorted(self._topics.items())
+            if self._is_shown(name, members)
+        )
         return SetView(nodes, topics, self._names, arm_views(nodes, self._cell))
 
     def _note(self, name: str, state: dict[str, Any]) -> None:
@@ -74,41 +74,32 @@ class SetListener:
             if isinstance(count, int):
                 self._sent.setdefault((name, topic), deque(maxlen=_COUNTS)).append((time.monotonic(), count))
 
-    def _rate(self, name: str, topic: str) -> float | None:
-        """How often a node sends on ``topic``, as it says [Hz]."""
-        counts = self._sent.get((name, topic))
-        if counts is None or len(counts) < 2:
-            return None
-        (began, first), (ended, last) = counts[0], counts[-1]
-        return max(last - first, 0) / max(ended - began, 1e-9)
+    def _rate(self, topic: str) -> float | None:
+        """Of all that say how much they send there [Hz]."""
+        rates = []
+        for name in self._publishers[topic]:
+            counts = self._sent.get((name, topic))
+            if counts is not None and len(counts) > 1:
+                (began, first), (ended, last) = counts[0], counts[-1]
+                rates.append(max(last - first, 0) / max(ended - began, 1e-9))
+        return sum(rates) if rates else None
 
     def _is_shown(self, topic: str, members: set[str]) -> bool:
-        """Whether some node of the set awaits it, or sends it and somebody counts or takes it.
-
-        What every node has, and the parts of actions, are left out.
-        """
+        """Whether some node of the set awaits it, or sends it and somebody counts or takes it."""
         if topic in _OWN or "/_action/" in topic or topic.removesuffix("/state") in members:
             return False
         if members.intersection(self._publishers[topic]):
             counted = any(topic == told for _, told in self._sent)
             return bool(counted or self._subscribers[topic])
-        takers = members.intersection(self._subscribers[topic])
-        return any(self._publishers[topic] or _awaits(self._states.newest[taker][0]) for taker in takers)
-
-    def _topic(self, topic: str) -> TopicView:
-        rates = [self._rate(name, topic) for name in self._publishers[topic]]
-        known = [rate for rate in rates if rate is not None]
-        rate = sum(known) if known else None
-        return TopicView(topic, self._topics[topic], self._publishers[topic], self._subscribers[topic], rate)
+        receivers = [self._states.newest[name][0] for name in members.intersection(self._subscribers[topic])]
+        # Arms and controllers need what they receive; a robot receives one of many kinds of commands.
+        return any(self._publishers[topic] or "arm" in state or "phase" in state for state in receivers)
 
 
 def watch_set(
     cell: Config, duration: float | None, show: Callable[[SetView], None], stop: Callable[[], bool]
 ) -> SetView:
-    """Listen for ``duration`` [s], or without one until ``stop`` says so; ``show`` gets a view now and then.
-
-    Returns the last view. Raises :class:`WatchError`.
-    """
+    """Listen for ``duration`` [s] or until ``stop``; ``show`` gets views. The last one. Raises :class:`WatchError`."""
     set_up_middleware(os.environ)
     try:
         rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
@@ -132,12 +123,6 @@ def watch_set(
         rclpy.try_shutdown()
 
 
-def _awaits(state: dict[str, Any]) -> bool:
-    """Whether a node needs what it takes: arms and controllers do, a robot takes one of many kinds of commands."""
-    return "arm" in state or "phase" in state
-
-
 def _names(endpoints: list[Any], own: str) -> tuple[str, ...]:
-    """Full names of the nodes of ``endpoints`` without this one, once for each endpoint."""
     names = (node_of(endpoint) or "a node not known yet" for endpoint in endpoints)
     return tuple(sorted(name for name in names if name != own))

@@ -39,12 +39,10 @@ class NodeView:
 
     @property
     def is_controller(self) -> bool:
-        """Whether it is a built-in controller."""
         return "phase" in self.values
 
     @property
     def is_robot(self) -> bool:
-        """Whether it takes joint commands and says so."""
         return "refused_commands" in self.values
 
     @property
@@ -60,7 +58,6 @@ class NodeView:
 
     @property
     def clock_problem(self) -> str:
-        """What is wrong with its time; "" for nothing."""
         return str(self.values.get("clock_problem", ""))
 
 
@@ -88,8 +85,6 @@ class ArmView:
 
 @dataclass(frozen=True, slots=True)
 class SetView:
-    """All of it."""
-
     nodes: tuple[NodeView, ...]
     topics: tuple[TopicView, ...]
     names: tuple[str, ...]  # of all nodes in the domain, one that runs twice twice
@@ -109,20 +104,16 @@ def arm_views(nodes: tuple[NodeView, ...], cell: Config) -> tuple[ArmView, ...]:
     for arm in cell.arms:
         found = [node for node in nodes if node.arm == arm]
         for node in found:
-            views.append(ArmView(arm, node.name, *_states(node, controller, arm), _why(node, controller, cell)))
+            said = "" if controller is None else str(controller.values.get(f"{arm}_state", ""))
+            state = str(node.values.get("state", ""))
+            views.append(ArmView(arm, node.name, state, said, _why(node, controller, cell)))
         if not found:
             why = f"no node teleoperates this arm: start {arm}_arm_controller, or q2r2 ros up"
             views.append(ArmView(arm, "", "", "", why))
     return tuple(views)
 
 
-def _states(node: NodeView, controller: NodeView | None, arm: str) -> tuple[str, str]:
-    said = "" if controller is None else str(controller.values.get(f"{arm}_state", ""))
-    return str(node.values.get("state", "")), said
-
-
 def _why(node: NodeView, controller: NodeView | None, cell: Config) -> str:
-    """Why an arm moves, or does not, in one line."""
     values, arm = node.values, node.arm or ""
     if node.age > SILENT:
         return f"{node.name} is silent for {node.age:.0f} s: it has ended, hangs, or the network lost it"
@@ -147,13 +138,10 @@ def _why_engaged(values: Mapping[str, Any], controller: NodeView | None, arm: st
         return f"engaged, but no pose of the {values.get('hand')} hand for {age:.0f} s"
     slip = values.get("slip")
     if isinstance(slip, int | float) and slip > _SLIPPED:
-        near = "" if controller is None else _nearest(controller.values)
+        nearest: Mapping[str, Any] = {} if controller is None else controller.values
+        distance, pair = nearest.get("closest_distance_m"), str(nearest.get("closest_pair", "")).replace("|", " | ")
+        near = f"; nearest pair {pair}, {1e3 * distance:.0f} mm" if isinstance(distance, int | float) else ""
         return f"held up, {1e3 * slip:.0f} mm short of the hand{near}"
     if controller is not None and controller.level != "ok" and arm in controller.message:
         return f"engaged; {controller.name}: {controller.message}"
     return "follows the hand"
-
-
-def _nearest(values: Mapping[str, Any]) -> str:
-    distance, pair = values.get("closest_distance_m"), str(values.get("closest_pair", "")).replace("|", " | ")
-    return f"; nearest pair {pair}, {1e3 * distance:.0f} mm" if isinstance(distance, int | float) else ""

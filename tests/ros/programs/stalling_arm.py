@@ -14,25 +14,18 @@ STALL = 3.0  # more than the timeouts of the tests' arm rig [s]
 
 
 class StallingArm(LeftArmController):
-    """Its outputs are reached late, once for each signal."""
-
     def setup_interfaces(self) -> None:
         super().setup_interfaces()
-        self._stalls = False
-        signal.signal(signal.SIGUSR1, self._on_signal)
         outputs: Any = self.outputs
+        stalls: list[float] = []
         step = outputs.step
+        signal.signal(signal.SIGUSR1, lambda *_: stalls.append(STALL))
 
         def late(*values: Any) -> Any:
-            if self._stalls:
-                self._stalls = False
-                time.sleep(STALL)
+            time.sleep(stalls.pop() if stalls else 0.0)
             return step(*values)
 
         outputs.step = late
-
-    def _on_signal(self, *_: Any) -> None:
-        self._stalls = True
 
 
 if __name__ == "__main__":

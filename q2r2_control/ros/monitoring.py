@@ -1,20 +1,21 @@
-"""The other ends of a topic: which nodes publish on it, and whether its subscribers still acknowledge messages."""
+"""What a node knows of others: who publishes and subscribes, who still acknowledges, what they say on ``~/state``."""
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
+from std_msgs.msg import String
 
-from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STREAM_QOS, BaseNode
+from q2r2_control.events import ReasonKind
+from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS, BaseNode
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
 _PERIOD = 0.5  # of asking the graph where no other code asks [s]
@@ -24,8 +25,11 @@ _NO_WAIT = Duration(nanoseconds=0)
 _CHECK, _GAP = 0.05, 0.015
 _ASKED = 0.02  # after all was acknowledged, it is asked again [s]
 _LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # [s]
-
-
+_STATE = "/state"
+_LOOK_PERIOD = 0.3  # of asking the graph for nodes that report [s]
+_DISCOVERY = 2.0  # an arm that is there has said so by then: nodes report twice a second [s]
+_SILENT, _GONE = 2.0, 5.0  # without a report [s]
+_ARM = {"engaged", "ready", "hand"}  # what an arm's node says
 # By the number of an endpoint, which is unique. A node that the graph has lost, such as one that was frozen or
 # unreachable for longer than its lease, comes back with the same endpoints, and Fast DDS never learns their node again.
 _known: dict[bytes, str] = {}
@@ -40,17 +44,13 @@ def node_of(endpoint: Any) -> str | None:
 
 
 class Publishers:
-    """Which nodes publish on some topics, asked now and then; names are kept after a node has left the graph.
-
-    The graph lists one that was killed for some seconds more, beside its successor.
-    """
+    """Which nodes publish on some topics, asked now and then; names are kept after a node has left the graph."""
 
     def __init__(self, node: Node, topics: Iterable[str]) -> None:
         self._node = node
         self._names: dict[str, str] = dict.fromkeys(topics, "")
         self._asked_at = dict.fromkeys(self._names, -math.inf)
-        # While /clock stands still, too.
-        node.create_timer(_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node.create_timer(_PERIOD, partial(self._ask, *self._names), clock=STEADY)
 
     def of(self, topic: str) -> str:
         """Full names of the nodes that publish on ``topic``, or of the last ones that did; "" if there were none."""
@@ -60,25 +60,21 @@ class Publishers:
 
     def source(self, topic: str) -> str:
         """The same for the middle of a sentence: " from /node", or "" if there were none."""
-        names = self.of(topic)
-        return f" from {names}" if names else ""
+        return f" from {names}" if (names := self.of(topic)) else ""
 
-    def _look(self) -> None:
-        for topic in self._names:
-            self._ask(topic)
-
-    def _ask(self, topic: str) -> None:
-        self._asked_at[topic] = time.monotonic()
-        names = {node_of(endpoint) for endpoint in self._node.get_publishers_info_by_topic(topic)}
-        if known := sorted(name for name in names if name is not None):
-            self._names[topic] = " and ".join(known)
+    def _ask(self, *topics: str) -> None:
+        for topic in topics:
+            self._asked_at[topic] = time.monotonic()
+            names = {node_of(endpoint) for endpoint in self._node.get_publishers_info_by_topic(topic)}
+            if known := sorted(name for name in names if name is not None):
+                self._names[topic] = " and ".join(known)
 
 
 def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
     """Publish what was decided on at ``decided`` [s] of the steady clock, unless its lifespan is over; whether it was.
 
     The middleware counts the lifespan from the publishing: a process that is frozen before would send a command of the
-    past, a jump. Serializing takes most of the time until the message is sent; :mod:`delay_watch` covers the rest.
+    past, a jump. Serializing takes most of the time until the message is sent; :class:`DelayWatch` covers the rest.
     """
     data = message if isinstance(message, bytes) else serialize_message(message)
     in_time = time.monotonic() - decided <= _LIFESPAN
@@ -98,15 +94,12 @@ class WatchedPublisher:
 
     def __init__(self, node: Node, kind: type, topic: str, timeout: float) -> None:
         self._publisher: Any = node.create_publisher(kind, topic, SENT_COMMAND_QOS)
+        self.topic_name: str = self._publisher.topic_name
         self._timeout = timeout
         self.sent = 0
         self._streaming = False
         self._acknowledged: float | None = None  # when all messages last were; None: not yet in this stream [s]
         self._gap_began = -math.inf  # [s]
-
-    @property
-    def topic_name(self) -> str:
-        return str(self._publisher.topic_name)
 
     @property
     def listeners(self) -> int:
@@ -152,10 +145,7 @@ class WatchedPublisher:
 
 
 class CommandWatch:
-    """Listens to a node's own command topics while the node itself sends nothing there.
-
-    Best effort, so that nobody waits for its acknowledgements or takes it for a robot's driver that does not answer.
-    """
+    """Listens to a node's own command topics while it sends nothing; best effort, so nobody awaits its answers."""
 
     def __init__(self, node: BaseNode, kind: type, topics: Iterable[str]) -> None:
         self._node, self._kind = node, kind
@@ -163,15 +153,13 @@ class CommandWatch:
         self._subscriptions: list[Any] = []
 
     def begin(self) -> None:
-        """Listen from now on."""
-        if not self._subscriptions:
-            self._subscriptions = [
-                self._node.create_subscription(self._kind, topic, partial(self._on_command, topic), STREAM_QOS)
-                for topic in self._heard
-            ]
+        if self._subscriptions:
+            return
+        for topic in self._heard:
+            on_command = partial(self._on_command, topic)
+            self._subscriptions.append(self._node.create_subscription(self._kind, topic, on_command, STREAM_QOS))
 
     def end(self) -> None:
-        """Listen no more: what comes from now on is the node's own."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []
@@ -188,3 +176,68 @@ class CommandWatch:
 
     def _on_command(self, topic: str, message: Any) -> None:
         self._heard[topic] = time.monotonic()
+
+
+class NodeStates:
+    """The newest state of every node in the domain that reports one, by its full name; the node has to be spun."""
+
+    def __init__(self, node: Node, on_state: Callable[[str, dict[str, Any]], None] = lambda name, state: None) -> None:
+        self._node, self._on_state = node, on_state
+        self._heard: set[str] = set()  # topics
+        self.newest: dict[str, tuple[dict[str, Any], float]] = {}  # and when it came [s]
+
+    def look(self) -> None:
+        for topic, types in self._node.get_topic_names_and_types():
+            if topic.endswith(_STATE) and types == ["std_msgs/msg/String"] and topic not in self._heard:
+                self._heard.add(topic)
+                take = partial(self._take, topic.removesuffix(_STATE))
+                self._node.create_subscription(String, topic, take, STREAM_QOS)
+
+    def _take(self, name: str, message: String) -> None:
+        try:
+            state = json.loads(message.data)
+        except ValueError:
+            return  # some other node's
+        if isinstance(state, dict) and {"level", "message"} <= state.keys():
+            self.newest[name] = state, time.monotonic()
+            self._on_state(name, state)
+
+
+class HandListeners:
+    """The nodes that say on ``~/state`` that they follow one of some hands."""
+
+    def __init__(self, node: Node, hands: Sequence[str]) -> None:
+        self._states, self._hands = NodeStates(node), hands
+        self._began = self._asked_at = 0.0  # [s]
+
+    def look(self) -> None:
+        now = time.monotonic()
+        if now - self._asked_at >= _LOOK_PERIOD:
+            self._began, self._asked_at = self._began or now, now
+            self._states.look()
+
+    def unready(self) -> str | None:
+        """One line if some arm cannot be engaged yet, or may be one that has not said so; else None."""
+        if time.monotonic() - self._began < _DISCOVERY and any(self.engaged(hand) is None for hand in self._hands):
+            return "an arm may be there that has not said yet what it does"
+        for name, state, age in self._arms():
+            if not state["engaged"] and age > _SILENT:
+                return f"{name} is silent for {age:.0f} s"
+            if not (state["engaged"] or state["ready"]):
+                return f"{name}: {state['message']}"
+        return None
+
+    def engaged(self, hand: str) -> bool | None:
+        """Whether all arms that follow a hand are engaged; None if no arm follows it."""
+        engaged = [state["engaged"] for _, state, _ in self._arms() if state["hand"] == hand]
+        return all(engaged) if engaged else None
+
+    def paused_by_a_person(self) -> bool:
+        """Whether some arm's ``~/pause`` was called."""
+        return any(state.get("last_event_kind") == ReasonKind.PAUSE_SERVICE for _, state, _ in self._arms())
+
+    def _arms(self) -> list[tuple[str, dict[str, Any], float]]:
+        """Name, state and age [s] of the arms' nodes that follow these hands."""
+        now = time.monotonic()
+        said = ((name, state, now - at) for name, (state, at) in self._states.newest.items())
+        return [one for one in said if one[2] <= _GONE and one[1].keys() >= _ARM and one[1]["hand"] in self._hands]
