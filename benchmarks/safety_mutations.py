@@ -136,9 +136,9 @@ MUTATIONS = (
     ),
     Mutation(
         "a body that turns is faster than its middle",
-        "velocity_bounds.py",
-        "return np.sqrt(square) + velocities.swing[first] + velocities.swing[second]",
-        "return np.sqrt(square)",
+        "speed_bound.py",
+        "return between + velocities.swing[first] + velocities.swing[second]",
+        "return between",
     ),
     Mutation(
         "curvature counts beside the plane",

@@ -33,8 +33,7 @@ from q2r2_control.control.cholesky import factorise
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure
-from q2r2_control.control.geometry.smooth_distance import measure_smooth
+from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_smooth
 from q2r2_control.control.jit import KernelPointer, kernel, pointee
 from q2r2_control.types import Array
 

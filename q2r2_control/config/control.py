@@ -90,7 +90,6 @@ class ContactPair(StrictModel):
 class ControllerSettings(StrictModel):
     """Settings of :class:`CartesianController`; every range is checked when the object is made."""
 
-    solver: str = Field("daqp", description="daqp, or the name of any solver that qpsolvers has installed")
     solve_time_limit: float | None = Field(
         None, gt=0, le=0.1, description="a later solution counts as failed [s]; none: runs do not depend on the clock"
     )

@@ -1,8 +1,4 @@
-"""Cholesky factors of small positive definite matrices, compiled.
-
-For six to fourteen rows LAPACK takes several times as long to call as the work itself takes. Nothing here raises: a
-matrix that is not positive definite is said to be none.
-"""
+"""Cholesky factors of small positive definite matrices, compiled, without the time that a call of LAPACK takes."""
 
 from __future__ import annotations
 

@@ -12,12 +12,10 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.held_objects import ObjectPairs
 from q2r2_control.control.jit import bound, pointer_to
 from q2r2_control.control.kernel_model import KernelData, kernel_model_of
-from q2r2_control.control.live_settings import LiveSettings
-from q2r2_control.control.qp import QpProblem, Solver, make_solver
-from q2r2_control.control.qp_assembly import assemble, find_minimum_anew
+from q2r2_control.control.live_settings import LiveSettings, ObjectPairs
+from q2r2_control.control.qp import DaqpSolver, QpProblem, Solver, assemble, find_minimum
 from q2r2_control.control.reference import move_reference, observe_bodies, spare_distance, start_reference
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
@@ -43,7 +41,7 @@ class CartesianController:
 
     One tick is three calls: :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost, a
     solver solves it where that is not the solution, :func:`move_reference` takes of the solution what can be certified
-    and moves the reference. A ``solver`` that is given, instead of one by its name, is asked at every tick.
+    and moves the reference. A ``solver`` that is given in place of DAQP is asked at every tick.
     """
 
     def __init__(
@@ -53,7 +51,7 @@ class CartesianController:
         settings = settings or ControllerSettings()
         self._nv = robot.model.nv
         self._arms = tuple(robot.arms)
-        self._solver = solver or make_solver(settings.solver, self._nv, settings.solve_time_limit)
+        self._solver = solver or DaqpSolver(self._nv, settings.solve_time_limit)
         model = kernel_model_of(robot, settings)
         data = KernelData.empty(model)
         self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(data)
@@ -88,13 +86,14 @@ class CartesianController:
         """Go by other settings from the next step on, by name as in ``LIVE``; returns why not, or None.
 
         Gains change over half a second. A smaller ``min_distance`` counts at once; a greater one for each pair as far
-        as it is proven, see :mod:`live_settings`: so nothing jumps, nothing is pushed apart and every promise is kept
-        at every tick (:attr:`kept_distances`). One that home does not keep is not possible.
+        as it is proven (:attr:`kept_distances`). One that home does not keep is not possible.
         """
         try:
-            return self._live.change(self.settings.changed(values))
+            refused = self._live.change(self.settings.changed(values))
         except ConfigError as error:
             return str(error)
+        self._observe_again(self._unchanged)
+        return refused
 
     @property
     def kept_distances(self) -> Array:
@@ -108,25 +107,23 @@ class CartesianController:
 
     def _compile(self) -> None:
         """Run every kernel and the solver once, so that none is compiled or set up in mid-motion."""
-        self.reset(self.robot.home)
         model, data, targets = self._model_pointer, self._data_pointer, self._targets.pointer
-        self._assemble = bound(assemble, model, targets, data, self.settings.max_substep, -1.0)
         self._observe_bodies = bound(observe_bodies, model, data, self._unchanged)
+        self.reset(self.robot.home)
+        self._assemble = bound(assemble, model, targets, data, self.settings.max_substep, -1.0)
         self._spare = bound(spare_distance, model, data, self._with_others[self._arms[0]])
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         if self._external_tasks:
-            self._find_minimum = bound(find_minimum_anew, data)
+            self._find_minimum = bound(find_minimum, data)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
-        # A solver is set up at its first problem, and at home there may be none for it.
-        self._problem.minimum = None
+        self._problem.minimum = None  # a solver is set up at its first problem, and at home there may be none for it
         self._solver.solve(self._problem)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
-        """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each; targets are forgotten.
+        """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each.
 
-        So are openings: fingers are all of their way again, see :meth:`set_opening`; and nothing is held, see
-        :meth:`set_holding`. Raises :class:`RobotError` for a wrong shape or a number that is not finite. A start
-        outside the limits or in penetration is allowed: the controller recovers from it.
+        Targets and openings are forgotten, and nothing is held. A start outside the limits or in penetration is
+        allowed: the controller recovers from it. Raises :class:`RobotError` for a wrong shape or no finite number.
         """
         state = self._state
         state.q[:] = self._checked("q", q)
@@ -136,11 +133,10 @@ class CartesianController:
         self._active.used[0] = 0
         self._live.restart()
         self._targets.reset(state.q)
-        observed = start_reference(self._model_pointer, self._data_pointer)
-        self._closest, self._distance, self._tightest, self._margin, proven = observed
-        self._apart = self._margin >= -ROUNDING
-        self._certified = proven and self._apart
+        proven = start_reference(self._model_pointer, self._data_pointer)
         self._live.begin()
+        self._observe_again(self._unchanged)
+        self._certified = proven and self._apart
 
     def _checked(self, name: str, values: Array) -> Array:
         array = np.array(values, dtype=np.float64)
@@ -153,37 +149,36 @@ class CartesianController:
 
         An arm that is missing or None holds. A target that is not a finite pose is not used: the arm's last target
         stays, and the report names the arm. A dt that is not in (0, 0.1] s moves nothing, or no more than 0.1 s.
-
-        ``posture`` (nv,) [rad] is what arms that follow a target take as far as their tools leave them free to; without
-        it that is home. One that is not nv finite numbers is not used: the last one stays.
+        Joints that the tools leave free go to ``posture`` (nv,) [rad], or home; one that is not finite is not used.
         """
         usable = isinstance(dt, _NUMBER) and math.isfinite(dt) and dt > 0.0
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         state = self._state
         self._targets.aim_posture(posture)
         summary = StepSummary()
+        known, longest = self._targets.offer(targets), self.settings.max_substep
         if time > 0.0:
-            known = self._targets.offer(targets)
-            substeps = max(math.ceil(time / self.settings.max_substep - 1e-9), 1)
+            substeps = max(math.ceil(time / longest - 1e-9), 1)
             for index in range(substeps):
                 if not self._advance(time / substeps, 1.0 / substeps, -1.0 if index else time, summary):
                     summary.unsolved |= 1 << index
-            rejected = () if known and summary.targets_usable else self._targets.rejected(targets)
-        else:
-            rejected = self._targets.update(targets, time, state.q, state.v)
-            state.a.fill(0.0)
+        else:  # takes the targets, and moves nothing
+            pointers = self._model_pointer, self._targets.pointer, self._data_pointer
+            summary.targets_usable, _, _ = self._assemble(*pointers, longest, 0.0)
+        rejected = () if known and summary.targets_usable else self._targets.rejected(targets)
+        closest, distance, tightest, margin = self._observed
         report = StepReport(
             status=summary.status(self._apart, usable and dt <= LONGEST_DT, rejected),
             rejected=rejected,
             binding=self._names.of(self._active),
-            closest_pair=self._names.pair(self._closest),
-            closest_distance=self._distance,
+            closest_pair=self._names.pair(closest),
+            closest_distance=distance,
             certified=self._certified,
             fallback=summary.fallback,
             slack=summary.slack,
             solve_time=summary.solve_time,
-            tightest_pair=self._names.pair(self._tightest),
-            margin=self._margin,
+            tightest_pair=self._names.pair(tightest),
+            margin=margin,
             unsolved=summary.unsolved,
         )
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
@@ -199,11 +194,10 @@ class CartesianController:
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         """Say that the gripper of ``arm`` is, and stays, between two openings, 0 closed .. 1 fully open.
 
-        Its fingers count as what they sweep between these, from the next step on. Bodies within what they were are
-        always accepted. Others are if every pair keeps its distance with them, at the reference and on a certified stop
-        from there; else nothing changes, and the pair that is in the way is returned. So a gripper may be commanded to
-        what was accepted, and to nothing else. Until something is said, and after :meth:`reset`, fingers are all of
-        their way.
+        Its fingers count as what they sweep between these, from the next step on; at first, and after :meth:`reset`,
+        they are all of their way. Bodies within what they were are always accepted. Others are if every pair keeps its
+        distance with them, at the reference and on a certified stop from there; else nothing changes, and the pair in
+        the way is returned. A gripper may be commanded to what was accepted only.
 
         Raises :class:`RobotError` for a name that is no arm's and for numbers that are no interval.
         """
@@ -223,13 +217,11 @@ class CartesianController:
         return dict(self._fingers.intervals)
 
     def set_holding(self, arm: str, holds: bool) -> None:
-        """Say that the gripper of ``arm`` holds its object from the next step on, or that it does not.
+        """Say that the gripper of ``arm`` holds its object from the next step on, or, as after :meth:`reset`, does not.
 
-        The object of the cell's YAML then is part of the tool. Each of its pairs begins with the distance that there is
-        and keeps more as it gets more, until it keeps its own (:attr:`object_distances`): so it is always accepted, and
-        nothing moves for it. Until something is said, and after :meth:`reset`, nothing is held.
-
-        Raises :class:`RobotError` for an arm that has no object.
+        The object then is part of the tool. Each of its pairs begins with the distance that there is and keeps more as
+        it gets more, until it keeps its own (:attr:`object_distances`): so it is always accepted, and nothing moves for
+        it. Raises :class:`RobotError` for an arm that has no object.
         """
         if not self._objects.set_holding(arm, holds):
             return
@@ -249,10 +241,9 @@ class CartesianController:
         return self._objects.kept.copy()
 
     def _observe_again(self, grown: IntArray) -> int:
-        """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""
-        observed = self._observe_bodies(self._model_pointer, self._data_pointer, grown)
-        self._closest, self._distance, self._tightest, self._margin, blocked = observed
-        self._apart = self._margin >= -ROUNDING
+        """Observe what has changed; returns the pair in the way of bodies that have ``grown``, or -1."""
+        self._observed, blocked = self._observe_bodies(self._model_pointer, self._data_pointer, grown)
+        self._apart = self._observed[-1] >= -ROUNDING
         return int(blocked)
 
     def tool_pose(self, arm: str) -> pin.SE3:
@@ -261,10 +252,7 @@ class CartesianController:
         return pose_of(self._tasks.rotation[i], self._tasks.translation[i])
 
     def spare_distance(self, arm: str) -> float:
-        """How much nearer ``arm`` may come to what is no part of it [m]: the least of its pairs, inf if there is none.
-
-        At the reference, and less what each pair keeps.
-        """
+        """How much nearer ``arm`` may come to what is no part of it at the reference [m]; inf if there is no pair."""
         return float(self._spare(self._model_pointer, self._data_pointer, self._with_others[arm]))
 
     @property
@@ -292,15 +280,13 @@ class CartesianController:
         solved = solution.v is not None and (limit is None or solution.solve_time <= limit)
         if solved:
             self._solution[:] = solution.v
-        outcome, self._closest, self._distance, self._tightest, self._margin, slack = self._move(
+        self._observed, outcome, slack = self._move(
             self._model_pointer, self._data_pointer, self._solution, solved, h, share
         )
         summary.fallback |= outcome != FOLLOWED
         summary.slack = max(summary.slack, slack)
         summary.solve_time += solution.solve_time
-        if self._objects.growing:
-            self._objects.grow(h)
-        was_apart, self._apart = self._apart, self._margin >= -ROUNDING
+        was_apart, self._apart = self._apart, self._observed[-1] >= -ROUNDING
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved

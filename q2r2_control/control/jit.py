@@ -1,9 +1,8 @@
 """Compile the hot path with Numba and keep the machine code between runs.
 
 Numba's own cache looks only at the file of the compiled function, so a kernel that calls another module's kernel
-would go on running that module's old code after an edit. A controller must not run yesterday's mathematics: the
-cache folder is named by a hash of every source file of this package that machine code is made from, so any edit of
-one compiles afresh.
+would go on running that module's old code after an edit. So the cache folder is named by a hash of every source file
+of this package that machine code is made from, and any edit of one compiles afresh.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import types
 from numba.core import cgutils
+from numba.core.registry import cpu_target
 
 _ROOMS = ("control", "compliance")
 _COMPILED = re.compile(r"^@(inlined_|numpy_)?kernel|\bNamedTuple\b", re.MULTILINE)
@@ -49,8 +49,7 @@ def _cache_folder() -> Path:
 
 _FOLDER = str(_cache_folder())
 
-
-# Set by Numba at run time, so no type checker knows its members; nor what is registered with the decorators.
+# No type checker knows what Numba sets at run time.
 config: Any = numba.config
 extending: Any = numba.extending
 
@@ -71,10 +70,7 @@ extending.register_model(_Pointer)(extending.models.OpaqueModel)
 
 
 class KernelPointer:
-    """A named tuple of arrays behind one pointer: made by :func:`pointer_to`, read in a kernel by :func:`pointee`.
-
-    Handing a kernel fifty arrays costs more than the work it does; a pointer costs the same for any number.
-    """
+    """A named tuple of arrays behind one pointer: made by :func:`pointer_to`, read in a kernel by :func:`pointee`."""
 
     __slots__ = ("address", "kind", "memory", "value")
 
@@ -116,17 +112,6 @@ def pointee(typing_context: Any, pointer: Any) -> Any:
 
 
 @extending.intrinsic
-def _size(typing_context: Any, value: Any) -> Any:
-    """Bytes that a value takes."""
-
-    def count(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        size = context.get_abi_sizeof(context.get_data_type(value))
-        return context.get_constant(types.intp, size)
-
-    return types.intp(value), count
-
-
-@extending.intrinsic
 def _put(typing_context: Any, value: Any, memory: Any) -> Any:
     """Write a value into an array of bytes."""
 
@@ -141,17 +126,13 @@ def _put(typing_context: Any, value: Any, memory: Any) -> Any:
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` at its first call; strict IEEE arithmetic, no Python objects, division by 0 gives inf.
 
-    It may allocate nothing, so that arrays pass through its calls without being counted: counting references to the
-    twenty arrays of a call takes longer than measuring a pair of capsules.
+    It may allocate nothing, so that references to the arrays of its calls are not counted.
     """
     return _compiled(function, _nrt=False)
 
 
 def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A :func:`kernel` that becomes part of its callers: for a small one that is handed a whole model and data.
-
-    Passing a hundred arrays that it does not read takes longer than its work.
-    """
+    """A :func:`kernel` that becomes part of its callers: for a small one that is handed a whole model and data."""
     return _compiled(function, _nrt=False, forceinline=True)
 
 
@@ -171,18 +152,14 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
 
 @kernel
-def _size_of(value: Any) -> int:
-    return _size(value)
-
-
-@kernel
 def _write(value: Any, memory: npt.NDArray[np.uint8]) -> None:
     _put(value, memory)
 
 
 def pointer_to(value: Any) -> KernelPointer:
     """Put ``value``, a named tuple of arrays, numbers and more of its kind, behind a pointer."""
-    memory = np.zeros(_size_of(value), dtype=np.uint8)
+    context = cpu_target.target_context
+    memory = np.zeros(context.get_abi_sizeof(context.get_data_type(numba.typeof(value))), dtype=np.uint8)
     _write(value, memory)
     return KernelPointer(value, memory)
 
@@ -190,11 +167,9 @@ def pointer_to(value: Any) -> KernelPointer:
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     """A kernel's machine code for arguments of the types of these, with which it runs once.
 
-    A kernel looks at the type of each argument at each call, which for a :class:`KernelPointer` takes longer than
-    a small kernel's work. What is returned does not look: hand it arguments of exactly these types and layouts.
+    It does not look at the types of its arguments, which saves time: hand it exactly these types and layouts.
     """
     function(*arguments)
-    # Set by Numba at run time too.
-    dispatcher: Any = function
+    dispatcher: Any = function  # get_overload is set by Numba at run time too
     code: Callable[..., Any] = dispatcher.get_overload(tuple(numba.typeof(argument) for argument in arguments))
     return code

@@ -8,7 +8,7 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings, check_priority
 from q2r2_control.control.geometry.collision import CollisionModel, collision_model_of, turning_bodies
-from q2r2_control.control.geometry.pair_distance import deepest, with_rounded_boxes
+from q2r2_control.control.geometry.pair_distance import with_rounded_boxes
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_data import Approach, SafetyData, SafetyModel
 from q2r2_control.control.tasks.task_data import TaskData, TaskModel, task_model_of
@@ -20,8 +20,6 @@ from q2r2_control.types import Array
 
 # Of pairs that may touch: rows that aim at the very distance would leave the certificate nothing [m].
 _LEAST_BUFFER = 0.00025
-
-
 # How far before contact pairs that may touch are slowed down; bodies are a little larger than what they enclose [m].
 _CONTACT_ZONE = 0.002
 # Of the depth at which the cores of two bodies meet: as far as they may get into each other.
@@ -34,11 +32,6 @@ class KernelModel(NamedTuple):
     safety: SafetyModel
     tasks: TaskModel
 
-    @property
-    def live(self) -> tuple[Array, ...]:
-        """Gains, speeds and weights, which may change between ticks."""
-        return (*self.tasks.live, self.safety.approach.gain)
-
 
 def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
     """Arrays of a robot's joints, tools, pairs and limits.
@@ -47,11 +40,6 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
     for names of ``settings.pairs`` that no pair has.
     """
     check_priority(settings.priority, tuple(robot.arms))
-    safety = _safety_model(robot, settings)
-    return KernelModel(safety, task_model_of(robot, settings, safety.collision.chain))
-
-
-def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
     kept, objects = kept_distances(robot, settings), len(robot.objects.holders)
     min_distance = np.append(kept.values, np.full(objects, -np.inf))  # nothing is held yet
     contact_speed = np.append(kept.contact_speed, np.full(objects, np.inf))
@@ -61,7 +49,7 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
     arm = np.full(robot.model.nv, len(robot.arms), dtype=np.int64)
     for i, joints in enumerate(robot.arms.values()):
         arm[joints.joints] = i
-    return SafetyModel(
+    safety = SafetyModel(
         collision=collision,
         limits=JointLimits(
             lower=robot.position_lower + settings.position_margin,
@@ -81,14 +69,16 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
         min_distance=min_distance,
         arm=arm,
     )
+    return KernelModel(safety, task_model_of(robot, settings, collision.chain))
 
 
 def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) -> None:
     """Raises :class:`ConfigError` where two bodies may get so deep into each other that no direction leads out."""
-    radius = collision.bodies.radius.copy()
+    radius = collision.bodies.radius.copy()  # the least that each body ever has [m]
     for number, finger in turning_bodies(robot):
         radius[number] = finger.radius
-    allowed = _DEEPEST * deepest(collision, radius)[: len(kept.values)]
+    until_cores_meet = radius[collision.pairs.first] + radius[collision.pairs.second]
+    allowed = _DEEPEST * until_cores_meet[: len(kept.values)]
     for p in np.flatnonzero(-kept.values > allowed):
         names = " and ".join(pair_names(robot.collision_model)[p])
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Settings of a controller that change while it moves: distances that pairs keep, and gains.
+"""What counts while a controller runs: distances that pairs keep, objects that are held, and gains.
 
 **Distances.** A greater one makes a state uncertified that was certified. So a pair keeps more only as far as the stop
 at hand is proven with it: never more than  d - S - buffer,  with the pair's distance d at the reference and the bound S
@@ -7,15 +7,17 @@ of how much closer the stop brings it (stop_certificate.py). What a pair keeps
 - falls at once, when less is asked for: what was proven stays proven;
 - grows at ``GROWTH`` towards what is asked for, and no farther than that bound, before a step is decided on. So the
   step is proven with the greater distance, and the invariant of safety/README.md holds at every tick;
-- never falls while it grows. A pair that is nearer than asked for is not pushed apart: it keeps the room that it has,
-  and more when it gets more. It holds up no motion that opens it.
+- never falls while it grows. A pair that is nearer than asked for is not pushed apart.
 
-After a reset pairs keep at once what the posture leaves them of what was asked for later, and what the controller
-was made with in any case: out of a start nearer than that it recovers, as without any change.
+After a reset pairs keep at once what the posture leaves them, and what the controller was made with in any case: out of
+a start nearer than that it recovers.
 
-**Gains** and weights go to their new values on a straight line, so that what a tool is asked for does not jump. Speeds
-and accelerations stay within the limits of joints whatever they are. The gain of separation is one of them: it says how
-briskly pairs may close in, and the certificate, which keeps them apart, does not read it (safety/separation_rows.py).
+**Held objects.** A pair that does not count keeps minus infinity. One that appears keeps d - S - buffer, or its own
+distance where that is less: so the stop at hand is proven with the object too, and it never has to be refused. It grows
+to the same value for the d and S of later, and never falls. Two objects that overlap when the second one is gripped are
+one that both hands hold, and not watched against each other until one lets go.
+
+**Gains** and weights go to their new values on a straight line. The certificate reads none of them.
 """
 
 from __future__ import annotations
@@ -23,13 +25,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.held_objects import ObjectPairs
 from q2r2_control.control.kernel_model import KernelData, KernelModel, stop_buffer
 from q2r2_control.control.safety.safety_data import provable_distances
 from q2r2_control.control.tasks.task_data import task_model_of
-from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances, too_close_at_home
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -39,6 +42,79 @@ _PERIOD = 0.01  # between two looks at distances that grow [s]
 _RAMP_TIME = 0.5  # of gains [s]
 
 
+class ObjectPairs:
+    """Which objects are held, and what their pairs keep; all arrays are of the objects' pairs alone."""
+
+    def __init__(self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData) -> None:
+        self._robot, self._safety, self._data = robot, model.safety, data.safety
+        self._arms, self._holders = tuple(robot.objects.by_arm), robot.objects.holders
+        self._shared = np.array([len(holders) > 1 for holders in self._holders], dtype=np.bool_)
+        self._range = slice(len(model.safety.min_distance) - len(self._holders), None)
+        self._aim(settings)
+        self.clear()
+
+    def _aim(self, settings: ControllerSettings) -> None:
+        self._goal = kept_by_objects(self._robot, settings).values
+        self._buffer = stop_buffer(self._goal, settings)
+
+    def clear(self) -> None:
+        """Nothing is held."""
+        self.holding: frozenset[str] = frozenset()
+        self._due = 0.0
+        self._new: npt.NDArray[np.bool_] = np.zeros(len(self._holders), dtype=np.bool_)
+        self._write(np.full(len(self._holders), -np.inf))
+
+    def set_holding(self, arm: str, holds: bool) -> bool:
+        """Take it that an arm's gripper holds its object, or does not; whether that is new.
+
+        Pairs that begin to count keep their own distance until they are measured, and :meth:`begin` then. Raises
+        :class:`RobotError` for an arm that has no object.
+        """
+        if arm not in self._arms:
+            allowed = ", ".join(self._arms) or "none"
+            raise RobotError(f"holding of arm {arm!r:.40}: its gripper has no object; those that have one: {allowed}")
+        if holds == (arm in self.holding):
+            return False
+        self.holding = self.holding | {arm} if holds else self.holding - {arm}
+        counts = np.array([holders <= self.holding for holders in self._holders], dtype=np.bool_)
+        self._new = counts & ~np.isfinite(self.kept)
+        self._write(np.where(counts, np.where(self._new, self._goal, self.kept), -np.inf))
+        return True
+
+    def begin(self) -> None:
+        """Let the pairs that have begun to count, and were measured, keep what they can."""
+        kept = np.where(self._new, np.minimum(self._goal, self._within_reach()), self.kept)
+        overlap = self._data.distance[self._range] < np.minimum(self._goal, 0.0)
+        if (overlap & self._shared & self._new).any():  # both hands hold one object
+            kept[self._shared] = -np.inf
+        self._write(kept)
+        self._due = 0.0
+
+    def step(self, h: float) -> None:
+        """Before a step of ``h`` [s]: let what pairs keep grow, with the reference and the stop as they are."""
+        self._due -= h
+        if self._due <= 0.0:
+            self._due = _PERIOD
+            more = np.maximum(self.kept, np.minimum(self._goal, self._within_reach()))
+            self._write(np.where(np.isfinite(self.kept), more, -np.inf))
+
+    def change(self, settings: ControllerSettings) -> None:
+        """Let pairs keep what ``settings`` say: less at once, more as :meth:`step` finds the room."""
+        self._aim(settings)
+        self._write(np.minimum(self.kept, self._goal))
+
+    def _within_reach(self) -> Array:
+        """d - S - buffer [m]."""
+        return np.asarray(provable_distances(self._safety, self._data)[self._range] - self._buffer)
+
+    def _write(self, kept: Array) -> None:
+        """Tell the kernels what the pairs keep [m]; minus infinity where they do not count."""
+        self.kept = kept
+        self._safety.min_distance[self._range] = kept
+        self._safety.approach.stop_distance[self._range] = kept + self._buffer
+        self.growing = bool((np.isfinite(kept) & (kept < self._goal)).any())
+
+
 class LiveSettings:
     """What of one controller's settings is in force, on its way to what was asked for."""
 
@@ -46,8 +122,8 @@ class LiveSettings:
         self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData, objects: ObjectPairs
     ) -> None:
         self._robot, self._objects = robot, objects
-        self._safety, self._data = model.safety, data.safety
-        self._gains = LiveGains(robot, model, settings)
+        self._model, self._safety, self._data = model, model.safety, data.safety
+        self._gains, self._ramp = self._gains_of(settings), 0.0  # and the time until they are reached [s]
         self._goal = self._least = kept_distances(robot, settings).values  # least: without any change
         self._growing, self._due = False, 0.0
         self.settings = settings
@@ -75,7 +151,9 @@ class LiveSettings:
         self._goal, self._due = goal.values, 0.0
         self._write(np.minimum(self.kept, self._goal))
         self._objects.change(settings)
-        self._gains.aim(settings)
+        gains = self._gains_of(settings)
+        if not all(map(np.array_equal, gains, self._gains)):
+            self._gains, self._ramp = gains, _RAMP_TIME
         return None
 
     def restart(self) -> None:
@@ -83,7 +161,7 @@ class LiveSettings:
         self._due = 0.0
         if self._growing:
             self._write(np.minimum(self._goal, self._least))
-        self._gains.finish()
+        self._approach_gains(self._ramp)
 
     def begin(self) -> None:
         """After a reset was observed: keep what the posture allows."""
@@ -91,7 +169,10 @@ class LiveSettings:
 
     def step(self, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference."""
-        self._gains.step(h)
+        if self._objects.growing:
+            self._objects.step(h)
+        if self._ramp:
+            self._approach_gains(h)
         if self._growing:
             self._due -= h
             if self._due <= 0.0:
@@ -112,30 +193,11 @@ class LiveSettings:
             self._safety.min_distance[: len(kept)] = kept
             self._safety.approach.stop_distance[: len(kept)] = kept + stop_buffer(kept, self.settings)
 
-
-class LiveGains:
-    """The kernels' gains, speeds and weights: what ``KernelModel.live`` says."""
-
-    def __init__(self, robot: Robot, model: KernelModel, settings: ControllerSettings) -> None:
-        self._robot, self._model = robot, model
-        self._goal, self._left = self._live_of(settings), 0.0
-
-    def _live_of(self, settings: ControllerSettings) -> tuple[Array, ...]:
+    def _gains_of(self, settings: ControllerSettings) -> tuple[Array, ...]:
         tasks = task_model_of(self._robot, settings, self._model.tasks.chain)
         return (*tasks.live, np.array([settings.separation_gain]))
 
-    def aim(self, settings: ControllerSettings) -> None:
-        goal = self._live_of(settings)
-        if not all(np.array_equal(values, before) for values, before in zip(goal, self._goal, strict=True)):
-            self._goal, self._left = goal, _RAMP_TIME
-
-    def finish(self) -> None:
-        if self._left:
-            self.step(self._left)
-
-    def step(self, h: float) -> None:
-        if not self._left:
-            return
-        share, self._left = min(h / self._left, 1.0), max(self._left - h, 0.0)
-        for values, goal in zip(self._model.live, self._goal, strict=True):
+    def _approach_gains(self, h: float) -> None:
+        share, self._ramp = min(h / self._ramp, 1.0) if self._ramp else 1.0, max(self._ramp - h, 0.0)
+        for values, goal in zip((*self._model.tasks.live, self._safety.approach.gain), self._gains, strict=True):
             values[:] = goal if share == 1.0 else values + share * (goal - values)

@@ -1,25 +1,41 @@
-"""The QP as data, and the solvers that take it. Building is pure and separate from solving.
+"""The QP of a step: built from tasks, box and separation rows by compiled kernels, and solved where a bound matters.
 
     minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = SOFTNESS a_i' H^-1 a_i,  a_i the i-th row
     subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
 
 The box is never empty (joint_limits.py) and the rows are soft, so a solution always exists. Rows have unit norm, so
 that a slack is a joint speed. H^-1 along a row is what the cost yields to it: a row alone gives way by the part
-SOFTNESS of what it corrects, however strong the cost. This is DAQP's own notion of softness; other solvers are given
-the same. Where the cost's own minimum keeps box and rows it is the solution, and no solver has to be asked.
+SOFTNESS of what it corrects, however strong the cost. Where the cost's own minimum keeps box and rows it is the
+solution, and no solver has to be asked.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Protocol
 
 import daqp
 import numpy as np
-import qpsolvers
 
-from q2r2_control.errors import ConfigError
+from q2r2_control.control.cholesky import factorise, substitute
+from q2r2_control.control.geometry.closest_points import dot
+from q2r2_control.control.jit import KernelPointer, kernel, pointee
+from q2r2_control.control.kernel_model import KernelData
+from q2r2_control.control.safety.joint_limits import next_velocity_box
+from q2r2_control.control.safety.separation_rows import write_separation_rows
+from q2r2_control.control.targets import update_targets
+from q2r2_control.control.tasks.frame import (
+    accumulate_stretch_damping,
+    accumulate_tool_cost,
+    tool_jacobian,
+    wanted_twist,
+)
+from q2r2_control.control.tasks.task_data import (
+    accumulate_hold_cost,
+    accumulate_posture_cost,
+    project_to_nullspace,
+    pull_to_posture,
+)
 from q2r2_control.types import Array
 
 SOFTNESS = 1e-5  # part of its correction by which a row gives way
@@ -38,10 +54,6 @@ class QpProblem:
     rows_lower: Array  # (m,) [rad/s]
     minimum: Array | None = None  # (nv,) of the cost alone, if that keeps box and rows and so is the solution [rad/s]
 
-    def softness(self) -> Array:
-        """rho (m,): how far each row gives way per unit of its multiplier."""
-        return np.asarray(SOFTNESS * np.sum(self.rows * np.linalg.solve(self.H, self.rows.T).T, axis=1))
-
 
 @dataclass(slots=True)
 class QpSolution:
@@ -57,23 +69,12 @@ class Solver(Protocol):
     def solve(self, problem: QpProblem) -> QpSolution: ...
 
 
-class SkipIfUnconstrained:
-    """Asks a solver only where a bound holds the cost's own minimum back."""
-
-    def __init__(self, solver: Solver) -> None:
-        self.solver = solver
-
-    def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`; takes no time of a solver where none is asked."""
-        return self.solver.solve(problem) if problem.minimum is None else QpSolution(problem.minimum, 0.0)
-
-
 class DaqpSolver:
-    """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022): dual active set, soft rows of its own."""
+    """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022): dual active set, soft rows; ``time_limit`` [s] or None."""
 
     _OPTIMAL = (1, 2)  # 2: optimal with a soft row violated
 
-    def __init__(self, nv: int, time_limit: float | None) -> None:
+    def __init__(self, nv: int, time_limit: float | None = None) -> None:
         self._nv = nv
         self._time_limit = time_limit or 0.0  # 0: none
         self._upper = np.full(nv, _UNBOUNDED)
@@ -81,6 +82,9 @@ class DaqpSolver:
         self._sense = np.zeros(nv, dtype=np.int32)
 
     def solve(self, problem: QpProblem) -> QpSolution:
+        """See :class:`Solver`; DAQP is asked only where a bound holds the cost's own minimum back."""
+        if problem.minimum is not None:
+            return QpSolution(problem.minimum, 0.0)
         nv = self._nv
         m = nv + len(problem.rows_lower)
         if m > len(self._upper):
@@ -105,42 +109,59 @@ class DaqpSolver:
         return QpSolution(v if flag in self._OPTIMAL else None, info["setup_time"] + info["solve_time"])
 
 
-class QpsolversSolver:
-    """Any other solver through qpsolvers, with the slack as extra variables."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def solve(self, problem: QpProblem) -> QpSolution:
-        nv, m = len(problem.g), len(problem.rows_lower)
-        P = np.diag(np.concatenate([np.zeros(nv), 1.0 / problem.softness()]))
-        P[:nv, :nv] = problem.H
-        before = time.perf_counter()
-        try:
-            x = qpsolvers.solve_qp(
-                P,
-                np.concatenate([problem.g, np.zeros(m)]),
-                G=-np.hstack([problem.rows, np.eye(m)]) if m else None,
-                h=-problem.rows_lower if m else None,
-                lb=np.concatenate([problem.lower, np.zeros(m)]),
-                ub=np.concatenate([problem.upper, np.full(m, np.inf)]),
-                solver=self._name,
-            )
-        except Exception:  # each solver behind qpsolvers has exceptions of its own
-            x = None
-        v = None if x is None else np.asarray(x[:nv], dtype=np.float64)
-        # qpsolvers tells no time; this is the one place below the pipeline that reads a clock.
-        return QpSolution(v, time.perf_counter() - before)
+@kernel
+def find_minimum(data_pointer: KernelPointer) -> bool:
+    """Write -H^-1 g to ``tasks.minimum`` (nv,) [rad/s]; whether it is finite and within the box and all rows."""
+    data: KernelData = pointee(data_pointer)
+    tasks, box, rows, minimum = data.tasks, data.safety.box, data.safety.rows, data.tasks.minimum
+    nv = minimum.shape[0]
+    for i in range(nv):
+        for j in range(i, nv):
+            tasks.factor[i, j] = tasks.H[i, j]
+        minimum[i] = -tasks.g[i]
+    if not factorise(tasks.factor):
+        return False
+    substitute(tasks.factor, minimum)
+    for j in range(nv):
+        # Written so that what is no number is outside.
+        if not (box.lower[j] <= minimum[j] <= box.upper[j]):
+            return False
+    kept = True
+    for row in range(rows.used[0]):
+        kept &= dot(rows.matrix[row], minimum) >= rows.lower[row]
+    return kept
 
 
-def make_solver(name: str, nv: int, time_limit: float | None) -> Solver:
-    """Solver by its name in the YAML; ``time_limit`` [s] is given to solvers that take one.
+@kernel
+def assemble(
+    model_pointer: KernelPointer, targets_pointer: KernelPointer, data_pointer: KernelPointer, h: float, tick: float
+) -> tuple[bool, bool, bool]:
+    """Cost, rows and box of a step of ``h`` [s] from an observed reference.
 
-    Raises :class:`ConfigError` for a solver that is not installed.
+    ``tick`` [s]: of which it is the first step, with the targets that were offered; below 0: it is another one. Returns
+    whether all targets were usable, whether all joints are within their limits, and what :func:`find_minimum` says.
     """
-    if name == "daqp":
-        return SkipIfUnconstrained(DaqpSolver(nv, time_limit))
-    available = sorted({"daqp", *qpsolvers.available_solvers})
-    if name not in available:
-        raise ConfigError(f"control.solver = {name!r}: not installed; allowed here: {', '.join(available)}")
-    return SkipIfUnconstrained(QpsolversSolver(name))
+    model, targets, data = pointee(model_pointer), pointee(targets_pointer), pointee(data_pointer)
+    state, tasks = data.safety.state, data.tasks
+    usable = True
+    if tick >= 0.0:
+        usable = update_targets(targets, state.q, state.v, tick)
+        state.a[:] = 0.0
+    tasks.H[:] = 0.0
+    tasks.g[:] = 0.0
+    tasks.J[:] = 0.0
+    pull_to_posture(model.tasks, tasks, targets, state.q)
+    for i in range(targets.follows.shape[0]):
+        if targets.follows[i] == 0:
+            accumulate_hold_cost(tasks, targets, i, state.q)
+            continue
+        J, weight = tasks.J[6 * i : 6 * i + 6], model.tasks.priority.weight[i]
+        tool_jacobian(model.tasks.chain, tasks.placements, model.tasks.tools, i, tasks.translation[i], J)
+        wanted_twist(model.tasks.motion, tasks, targets, i)
+        accumulate_tool_cost(J, tasks.twist[i], weight, tasks.H, tasks.g)
+        accumulate_stretch_damping(model.tasks, tasks, i)
+    project_to_nullspace(tasks.J, tasks.tools_factor, tasks.tools_moved, tasks.posture)
+    accumulate_posture_cost(model.tasks, tasks)
+    write_separation_rows(model.safety, data.safety, h)
+    inside = next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
+    return usable, inside, find_minimum(data_pointer)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
 from q2r2_control.control.safety.safety_data import ActiveBounds
@@ -41,21 +43,21 @@ class LimitNames:
         kinds, subjects = active.kind[:found], active.subject[:found]
         key = kinds.tobytes() + subjects.tobytes()
         if key != self._last[0]:
-            names, both = self._by_kind, zip(kinds.tolist(), subjects.tolist(), strict=True)
-            self._last = key, tuple(dict.fromkeys([names[kind][subject] for kind, subject in both]))
+            both = dict.fromkeys(zip(kinds.tolist(), subjects.tolist(), strict=True))
+            self._last = key, tuple(self._by_kind[kind][subject] for kind, subject in both)
         return self._last[1]
 
 
+@dataclass(slots=True)
 class StepSummary:
     """What the substeps of one tick add up to."""
 
-    def __init__(self) -> None:
-        self.fallback = False
-        self.targets_usable = True  # all of them
-        self.inside = True  # all joints are within their limits
-        self.unsolved = 0  # bit by bit, which substeps had no solution
-        self.slack = 0.0
-        self.solve_time = 0.0
+    fallback: bool = False
+    targets_usable: bool = True  # all of them
+    inside: bool = True  # all joints are within their limits
+    unsolved: int = 0  # bit by bit, which substeps had no solution
+    slack: float = 0.0
+    solve_time: float = 0.0
 
     def status(self, apart: bool, dt_usable: bool, rejected: tuple[str, ...]) -> StepStatus:
         """The most important of what happened."""

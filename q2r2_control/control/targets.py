@@ -8,19 +8,16 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.jit import KernelPointer, bound, kernel, pointee, pointer_to
-from q2r2_control.control.tasks.frame import rotation_vector
+from q2r2_control.control.geometry.closest_points import dot, size_of
+from q2r2_control.control.jit import kernel, pointer_to
+from q2r2_control.control.tasks.frame import rotation_vector, times_transposed
 from q2r2_control.control.tasks.task_data import PoseScratch, TaskModel, TaskTargets
 from q2r2_control.types import Array
 
 # Farther than any cell; keeps squares of what is merely far away finite.
 _FARTHEST = 100.0  # [m]
 _ORTHONORMAL = 1e-3
-# A target faster than this many times the tool's own limit did not move, it was put elsewhere.
-_TELEPORT = 3.0
 _AT_REST = 1e-2  # [rad/s]
-
-
 _NONE, _POSE, _NO_POSE = 0, 1, 2  # what was offered to an arm
 
 
@@ -29,16 +26,9 @@ class TargetTracker:
 
     def __init__(self, model: TaskModel, arms: tuple[str, ...], settings: ControllerSettings) -> None:
         self._arms, self._home = arms, model.posture.home
-        self._targets = TaskTargets.empty(
-            model,
-            settings.feed_forward_time,
-            _TELEPORT * settings.max_linear_speed,
-            _TELEPORT * settings.max_angular_speed,
-        )
+        self._targets = TaskTargets.empty(model, settings)
         self._pose, self._offered = self._targets.pose, self._targets.offered
         self.pointer = pointer_to(self._targets)
-        nv = len(self._home)
-        self._update = bound(_update_through_pointer, self.pointer, np.zeros(nv), np.zeros(nv), 0.0)
 
     def reset(self, q: Array) -> None:
         """Forget all targets; every arm holds where it is, ``q`` (nv,) [rad]."""
@@ -46,7 +36,6 @@ class TargetTracker:
         self._targets.follows[:] = 0
         self._targets.hold[:] = q
         self._targets.posture[:] = self._home
-        self._aims_home = True
 
     def hold_at(self, q: Array | None) -> None:
         """Arms that follow no target go to ``q`` (nv,) [rad] and hold there; None: where they come to rest."""
@@ -59,18 +48,9 @@ class TargetTracker:
     def aim_posture(self, posture: Array | None) -> None:
         """Let the free joints go to ``posture`` (nv,) [rad], home where there is none; a bad one changes nothing."""
         if posture is None:
-            if not self._aims_home:
-                self._targets.posture[:] = self._home
-                self._aims_home = True
+            self._targets.posture[:] = self._home
         elif posture.shape == self._home.shape and np.isfinite(posture).all():
             self._targets.posture[:] = posture
-            self._aims_home = False
-
-    def update(self, targets: Mapping[str, pin.SE3 | None], dt: float, q: Array, v: Array) -> tuple[str, ...]:
-        """Take the targets of one tick; returns the names whose target is not usable, unknown names among them."""
-        known = self.offer(targets)
-        usable = self._update(self.pointer, q, v, dt)
-        return () if usable and known else self.rejected(targets)
 
     def offer(self, targets: Mapping[str, pin.SE3 | None]) -> bool:
         """Write the targets of one tick to where :func:`update_targets` looks; whether every name is an arm's."""
@@ -89,11 +69,6 @@ class TargetTracker:
         """Of what was offered and taken, the names whose target is not usable, unknown names among them."""
         rejected = [arm for arm, offered in zip(self._arms, self._offered, strict=True) if offered == _NO_POSE]
         return (*rejected, *(str(name) for name in targets if name not in self._arms))
-
-
-@kernel
-def _update_through_pointer(targets_pointer: KernelPointer, q: Array, v: Array, dt: float) -> bool:
-    return update_targets(pointee(targets_pointer), q, v, dt)
 
 
 @kernel
@@ -144,12 +119,12 @@ def _update_pose(targets: TaskTargets, i: int, dt: float) -> bool:
     if targets.follows[i] == 1 and dt > 0.0:
         for k in range(3):
             moved[k] = (scratch.translation[k] - targets.translation[i, k]) / dt
-        _times_transposed(scratch.rotation, targets.rotation[i], scratch.gram)
+        times_transposed(scratch.rotation, targets.rotation[i], scratch.gram)
         turned = moved[3:6]
         rotation_vector(scratch.gram, turned)
         for k in range(3):
             turned[k] /= dt
-        put_elsewhere = _size(moved[0:3]) > targets.teleport_speed or _size(turned) > targets.teleport_turn
+        put_elsewhere = size_of(moved[0:3]) > targets.teleport_speed or size_of(turned) > targets.teleport_turn
         share = 1.0 - np.exp(-dt / targets.feed_forward_time)
         for k in range(6):
             velocity = 0.0 if put_elsewhere else moved[k]
@@ -165,42 +140,26 @@ def _update_pose(targets: TaskTargets, i: int, dt: float) -> bool:
 
 
 @kernel
-def _size(vector: Array) -> float:
-    return np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
-
-
-@kernel
-def _times_transposed(A: Array, B: Array, product: Array) -> None:
-    """A B' of two 3 by 3 matrices."""
-    for i in range(3):
-        for j in range(3):
-            product[i, j] = A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
-
-
-@kernel
 def _checked_pose(pose: Array, scratch: PoseScratch) -> bool:
     """Split a pose (4, 4) into ``scratch``, its rotation made orthonormal; False if not finite or no rotation."""
     rotation, translation, gram = scratch.rotation, scratch.translation, scratch.gram
-    largest = 0.0
-    total = 0.0
+    largest, total, error = 0.0, 0.0, 0.0
     for i in range(3):
         for j in range(3):
             rotation[i, j] = pose[i, j]
         translation[i] = pose[i, 3]
         largest = max(largest, abs(translation[i]))
         total += translation[i]
-    _times_transposed(rotation, rotation, gram)
-    error = 0.0
+    times_transposed(rotation, rotation, gram)
     for i in range(3):
         gram[i, i] -= 1.0
         for j in range(3):
             total += gram[i, j]
             error = max(error, abs(gram[i, j]))
-    determinant = (
-        rotation[0, 0] * (rotation[1, 1] * rotation[2, 2] - rotation[1, 2] * rotation[2, 1])
-        - rotation[0, 1] * (rotation[1, 0] * rotation[2, 2] - rotation[1, 2] * rotation[2, 0])
-        + rotation[0, 2] * (rotation[1, 0] * rotation[2, 1] - rotation[1, 1] * rotation[2, 0])
-    )
+    determinant = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        determinant += rotation[0, i] * (rotation[1, j] * rotation[2, k] - rotation[1, k] * rotation[2, j])
     # A maximum may pass over NaN and infinities may cancel; what is not finite shows in the sum.
     if not (np.isfinite(total) and error < _ORTHONORMAL and determinant > 0.0):
         return False
@@ -210,10 +169,6 @@ def _checked_pose(pose: Array, scratch: PoseScratch) -> bool:
     # A Newton step towards the nearest rotation, R - (R R' - I) R / 2 (Higham, Functions of Matrices, 2008, eq. 8.20).
     for i in range(3):
         for j in range(3):
-            scratch.correction[i, j] = 0.5 * (
-                gram[i, 0] * rotation[0, j] + gram[i, 1] * rotation[1, j] + gram[i, 2] * rotation[2, j]
-            )
-    for i in range(3):
-        for j in range(3):
-            rotation[i, j] -= scratch.correction[i, j]
+            scratch.correction[i, j] = 0.5 * dot(gram[i], rotation[:, j])
+    rotation -= scratch.correction
     return True

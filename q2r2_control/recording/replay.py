@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
+from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, Solver
 from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.pipeline.loop_clock import LoopClock
@@ -129,7 +129,7 @@ class ReplayPipeline(Pipeline):
 
     def _prepare(self, realtime: bool) -> None:
         settings = permitted(self.config.control.model_copy(update={"solve_time_limit": None}), self.drive)
-        inner = make_solver(settings.solver, self.robot.model.nv, None)
+        inner = DaqpSolver(self.robot.model.nv)
         self.controller = CartesianController(self.robot, settings, solver=_Solver(inner, self._recorded))
         super()._prepare(realtime)
 

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.qp import make_solver
+from q2r2_control.control.qp import DaqpSolver
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -92,7 +92,7 @@ def run_soak(config: Config, ticks: int, seed: int, progress: Callable[[str], No
     robot = Robot.from_config(config)
     settings = config.control.model_copy(update={"solve_time_limit": config.control.solve_time_limit or 0.005})
     # The solver gets no time limit: a soak that finds something has to find it again.
-    inner = make_solver(settings.solver, robot.model.nv, None)
+    inner = DaqpSolver(robot.model.nv)
     worst = WorstSolver(robot, np.random.default_rng([seed, 6]))
     solver = FaultySolver(inner, np.random.default_rng([seed, 1]), worst)
     controller = CartesianController(robot, settings, solver=solver)

@@ -146,7 +146,7 @@ def test_what_only_the_robot_can_tell_is_named_when_it_is_composed(
 
 
 def test_the_number_of_further_faults_is_told(tmp_path: Path) -> None:
-    text = changed("control", {"acceleration_limit": -1, "min_distance": -1, "solver": 5})
+    text = changed("control", {"acceleration_limit": -1, "min_distance": -1, "max_substep": -1})
     assert fault(tmp_path, text).endswith("(and 2 more)")
 
 

@@ -20,7 +20,7 @@ from q2r2_control.control.geometry.collision import (
 from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.kernel_model import KernelData, KernelModel, kernel_model_of
-from q2r2_control.control.safety.velocity_bounds import update_body_velocities
+from q2r2_control.control.safety.speed_bound import update_body_velocities
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 

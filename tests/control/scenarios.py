@@ -82,14 +82,6 @@ def circle(t: float, start: Mapping[str, pin.SE3]) -> Targets:
     return {side: _moved(pose, (0.0, 0.1 * np.sin(phase), 0.1 * (1.0 - np.cos(phase)))) for side, pose in start.items()}
 
 
-def back_inwards(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """From where the tools start, 0.2 m back towards the middle of the floor."""
-    return {
-        side: pin.SE3(pose.rotation, pose.translation * (1.0 - 0.2 / np.linalg.norm(pose.translation)))
-        for side, pose in start.items()
-    }
-
-
 SCENARIOS: dict[str, Scenario] = {
     "crossing": crossing,
     "same point": same_point,

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from q2r2_control.config.control import LIVE, ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.live_settings import GROWTH
-from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.robot.kept_distances import kept_distances
 from tests.control.scenarios import SCENARIOS, circle
 from tests.control.test_scenarios import robot_of
 from tests.support.driven import Driven
 
 DT = 0.002
-# Ranges within which gains and weights are drawn, of which every digit counts alike.
-ANY = {"separation_gain": (0.01, 50.0), "stretch_gain": (0.1, 200.0), "posture_weight": (1e-6, 1.0)}
 NEAR, FAR = 0.005, 0.035  # [m]
 UP = np.array([0.0, 0.0, 0.05])  # [m]
 
@@ -35,7 +29,7 @@ def margins(run: Driven) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_arms_that_rest_against_each_other_are_not_pushed_apart_by_a_greater_distance(
+def test_a_greater_distance_pushes_no_pair_apart_and_is_kept_once_the_pair_has_opened(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -47,18 +41,9 @@ def test_arms_that_rest_against_each_other_are_not_pushed_apart_by_a_greater_dis
     run.drive(1.5)
     assert np.abs(run.q - before).max() < 1e-4
     assert margins(run).min() < -0.02  # nearer than asked for, and left so
-    assert controller.narrow_pair is not None
+    assert len(controller.narrow_pair or ()) == 2
     assert controller.kept_distances.min() > 0.6 * pair.min()  # but no nearer than it is
-
-
-@pytest.mark.slow
-def test_a_pair_keeps_all_of_a_greater_distance_once_it_has_been_opened_and_is_then_held_there(
-    controller: CartesianController,
-) -> None:
-    run = Driven(controller)
-    run.drive(3.0, SCENARIOS["crossing"])
-    assert controller.change({"min_distance": FAR}) is None
-    run.drive(3.0, lambda _, start: dict(start))
+    run.drive(3.0, run.start)
     assert controller.narrow_pair is None
     assert controller.kept_distances.min() == FAR
     run.drive(3.0, SCENARIOS["crossing"])
@@ -90,54 +75,6 @@ def test_changes_drawn_at_random_in_mid_motion_break_no_promise(controller: Cart
         assert controller.change({name: float(value)}) is None
         run.drive(0.2, scenarios[random.integers(len(scenarios))])
     assert run.contract.uncertified == 0
-
-
-class WithoutRows:
-    """A solver that knows of no separation: whatever it asks for, only the certificate keeps pairs apart."""
-
-    def __init__(self, inner: Solver) -> None:
-        self._inner = inner
-
-    def solve(self, problem: QpProblem) -> QpSolution:
-        return self._inner.solve(replace(problem, rows=problem.rows[:0], rows_lower=problem.rows_lower[:0]))
-
-
-def drawn_gains(random: np.random.Generator) -> dict[str, float]:
-    return {key: float(np.exp(random.uniform(*np.log(ends)))) for key, ends in ANY.items()}
-
-
-@pytest.mark.parametrize("name", ["crossing", "into the table"])
-def test_the_certificate_keeps_distances_whatever_the_gain_is_and_where_the_solver_knows_no_rows(name: str) -> None:
-    robot = robot_of("iiwa7")
-    solver = WithoutRows(make_solver("daqp", robot.model.nv, None))
-    run = Driven(CartesianController(robot, ControllerSettings(min_distance=NEAR), solver=solver))
-    random = np.random.default_rng(6)
-    for _ in range(20):
-        assert run.controller.change(drawn_gains(random)) is None
-        run.drive(0.1, SCENARIOS[name])
-    assert run.contract.fallbacks > 100
-    assert margins(run).min() < 0.005
-    assert run.contract.uncertified == 0
-
-
-@pytest.mark.parametrize("name", ["crossing", "into the table"])
-def test_gains_that_change_all_the_time_near_contact_break_no_promise_and_leave_the_arms_at_rest(
-    controller: CartesianController, name: str
-) -> None:
-    random, run, scenario = np.random.default_rng(5), Driven(controller), SCENARIOS[name]
-    fastest = 0.0
-    for _ in range(30):
-        assert controller.change(drawn_gains(random)) is None
-        run.drive(0.1, scenario)
-        fastest = max(fastest, np.abs(run.v).max() if margins(run).min() < 0.01 else 0.0)
-    assert fastest > 0.1  # it was in motion there
-    run.drive(5.0, scenario)
-    assert run.contract.uncertified == 0
-    squares = []
-    for _ in range(50):
-        run.drive(0.01, scenario)
-        squares.append(float(run.a @ run.a))
-    assert np.sqrt(np.mean(squares)) < 0.1
 
 
 def test_arms_that_close_in_are_slowed_by_a_smaller_gain_of_separation_and_not_with_a_jerk(
@@ -174,8 +111,12 @@ def test_what_was_changed_is_what_a_controller_that_is_made_with_it_has(name: st
 def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(controller: CartesianController) -> None:
     run = Driven(controller)
     run.drive(4.0, SCENARIOS["crossing"])
-    assert controller.change({"min_distance": FAR}) is None
-    controller.reset(run.q)
+    for changed in (FAR, NEAR, FAR):
+        assert controller.change({"min_distance": changed}) is None
+        if changed == FAR:
+            controller.reset(run.q)
+        least = (controller.robot.distance_values(run.q) - controller.kept_distances).min()
+        assert controller.step({}, 0.0).report.margin == pytest.approx(least, abs=2e-6)
     run.contract.start(run.q)
     before = run.q
     run.drive(0.5)
@@ -231,11 +172,6 @@ def test_a_distance_that_home_does_not_keep_is_refused_and_names_the_pair(contro
 
 def _way(controller: CartesianController) -> np.ndarray:
     """Positions while both arms reach across each other, and then upwards."""
-    start, way = _tools(controller), []
-    for scenario in (SCENARIOS["crossing"], SCENARIOS["overhead"]):
-        way += [controller.step(scenario(0.0, start), DT).q for _ in range(400)]
-    return np.array(way)
-
-
-def _tools(controller: CartesianController) -> dict[str, pin.SE3]:
-    return {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    goals = [SCENARIOS[name](0.0, start) for name in ("crossing", "overhead") for _ in range(400)]
+    return np.array([controller.step(goal, DT).q for goal in goals])

@@ -1,18 +1,24 @@
-"""Fingers count at the openings that they may have: less is free, more is proven first, and nothing else moves."""
+"""Fingers that slide or turn count at the openings that they may have: more is proven first, and shown by Coal."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.finger_bodies import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.types import ALL_OF_THE_WAY, Array
 from tests.support.coal_distances import coal_distances
 from tests.support.driven import Driven
 from tests.support.object_cell import ABOVE, BESIDE, CELL, SETTINGS, tips_at
+from tests.support.turning_hand import RealHands, above_table, turning_cell
 
 DT = 0.002
 
@@ -67,24 +73,6 @@ def test_beside_the_block_it_may_open_as_far_as_the_block_allows_and_above_it_at
     run.drive(0.1, {"left": ABOVE})
 
 
-def test_an_opening_that_is_refused_leaves_every_bit_of_the_motion_as_it_was(robot: Robot) -> None:
-    twins = [CartesianController(robot, SETTINGS) for _ in range(2)]
-    for controller in twins:
-        assert controller.set_opening("left", 0.0, 0.0) is None
-    refused = 0
-    for _ in range(700):
-        if (twins[1].set_opening("left", 0.0, 1.0)) is not None:
-            refused += 1
-        else:
-            # Where all of the way is accepted, both are told.
-            twins[0].set_opening("left", 0.0, 1.0)
-            assert [controller.set_opening("left", 0.0, 0.0) for controller in twins] == [None, None]
-        first, second = (controller.step({"left": BESIDE}, DT) for controller in twins)
-        np.testing.assert_array_equal(first.q, second.q)
-        np.testing.assert_array_equal(first.v, second.v)
-    assert refused > 100
-
-
 def test_an_arm_at_speed_may_not_open_where_there_is_room_but_none_to_stop(controller: CartesianController) -> None:
     """Towards the block with the gripper closed, asked at every tick; Coal looks at stops from what is accepted."""
     robot = controller.robot
@@ -121,31 +109,25 @@ def test_a_reset_forgets_openings(controller: CartesianController) -> None:
     assert controller.openings == dict.fromkeys(("left", "right"), ALL_OF_THE_WAY)
     reference = controller.step({}, DT)
     assert reference.report.closest_distance == pytest.approx(closest_by_coal(controller, reference.q), abs=2e-6)
-
-
-def test_measured_openings_a_little_beyond_the_ends_are_the_ends(controller: CartesianController) -> None:
-    controller.reset(controller.robot.home)
-    assert controller.set_opening("left", -0.03, 1.02) is None
+    assert controller.set_opening("left", -0.03, 1.02) is None, "as a sensor may say"
     assert controller.openings["left"] == ALL_OF_THE_WAY
 
 
 @pytest.mark.parametrize(
-    ("arm", "least", "greatest", "complaint"),
+    ("arm", "interval", "complaint"),
     [
-        ("middle", 0.0, 1.0, "no such arm; arms: left, right"),
-        ("left", 0.6, 0.5, "the least first"),
-        ("left", float("nan"), 1.0, "finite numbers"),
-        ("left", 0.0, float("inf"), "finite numbers"),
-        ("left", None, 1.0, "finite numbers"),
+        ("middle", (0.0, 1.0), "no such arm; arms: left, right"),
+        ("left", (0.6, 0.5), "the least first"),
+        ("left", (float("nan"), 1.0), "finite numbers"),
+        ("left", (0.0, float("inf")), "finite numbers"),
+        ("left", (None, 1.0), "finite numbers"),
     ],
 )
 def test_what_is_no_opening_is_refused_by_name(
-    controller: CartesianController, arm: str, least: float, greatest: float, complaint: str
+    controller: CartesianController, arm: str, interval: tuple[float, float], complaint: str
 ) -> None:
-    controller.reset(controller.robot.home)
     with pytest.raises(RobotError, match=complaint):
-        controller.set_opening(arm, least, greatest)
-    assert controller.openings["left"] == ALL_OF_THE_WAY
+        controller.set_opening(arm, *interval)
 
 
 @pytest.mark.parametrize("below", [0.0, 1e-13, 5e-10])
@@ -160,3 +142,100 @@ def test_fingers_at_their_distance_to_the_last_digits_part_again(robot: Robot, b
     reference = near.drive(2.0, {"left": ABOVE})
     assert not reference.report.fallback
     assert np.linalg.norm(near.controller.tool_pose("left").translation - ABOVE.translation) < 1e-3
+
+
+COAL = 2e-6  # how exactly our distances are Coal's [m]
+
+
+class Cell(Driven):
+    """A run with its contract, and the fingers as they really are."""
+
+    def __init__(self, config: Config) -> None:
+        # No outcome hangs on the clock.
+        robot, settings = Robot.from_config(config), config.control.model_copy(update={"solve_time_limit": None})
+        self.real, self.kept = RealHands(robot), kept_distances(robot, settings).values
+        super().__init__(CartesianController(robot, settings), dt=DT)
+
+    def spare(self, openings: dict[str, float]) -> float:
+        """How much farther apart than it has to be the nearest pair of shapes as drawn is [m]."""
+        return float((self.real.distances(self.q, openings) - self.kept).min())
+
+    def spare_of_bodies(self) -> float:
+        """The same of the fingers' bodies."""
+        model = collision_model_at(self.robot.collision_model, self.robot.finger_bodies, self.controller.openings)
+        return float((coal_distances(self.robot, model, self.q) - self.kept).min())
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Cell:
+    return Cell(turning_cell(tmp_path))
+
+
+def test_an_open_gripper_may_not_close_into_the_table_and_may_where_there_is_room(cell: Cell) -> None:
+    assert cell.set_opening("left", 1.0, 1.0) is None
+    cell.drive(1.8, {"left": above_table(0.006)})
+    # The closed fingers' tips would be 8 mm inside the table.
+    assert cell.spare({"left": 1.0, "right": 1.0}) > 0.0 > cell.spare({"left": 0.0, "right": 1.0})
+    for least in (0.0, 0.3):
+        pair = cell.set_opening("left", least, 1.0)
+        assert pair is not None
+        assert "table_0" in pair
+        assert any("_tip" in name for name in pair)
+        assert cell.controller.openings["left"] == (1.0, 1.0)
+    assert cell.set_opening("left", 0.95, 1.0) is None
+    cell.drive(1.2, {"left": above_table(0.06)})
+    assert cell.set_opening("left", *ALL_OF_THE_WAY) is None
+    cell.drive(0.02, {"left": above_table(0.06)})
+
+
+def test_less_that_reaches_nearer_is_refused_like_more_and_the_wider_body_stays(cell: Cell) -> None:
+    """Onto the table along a direction in which the capsules of a part of an interval reach farther than of all."""
+    wide, narrow, direction = (0.0, 0.7), (0.175, 0.7), np.array([-0.1135, 0.3231, 0.9395])
+    fingers = [body for body in cell.robot.finger_bodies if isinstance(body, TurningBody) and body.arm == "left"]
+    reach = {}
+    for interval in (wide, narrow):
+        capsules = [body.capsule(interval) for body in fingers]
+        reach[interval] = max(max(start @ direction, end @ direction) + radius for start, end, radius in capsules)
+    assert reach[narrow] > reach[wide] + 0.0007
+    assert cell.set_opening("left", *wide) is None
+    home = cell.controller.tool_pose("left")
+    data = cell.robot.model.createData()
+    pin.forwardKinematics(cell.robot.model, data, cell.robot.home)
+    pointed = data.oMi[int(cell.robot.arms["left"].joints[-1]) + 1].rotation @ direction
+    tilt = pin.Quaternion.FromTwoVectors(pointed, np.array([0.0, 0.0, -1.0])).matrix()
+    low, high = (pin.SE3(tilt @ home.rotation, np.array([0.5, 0.25, height])) for height in (0.15, 0.3))
+    cell.drive(1, {"left": high})
+    cell.drive(1.8, {"left": low})
+    pair = cell.set_opening("left", *narrow)
+    assert pair is not None
+    assert "table_0" in pair
+    assert cell.controller.openings["left"] == wide
+    assert cell.set_opening("left", 0.3, 0.4) is None  # much less is within
+    assert cell.spare_of_bodies() >= -COAL
+    assert cell.set_opening("left", *wide) is None
+    cell.drive(0.4, {"left": high})
+    assert cell.set_opening("left", *narrow) is None
+
+
+@pytest.mark.slow
+def test_with_hostile_targets_and_openings_no_finger_is_ever_too_near_wherever_it_really_is(cell: Cell) -> None:
+    random, refused = np.random.default_rng(5), 0
+    goals: dict[str, pin.SE3] = {}
+    for tick in range(3000):
+        if tick % 150 == 0:
+            for arm, side in (("left", 1.0), ("right", -1.0)):
+                height = random.choice([0.1, 0.21, 0.23, 0.3])
+                place = np.array([random.uniform(0.4, 0.6), side * random.uniform(-0.15, 0.2), height])
+                tilt = pin.rpy.rpyToMatrix(np.pi + random.uniform(-0.6, 0.6), random.uniform(-0.3, 0.3), np.pi)
+                goals[arm] = pin.SE3(tilt, place)
+        if random.random() < 0.2:
+            low, high = np.sort(random.random(2)).tolist()
+            interval = ((low, high), (low, 1.0), (0.0, high), ALL_OF_THE_WAY)[random.integers(4)]
+            refused += cell.set_opening(str(random.choice(["left", "right"])), *interval) is not None
+        cell.drive(DT, goals)
+        if tick % 8 == 0:
+            for share in (0.0, 1.0, float(random.random())):
+                at = {arm: least + share * (most - least) for arm, (least, most) in cell.controller.openings.items()}
+                assert cell.spare(at) >= -COAL
+            assert cell.spare_of_bodies() >= -COAL
+    assert refused > 25

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from functools import cache
 
-import numpy as np
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.benchmark.motion_run import MotionFigures, OwnController, run_motion, without_pairs
 from q2r2_control.benchmark.work_motions import WORK_MOTIONS, WorkMotion
-from q2r2_control.verification.contract import Contract
+from tests.support.driven import Driven
 
 pytestmark = pytest.mark.slow
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
-DT = 0.002
 STILL = 3.0  # longer than the motions themselves wait: arms that block each other slide for a while [s]
 
 
@@ -41,11 +39,9 @@ def rms(name: str, free: bool = False) -> float:
 
 @pytest.mark.parametrize("motion", WORK_MOTIONS.values(), ids=WORK_MOTIONS.keys())
 def test_the_contract_holds_at_every_tick_of_work_without_fallback_and_it_ends_in_rest(motion: WorkMotion) -> None:
-    controller = CartesianController(robot_of(free=False), SETTINGS)
-    contract = Contract(controller)
-    start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
-    for t in np.arange(0.0, motion.ends + STILL, DT):
-        contract.check(controller.step(motion.targets(min(t, motion.ends), start), DT), DT)
+    run = Driven(CartesianController(robot_of(free=False), SETTINGS))
+    run.drive(motion.ends + STILL, lambda t, start: motion.targets(min(t, motion.ends), start))
+    contract = run.contract
     assert contract.uncertified == 0
     assert contract.fallback_share < 0.01
     assert contract.tail_acceleration() < 0.1
@@ -56,13 +52,6 @@ def test_arms_that_carry_something_close_together_follow_as_they_do_in_free_air(
     name = f"carry-0.20-{speed}"
     assert rms(name) <= 1.5 * rms(name, free=True)
     assert figures_of(name).fallback_percent == 0.0
-
-
-@pytest.mark.parametrize("speed", ["0.15", "0.30", "0.50"])
-def test_where_wrists_are_in_the_way_speed_costs_no_more_than_in_free_air(speed: str) -> None:
-    slow = rms("carry-0.16-0.04")
-    assert slow <= 10.0, "elbows make room"
-    assert rms(f"carry-0.16-{speed}") <= slow + 1.5 * rms(f"carry-0.16-{speed}", free=True)
 
 
 @pytest.mark.parametrize(("name", "time"), [("pass", 2.0), ("pass-back", 2.0), ("cross", 4.5), ("reach-under", 2.0)])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
+from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, Solver
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.judge import judge
@@ -192,7 +192,7 @@ class SometimesLate:
 
 def test_solutions_that_came_too_late_are_too_late_again(tmp_path: Path) -> None:
     loop = pipeline(control=cell().control.model_copy(update={"solve_time_limit": None}))
-    loop.controller._solver = SometimesLate(make_solver("daqp", loop.robot.model.nv, None))
+    loop.controller._solver = SometimesLate(DaqpSolver(loop.robot.model.nv))
     file = file_of(record(tmp_path, loop, 1.2))
     result = replay(file)
     assert result.difference is None

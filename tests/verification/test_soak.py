@@ -13,7 +13,7 @@ import pytest
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.qp import make_solver
+from q2r2_control.control.qp import DaqpSolver
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Reference
@@ -35,7 +35,7 @@ def robot() -> Robot:
 
 @cache
 def controller_and_solver() -> tuple[CartesianController, FaultySolver]:
-    solver = FaultySolver(make_solver("daqp", robot().model.nv, None), np.random.default_rng(0))
+    solver = FaultySolver(DaqpSolver(robot().model.nv), np.random.default_rng(0))
     return CartesianController(robot(), SETTINGS, solver=solver), solver
 
 
@@ -166,7 +166,7 @@ def test_arms_that_come_too_close_are_found_at_ticks_between_them_and_in_stops()
 
 def test_a_stop_that_is_due_and_not_executed_is_found() -> None:
     """The faults go to a solver that the controller does not have."""
-    elsewhere = FaultySolver(make_solver("daqp", 14, None), np.random.default_rng(0))
+    elsewhere = FaultySolver(DaqpSolver(14), np.random.default_rng(0))
     controller_and_solver()[1].fault = None
     report = soak(lambda reference: reference, 0, 3000, solver=elsewhere)
     assert {found.promise for found in report.broken} == {

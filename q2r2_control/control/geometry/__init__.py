@@ -1,6 +1,5 @@
 """Where joints, bodies and tools are, and how far bodies are apart: kernels over a robot's joint tree and its shapes.
 
 ``kinematics`` places joint frames; ``collision`` holds the bodies and monitored pairs and places them;
-``closest_points`` knows segments and boxes; ``pair_distance`` measures pairs and gives their gradients;
-``smooth_distance`` does so with a gradient that never jumps. Nothing of the other rooms is imported here.
+``closest_points`` knows segments and boxes; ``pair_distance`` measures pairs and gives their gradients.
 """

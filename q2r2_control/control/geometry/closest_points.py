@@ -9,16 +9,34 @@ from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.control.jit import kernel
+from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.types import Array
 
 _TINY = 1e-12
 
 
-@kernel
+@inlined_kernel
 def dot(a: Array, b: Array) -> float:
-    """Scalar product of two 3-vectors."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    """Scalar product of two vectors."""
+    total = 0.0
+    for k in range(a.shape[0]):
+        total += a[k] * b[k]
+    return total
+
+
+@inlined_kernel
+def size_of(a: Array) -> float:
+    """Euclidean norm of a vector."""
+    return np.sqrt(dot(a, a))
+
+
+@inlined_kernel
+def way_between(a: Array, b: Array) -> float:
+    """Euclidean distance of two points."""
+    square = 0.0
+    for k in range(a.shape[0]):
+        square += (a[k] - b[k]) ** 2
+    return np.sqrt(square)
 
 
 @kernel
@@ -34,29 +52,9 @@ def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_
     Minimises the convex quadratic |a(s) - b(t)|^2 over the unit square: the free minimum of s, then t for it, then s
     again for the clamped t (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
     """
-    aa = 0.0
-    bb = 0.0
-    ab = 0.0
-    ar = 0.0
-    br = 0.0
-    for k in range(3):
-        u = a1[k] - a0[k]
-        w = b1[k] - b0[k]
-        r = a0[k] - b0[k]
-        aa += u * u
-        bb += w * w
-        ab += u * w
-        ar += u * r
-        br += w * r
-    s = 0.0
-    t = 0.0
-    if aa <= _TINY and bb <= _TINY:
-        pass
-    elif aa <= _TINY:
-        t = clamp(br / bb, 0.0, 1.0)
-    elif bb <= _TINY:
-        s = clamp(-ar / aa, 0.0, 1.0)
-    else:
+    aa, bb, ab, ar, br = products(a0, a1, b0, b1)
+    s, t = 0.0, 0.0
+    if aa > _TINY and bb > _TINY:
         determinant = aa * bb - ab * ab
         # Parallel segments have many closest pairs; the middle of the overlap turns least when they tilt. It is too
         # far by at most half the overlap times the angle, so only an angle below 1e-7 counts as parallel.
@@ -71,22 +69,35 @@ def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_
         elif t > 1.0:
             t = 1.0
             s = clamp((ab - ar) / aa, 0.0, 1.0)
-    square = 0.0
+    elif aa > _TINY:
+        s = clamp(-ar / aa, 0.0, 1.0)
+    elif bb > _TINY:
+        t = clamp(br / bb, 0.0, 1.0)
     for k in range(3):
         on_a[k] = a0[k] + s * (a1[k] - a0[k])
         on_b[k] = b0[k] + t * (b1[k] - b0[k])
-        square += (on_a[k] - on_b[k]) ** 2
-    return np.sqrt(square)
+    return way_between(on_a, on_b)
+
+
+@kernel
+def products(a0: Array, a1: Array, b0: Array, b1: Array) -> tuple[float, float, float, float, float]:
+    """Scalar products u'u, w'w, u'w, u'r and w'r of u = a1 - a0, w = b1 - b0 and r = a0 - b0."""
+    aa, bb, ab, ar, br = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        u, w, r = a1[k] - a0[k], b1[k] - b0[k], a0[k] - b0[k]
+        aa += u * u
+        bb += w * w
+        ab += u * w
+        ar += u * r
+        br += w * r
+    return aa, bb, ab, ar, br
 
 
 @kernel
 def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
     """Parameter on a of the middle of what b covers of it, for parallel segments."""
-    first = -ar / aa  # of b0 on a
-    second = (ab - ar) / aa  # of b1 on a
-    low = clamp(min(first, second), 0.0, 1.0)
-    high = clamp(max(first, second), 0.0, 1.0)
-    return 0.5 * (low + high)
+    start, end = -ar / aa, (ab - ar) / aa  # of b on a
+    return 0.5 * (clamp(start, 0.0, 1.0) + clamp(end, 0.0, 1.0))
 
 
 @kernel
@@ -94,17 +105,14 @@ def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, n
     """Signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
 
     Writes the closest points and the unit normal from the segment to the box. The squared distance along the segment
-    is convex and piecewise quadratic, its derivative rising and piecewise linear, so its zero is found exactly
-    between two of the at most six parameters where the segment crosses a face plane. A segment that enters the box
-    is pushed out through the face that takes the least way (negative distance).
+    is convex and piecewise quadratic, so the zero of its slope is found exactly between two of the at most six
+    parameters where the segment crosses a face plane. A segment that enters the box is pushed out the least way.
     """
     s = _minimum_along(a0, a1, half)
-    square = 0.0
     for k in range(3):
         on_a[k] = a0[k] + s * (a1[k] - a0[k])
         on_box[k] = clamp(on_a[k], -half[k], half[k])
-        square += (on_a[k] - on_box[k]) ** 2
-    distance = np.sqrt(square)
+    distance = way_between(on_a, on_box)
     if distance > 1e-9:
         for k in range(3):
             normal[k] = (on_box[k] - on_a[k]) / distance
@@ -169,33 +177,22 @@ def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
 def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
     """Least way out of the box for a segment that enters it.
 
-    The penetration depth of two convex polytopes is the distance from the origin to the nearest face of their Minkowski
-    difference (Cameron, ICRA 1997). For box and segment the faces belong to the box's faces, and to each of its edges
-    with the segment; leaving out the latter, the depth would jump where a segment begins to cut an edge.
+    That is to the nearest face of their Minkowski difference (Cameron, ICRA 1997). The faces belong to the box's faces,
+    and to each of its edges with the segment; without these the depth would jump where a segment begins to cut an edge.
     """
-    best = np.inf
-    axis = 0
-    sign = 1.0
+    best, axis, sign, edge = np.inf, 0, 1.0, -1
+    least = 1e-6 * way_between(a0, a1)
     for k in range(3):
-        upward = half[k] - min(a0[k], a1[k])
-        downward = half[k] + max(a0[k], a1[k])
-        if upward < best:
-            best = upward
-            axis = k
-            sign = 1.0
-        if downward < best:
-            best = downward
-            axis = k
-            sign = -1.0
-    edge = -1
-    length = np.sqrt((a1[0] - a0[0]) ** 2 + (a1[1] - a0[1]) ** 2 + (a1[2] - a0[2]) ** 2)
+        for side in (1.0, -1.0):
+            depth = half[k] - min(side * a0[k], side * a1[k])
+            if depth < best:
+                best, axis, sign = depth, k, side
     for k in range(3):
-        depth = _depth_across(a0, a1, half, k, 1e-6 * length, normal)
+        depth = _depth_across(a0, a1, half, k, least, normal)
         if depth < best:
-            best = depth
-            edge = k
+            best, edge = depth, k
     if edge >= 0:
-        _depth_across(a0, a1, half, edge, 1e-6 * length, normal)
+        _depth_across(a0, a1, half, edge, least, normal)
         _across_edge(a0, a1, half, edge, on_a, on_box, normal)
         return -best
     deeper_is_a0 = sign * a0[axis] < sign * a1[axis]
@@ -213,18 +210,14 @@ def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, norma
     """Way out of the box across its edges along axis ``k``; ``normal`` leads from the segment into the box."""
     i, j = (k + 1) % 3, (k + 2) % 3
     # e_k x (a1 - a0)
-    x = -(a1[j] - a0[j])
-    y = a1[i] - a0[i]
+    x, y = a0[j] - a1[j], a1[i] - a0[i]
     size = np.sqrt(x * x + y * y)
     if size <= least:
         return np.inf
-    x /= size
-    y /= size
+    x, y = x / size, y / size
     along = x * a0[i] + y * a0[j]
     out = 1.0 if along >= 0.0 else -1.0
-    normal[k] = 0.0
-    normal[i] = -out * x
-    normal[j] = -out * y
+    normal[k], normal[i], normal[j] = 0.0, -out * x, -out * y
     return half[i] * abs(x) + half[j] * abs(y) - abs(along)
 
 

@@ -63,11 +63,6 @@ class BodyPlacements(NamedTuple):
     end: Array  # (g, 3)
     rotation: Array  # (g, 3, 3)
 
-    @classmethod
-    def empty(cls, bodies: CollisionBodies) -> BodyPlacements:
-        g = len(bodies.joint)
-        return cls(np.zeros((g, 3)), np.zeros((g, 3)), np.zeros((g, 3, 3)))
-
 
 class Contact(NamedTuple):
     """The last pair that was measured, in the world."""
@@ -92,7 +87,9 @@ class CollisionData(NamedTuple):
 
     @classmethod
     def empty(cls, model: CollisionModel) -> CollisionData:
-        return cls(Placements.empty(model.chain), BodyPlacements.empty(model.bodies), Contact.empty())
+        g = len(model.bodies.joint)
+        posed = BodyPlacements(np.zeros((g, 3)), np.zeros((g, 3)), np.zeros((g, 3, 3)))
+        return cls(Placements.empty(model.chain), posed, Contact.empty())
 
 
 def collision_model_of(robot: Robot, geometry: pin.GeometryModel | None = None) -> CollisionModel:
@@ -104,8 +101,7 @@ def collision_model_of(robot: Robot, geometry: pin.GeometryModel | None = None) 
     chain, bodies = chain_of(robot.model), bodies_of(geometry)
     travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     extent = farthest_of(bodies)
-    for number, finger in turning_bodies(robot):
-        # Its capsules of other intervals are not within the one of all of the way.
+    for number, finger in turning_bodies(robot):  # capsules of other intervals are not within the one of all the way
         extent[number] = max(extent[number], finger.extent)
     return CollisionModel(chain, bodies, pairs_of(geometry, chain, bodies, travel, extent))
 
@@ -114,18 +110,17 @@ def bodies_of(model: pin.GeometryModel) -> CollisionBodies:
     """Read capsules, spheres and boxes. Raises :class:`RobotError` for any other shape."""
     count = model.ngeoms
     bodies = CollisionBodies(
-        joint=np.zeros(count, dtype=np.int64),
+        joint=np.array([geometry.parentJoint for geometry in model.geometryObjects], dtype=np.int64),
         box=np.zeros(count, dtype=np.int64),
         start=np.zeros((count, 3)),
         end=np.zeros((count, 3)),
         radius=np.zeros(count),
         half=np.zeros((count, 3)),
-        rotation=np.tile(np.eye(3), (count, 1, 1)),
+        rotation=np.zeros((count, 3, 3)),
         size=np.zeros(count),
     )
     for i, geometry in enumerate(model.geometryObjects):
         shape, placement = geometry.geometry, geometry.placement
-        bodies.joint[i] = geometry.parentJoint
         bodies.rotation[i] = placement.rotation
         reach = placement.rotation[:, 2] * (shape.halfLength if isinstance(shape, coal.Capsule) else 0.0)
         bodies.start[i], bodies.end[i] = placement.translation - reach, placement.translation + reach
@@ -152,16 +147,12 @@ def farthest_of(bodies: CollisionBodies) -> Array:
     return np.asarray(np.linalg.norm(bodies.half, axis=1) + ends)
 
 
-def pairs_of(
-    model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, travel: Array, extent: Array | None = None
-) -> Pairs:
+def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, travel: Array, extent: Array) -> Pairs:
     """Monitored pairs of ``model``; ``travel`` (nv,) is how far each joint can be from zero [rad or m].
 
-    ``extent`` (g,) is what :func:`farthest_of` the bodies never exceeds, whatever becomes of them [m]; None: as they
-    are. Raises :class:`RobotError` for a pair of two boxes, which no kernel measures.
+    ``extent`` (g,) is what :func:`farthest_of` the bodies never exceeds, whatever becomes of them [m]. Raises
+    :class:`RobotError` for a pair of two boxes, which no kernel measures.
     """
-    extent = farthest_of(bodies) if extent is None else extent
-    parent, translation, prismatic = chain.parent, chain.translation, chain.prismatic
     rows = []
     for pair in model.collisionPairs:
         first, second = (pair.second, pair.first) if bodies.box[pair.first] else (pair.first, pair.second)
@@ -175,43 +166,31 @@ def pairs_of(
             joint = int(bodies.joint[body])
             # Walking up, the bound grows by each link's offset and by how far each slide extends.
             while joint != 0:
-                if prismatic[joint]:
+                if chain.prismatic[joint]:
                     farthest += travel[joint - 1]
                 if joint in moving:
                     del moving[joint]  # moves both alike: no relative motion
                     carried = True
                 else:
-                    moving[joint] = (sign, 1.0 if prismatic[joint] else float(farthest))
-                farthest += np.linalg.norm(translation[joint])
-                joint = int(parent[joint])
+                    moving[joint] = (sign, 1.0 if chain.prismatic[joint] else float(farthest))
+                farthest += np.linalg.norm(chain.translation[joint])
+                joint = int(chain.parent[joint])
         rows.append((first, second, moving, carried))
     width = max([len(moving) for _, _, moving, _ in rows], default=1)
-    pairs = Pairs(
-        first=np.array([row[0] for row in rows], dtype=np.int64),
-        second=np.array([row[1] for row in rows], dtype=np.int64),
-        joint=np.zeros((len(rows), width), dtype=np.int64),
-        sign=np.zeros((len(rows), width)),
-        reach=np.zeros((len(rows), width)),
-        leverage=np.zeros(len(rows)),
-        carried=np.array([row[3] for row in rows], dtype=np.int64),
-    )
+    joints = np.zeros((len(rows), width), dtype=np.int64)
+    signs, reaches = np.zeros((2, len(rows), width))
     for p, (_, _, moving, _) in enumerate(rows):
         for k, (joint, (sign, reach)) in enumerate(sorted(moving.items())):
-            pairs.joint[p, k], pairs.sign[p, k], pairs.reach[p, k] = joint, sign, reach
-            pairs.leverage[p] += reach
-    return pairs
+            joints[p, k], signs[p, k], reaches[p, k] = joint, sign, reach
+    firsts, seconds, carries = (np.array([row[i] for row in rows], dtype=np.int64) for i in (0, 1, 3))
+    return Pairs(firsts, seconds, joints, signs, reaches, reaches.sum(axis=1), carries)
 
 
 @kernel
 def update_placements(model: CollisionModel, data: CollisionData, q: Array) -> None:
     """Joint frames and geometries in the world at ``q`` (nv,)."""
-    place(model.chain, q, data.placements)
-    _pose_bodies(model.bodies, data.placements, data.posed)
-
-
-@kernel
-def _pose_bodies(bodies: CollisionBodies, placements: Placements, posed: BodyPlacements) -> None:
-    """Move every geometry to the world."""
+    bodies, placements, posed = model.bodies, data.placements, data.posed
+    place(model.chain, q, placements)
     for g in range(bodies.joint.shape[0]):
         joint = bodies.joint[g]
         for row in range(3):

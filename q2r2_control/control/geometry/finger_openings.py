@@ -1,10 +1,9 @@
 """The fingers' bodies of one collision model, as their grippers' openings are known.
 
-They are changed in place, where the kernels read them. What was worked out once of all of a sliding finger's way stays:
-its part is nowhere farther from a joint's axis (``Pairs.reach``, ``leverage``) and fits into a ball of that size about
-its own middle (``CollisionBodies.size``), so that every bound made of these holds as it is. A finger that turns has
-another capsule for each interval. ``Pairs.reach`` and ``leverage`` are made of how far any of these is from a joint's
-axis (``collision_model_of``); radius and size change with it.
+They are changed in place, where the kernels read them. A part of a sliding finger's way is nowhere farther from a
+joint's axis than all of it (``Pairs.reach``, ``leverage``) and fits into a ball of that size about its own middle
+(``CollisionBodies.size``), so that every bound made of these holds as it is. A finger that turns has another capsule,
+radius and size for each interval; ``reach`` and ``leverage`` are made of the farthest of them (``collision_model_of``).
 """
 
 from __future__ import annotations
@@ -45,7 +44,6 @@ class FingerOpenings:
         self._turning = {arm: _Turning(found, bodies) for arm, found in turning.items()}
         self._start, self._end = bodies.start.copy(), bodies.end.copy()
         self._parts: dict[int, tuple[float, float]] = {}
-        self._none: IntArray = np.zeros(len(bodies.joint), dtype=np.int64)
 
     def checked(self, arm: str, least: float, greatest: float) -> Interval:
         """The interval as it can be set. Raises :class:`RobotError` for no arm and for no interval."""
@@ -64,7 +62,7 @@ class FingerOpenings:
         That is: is not within what it was before. One that slides grows by a wider interval only, one that turns may
         by a narrower one.
         """
-        grown = self._none.copy()
+        grown: IntArray = np.zeros(len(self._bodies.joint), dtype=np.int64)
         self.intervals[arm] = interval
         for body, finger in self._fingers[arm]:
             before, part = self._parts.get(body, ALL_OF_THE_WAY), finger.part(interval)

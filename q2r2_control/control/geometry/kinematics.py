@@ -75,14 +75,10 @@ def place(chain: Chain, q: Array, placements: Placements) -> None:
     """World placement of every joint frame at ``q`` (nv,)."""
     for i in range(1, chain.parent.shape[0]):
         parent = chain.parent[i]
-        x = chain.axis[i, 0]
-        y = chain.axis[i, 1]
-        z = chain.axis[i, 2]
-        sine = 0.0
-        versine = 0.0
+        x, y, z = chain.axis[i, 0], chain.axis[i, 1], chain.axis[i, 2]
+        sine, versine = 0.0, 0.0
         if chain.prismatic[i] == 0:
-            sine = np.sin(q[i - 1])
-            versine = 1.0 - np.cos(q[i - 1])
+            sine, versine = np.sin(q[i - 1]), 1.0 - np.cos(q[i - 1])
         # Rodrigues: I + sin K + (1 - cos) K^2
         t00 = 1.0 - versine * (y * y + z * z)
         t01 = versine * x * y - sine * z
@@ -94,9 +90,7 @@ def place(chain: Chain, q: Array, placements: Placements) -> None:
         t21 = versine * y * z + sine * x
         t22 = 1.0 - versine * (x * x + y * y)
         for row in range(3):
-            r0 = 0.0
-            r1 = 0.0
-            r2 = 0.0
+            r0, r1, r2 = 0.0, 0.0, 0.0
             moved = placements.translation[parent, row]
             for k in range(3):
                 up = placements.rotation[parent, row, k]

@@ -1,15 +1,31 @@
-"""Signed distances of monitored pairs and the rows that are their gradients, compiled.
+"""Signed distances of monitored pairs, exact and smooth, and the rows that are their gradients, compiled.
 
 For the closest points p1, p2 and the unit normal n from the first body to the second, the distance changes with
 d' = n' (J_p2 - J_p1) v: only joints that move one body relative to the other appear in it.
+
+**Smooth distances** have a gradient that never jumps, for forces that follow it. The closest points of two parallel
+segments, or of a segment along a box's face, jump from end to end as the bodies tilt. Here their parameters s, t in
+[0, 1] are drawn to the segments' middles by a small cost,
+
+    D^2 = min |a(s) - b(t)|^2 + e ((s - 1/2)^2 + (t - 1/2)^2),
+
+which makes them unique and continuous in the posture. By the envelope theorem dD = (b - a)' d(b - a) / D at the points
+found, so the pair's row with the normal (b - a) / D, slightly shorter than one, is exactly the gradient of D. D is
+larger than the distance d of the cores, by e / (4 d) at most.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.control.geometry.closest_points import dot, segment_box, segment_segment
-from q2r2_control.control.geometry.collision import CollisionBodies, CollisionData, CollisionModel, Contact
+from q2r2_control.control.geometry.closest_points import clamp, dot, products, segment_box, segment_segment, size_of
+from q2r2_control.control.geometry.collision import (
+    BodyPlacements,
+    CollisionBodies,
+    CollisionData,
+    CollisionModel,
+    Contact,
+)
 from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.types import Array
 
@@ -62,23 +78,32 @@ def measure_part(model: CollisionModel, data: CollisionData, p: int, start: Arra
 def _to_box(start: Array, end: Array, centre: Array, axes: Array, half: Array, contact: Contact) -> float:
     """Signed distance [m] of a segment and a box, of which ``axes`` (3, 3) and ``half`` sides (3,) are given."""
     local = contact.local
-    for k in range(3):
-        along_start = 0.0
-        along_end = 0.0
-        for row in range(3):
-            along_start += axes[row, k] * (start[row] - centre[row])
-            along_end += axes[row, k] * (end[row] - centre[row])
-        local[0, k] = along_start
-        local[1, k] = along_end
     normal = local[2]
+    _into_box_frame(start, end, centre, axes, local)
     distance = segment_box(local[0], local[1], half, contact.first, contact.second, normal)
-    for points in (contact.first, contact.second):
-        x, y, z = points[0], points[1], points[2]
-        for row in range(3):
-            points[row] = centre[row] + axes[row, 0] * x + axes[row, 1] * y + axes[row, 2] * z
+    _into_world(contact.first, centre, axes)
+    _into_world(contact.second, centre, axes)
     for row in range(3):
-        contact.normal[row] = axes[row, 0] * normal[0] + axes[row, 1] * normal[1] + axes[row, 2] * normal[2]
+        contact.normal[row] = dot(axes[row], normal)
     return distance
+
+
+@kernel
+def _into_box_frame(start: Array, end: Array, centre: Array, axes: Array, local: Array) -> None:
+    """Two points, (3,) each, into the first rows of ``local``."""
+    for k in range(3):
+        local[0, k], local[1, k] = 0.0, 0.0
+        for row in range(3):
+            local[0, k] += axes[row, k] * (start[row] - centre[row])
+            local[1, k] += axes[row, k] * (end[row] - centre[row])
+
+
+@kernel
+def _into_world(point: Array, centre: Array, axes: Array) -> None:
+    """A point (3,) of the box frame, in place."""
+    x, y, z = point[0], point[1], point[2]
+    for row in range(3):
+        point[row] = centre[row] + axes[row, 0] * x + axes[row, 1] * y + axes[row, 2] * z
 
 
 @kernel
@@ -106,9 +131,7 @@ def _any_normal(a0: Array, a1: Array, b0: Array, b1: Array, normal: Array) -> No
             normal[k] = b0[k] + b1[k] - a0[k] - a1[k]
     if dot(normal, normal) < 1e-18:
         normal[2] = 1.0
-    size = np.sqrt(dot(normal, normal)) if between >= 0.0 else -np.sqrt(dot(normal, normal))
-    for k in range(3):
-        normal[k] /= size
+    normal /= size_of(normal) if between >= 0.0 else -size_of(normal)
 
 
 @kernel
@@ -126,13 +149,8 @@ def distance_row(model: CollisionModel, data: CollisionData, p: int, row: Array)
         if chain.prismatic[joint] == 1:
             row[joint - 1] = sign * (nx * ax + ny * ay + nz * az)
             continue
-        if sign < 0.0:
-            x, y, z = contact.first[0], contact.first[1], contact.first[2]
-        else:
-            x, y, z = contact.second[0], contact.second[1], contact.second[2]
-        x -= placements.translation[joint, 0]
-        y -= placements.translation[joint, 1]
-        z -= placements.translation[joint, 2]
+        point, origin = contact.first if sign < 0.0 else contact.second, placements.translation[joint]
+        x, y, z = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
         row[joint - 1] = sign * (nx * (ay * z - az * y) + ny * (az * x - ax * z) + nz * (ax * y - ay * x))
 
 
@@ -147,20 +165,16 @@ def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
     """
     bodies, pairs = model.bodies, model.pairs
     second = pairs.second.copy()
-    sources: list[int] = []
-    skins: list[float] = []
+    number: dict[tuple[int, float], int] = {}  # of the rounded box, by its source and skin
     for p in np.flatnonzero((depth > 0.0) & (bodies.box[second] == 1)):
         box = int(second[p])
         skin = min(float(depth[p]), _THICKEST_SKIN * float(bodies.half[box].min()))
-        if (box, skin) not in zip(sources, skins, strict=True):
-            sources.append(box)
-            skins.append(skin)
-        second[p] = len(bodies.joint) + list(zip(sources, skins, strict=True)).index((box, skin))
-    if not sources:
+        second[p] = number.setdefault((box, skin), len(bodies.joint) + len(number))
+    if not number:
         return model
-    half = bodies.half[sources] - np.array(skins)[:, None]
-    size = np.linalg.norm(half, axis=1) + skins
-    rounded = {"radius": np.array(skins), "half": half, "size": size}
+    sources, skins = [box for box, _ in number], np.array([skin for _, skin in number])
+    half = bodies.half[sources] - skins[:, None]
+    rounded = {"radius": skins, "half": half, "size": np.linalg.norm(half, axis=1) + skins}
     joined = {
         name: np.concatenate([array, rounded.get(name, array[sources])]) for name, array in bodies._asdict().items()
     }
@@ -173,9 +187,67 @@ def deeper_at_corners(model: CollisionModel, kept: Array) -> Array:
     return np.where(boxed, (1.0 - 1.0 / np.sqrt(3.0)) * model.bodies.radius[model.pairs.first], 0.0)
 
 
-def deepest(model: CollisionModel, radius: Array) -> Array:
-    """How far the two bodies of each pair may get into each other until their cores meet (p,) [m].
+_HALVINGS = 40
 
-    ``radius`` (g,) are the least that the bodies ever have [m].
-    """
-    return radius[model.pairs.first] + radius[model.pairs.second]
+
+@kernel
+def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing: float) -> float:
+    """Smooth signed distance [m] of pair ``p``, cores apart; fills ``data.contact``. ``smoothing``: e [m^2]."""
+    bodies, posed, contact = model.bodies, data.posed, data.contact
+    first, second = model.pairs.first[p], model.pairs.second[p]
+    start, end = posed.start[first], posed.end[first]
+    if bodies.box[second] == 1:
+        core = _segment_box(start, end, posed, bodies.half[second], second, smoothing, contact)
+    else:
+        core = _segment_segment(start, end, posed.start[second], posed.end[second], smoothing, contact)
+    for k in range(3):
+        contact.normal[k] = (contact.second[k] - contact.first[k]) / core
+    return core - bodies.radius[first] - bodies.radius[second]
+
+
+@kernel
+def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: float, contact: Contact) -> float:
+    """D of two segments; the quadratic is strictly convex, so no case is degenerate."""
+    aa, bb, ab, ar, br = products(a0, a1, b0, b1)
+    aa, bb, ar, br = aa + smoothing, bb + smoothing, ar - 0.5 * smoothing, br + 0.5 * smoothing
+    s = clamp((ab * br - ar * bb) / (aa * bb - ab * ab), 0.0, 1.0)
+    t = (ab * s + br) / bb
+    if t < 0.0 or t > 1.0:
+        t = clamp(t, 0.0, 1.0)
+        s = clamp((ab * t - ar) / aa, 0.0, 1.0)
+    square = smoothing * ((s - 0.5) ** 2 + (t - 0.5) ** 2)
+    for k in range(3):
+        contact.first[k] = a0[k] + s * (a1[k] - a0[k])
+        contact.second[k] = b0[k] + t * (b1[k] - b0[k])
+        square += (contact.first[k] - contact.second[k]) ** 2
+    return np.sqrt(square)
+
+
+@kernel
+def _segment_box(
+    a0: Array, a1: Array, posed: BodyPlacements, half: Array, box: int, smoothing: float, contact: Contact
+) -> float:
+    """D of a segment and a box. The slope of D^2 rises strictly with s, so halving finds its zero."""
+    axes, centre, start, along = posed.rotation[box], posed.start[box], contact.local[0], contact.local[1]
+    _into_box_frame(a0, a1, centre, axes, contact.local)
+    along -= start
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        s = 0.5 * (low + high)
+        slope = smoothing * (s - 0.5)
+        for k in range(3):
+            point = start[k] + s * along[k]
+            slope += (point - clamp(point, -half[k], half[k])) * along[k]
+        if slope > 0.0:
+            high = s
+        else:
+            low = s
+    s = 0.5 * (low + high)
+    square = smoothing * (s - 0.5) ** 2
+    for k in range(3):
+        contact.first[k] = a0[k] + s * (a1[k] - a0[k])
+        point = start[k] + s * along[k]
+        contact.second[k] = clamp(point, -half[k], half[k])
+        square += (point - contact.second[k]) ** 2
+    _into_world(contact.second, centre, axes)
+    return np.sqrt(square)

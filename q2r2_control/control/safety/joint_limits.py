@@ -60,7 +60,7 @@ class VelocityBox(NamedTuple):
 
     @classmethod
     def empty(cls, nv: int) -> VelocityBox:
-        return cls(np.zeros(nv), np.zeros(nv), np.zeros(nv, dtype=np.int64), np.zeros(nv, dtype=np.int64))
+        return cls(*np.zeros((2, nv)), *np.zeros((2, nv), dtype=np.int64))
 
 
 @kernel
@@ -88,8 +88,7 @@ def next_velocity_box(limits: JointLimits, q: Array, v: Array, h: float, box: Ve
     inside = True
     for j in range(q.shape[0]):
         a = limits.acceleration[j]
-        slowest = v[j] - a * h
-        fastest = v[j] + a * h
+        slowest, fastest = v[j] - a * h, v[j] + a * h
         up = fastest_towards(limits.upper[j] - q[j], v[j], a, h, limits.longest_step, limits.return_speed)
         down = -fastest_towards(q[j] - limits.lower[j], -v[j], a, h, limits.longest_step, limits.return_speed)
         box.lower_limit[j] = POSITION if down > -limits.velocity[j] else VELOCITY

@@ -9,11 +9,10 @@ import numpy as np
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, Contact
 from q2r2_control.control.geometry.kinematics import IntArray, Placements
 from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox
-from q2r2_control.control.safety.velocity_bounds import BodyVelocities
+from q2r2_control.control.safety.speed_bound import BodyVelocities
 from q2r2_control.types import Array
 
-# A pair that is closer than its distance by less than this is not too close: a difference of distances has no more
-# digits. Its proof then is that it comes no closer than it is, see stop_certificate.py.
+# A pair that is closer than its distance by less than this is not too close, see stop_certificate.py.
 ROUNDING = 1e-9  # [m]
 
 
@@ -37,7 +36,7 @@ class SafetyModel(NamedTuple):
     arm: IntArray  # (nv,) number of the arm that a joint belongs to; joints of none share the last number
 
 
-_DEEPEST = 6  # halvings of the stop: 64 intervals
+_SAMPLES = 65  # of a stop, both ends among them
 INSTANTS = (0, 20, 64)  # of 64, where a row looks at the stop: the start, half of the way, and the end
 _ROWS_PER_PAIR = 5 * len(INSTANTS)  # the closest points and four segment ends, at each
 
@@ -59,12 +58,6 @@ class SeparationRows(NamedTuple):
     used: IntArray  # (1,) number of valid rows
     ahead: Array  # (instants,) scratch: how far a pair is apart at each [m]
 
-    @classmethod
-    def empty(cls, pairs: int, nv: int) -> SeparationRows:
-        m = _ROWS_PER_PAIR * pairs
-        counts = np.zeros(m, dtype=np.int64), np.zeros(1, dtype=np.int64)
-        return cls(np.zeros((m, nv)), np.zeros(m), *counts, ahead=np.zeros(len(INSTANTS)))
-
 
 class Candidate(NamedTuple):
     """The state after a step that is being looked at, and the stop from there."""
@@ -72,10 +65,6 @@ class Candidate(NamedTuple):
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
     deceleration: Array  # (nv,) of the stop [rad/s^2]
-
-    @classmethod
-    def empty(cls, nv: int) -> Candidate:
-        return cls(np.zeros(nv), np.zeros(nv), np.ones(nv))
 
 
 class QuadraticPiece(NamedTuple):
@@ -86,13 +75,9 @@ class QuadraticPiece(NamedTuple):
     loose: Array  # (nv,) [rad]
     travel: Array  # (nv,) total variation [rad]
 
-    @classmethod
-    def empty(cls, nv: int) -> QuadraticPiece:
-        return cls(np.zeros(nv), np.zeros(nv), np.zeros(nv), np.zeros(nv))
-
 
 class Rollout(NamedTuple):
-    """Scratch of the stop certificate: samples of a stop at up to 2^deepest + 1 instants."""
+    """Scratch of the stop certificate: samples of a stop."""
 
     q: Array  # (s, nv)
     v: Array  # (s, nv)
@@ -107,14 +92,12 @@ class Rollout(NamedTuple):
     step: QuadraticPiece  # from the reference to the candidate
     stop: QuadraticPiece  # all of the candidate's stop
     piece: QuadraticPiece  # a part of it
-    deviation: (
-        Array  # (nv,) of each joint from straight on at the reference's velocity at most, see speed_bound [rad or m]
-    )
+    deviation: Array  # (nv,) most of each joint from straight on, see speed_bound.py [rad or m]
 
     @classmethod
     def empty(cls, model: CollisionModel) -> Rollout:
         n, g = len(model.chain.parent), len(model.bodies.joint)
-        samples, nv = 2**_DEEPEST + 1, n - 1
+        samples, nv = _SAMPLES, n - 1
         return cls(
             q=np.zeros((samples, nv)),
             v=np.zeros((samples, nv)),
@@ -126,9 +109,9 @@ class Rollout(NamedTuple):
             known=np.zeros(samples),
             frame=Placements.empty(model.chain).rotation,
             contact=Contact.empty(),
-            step=QuadraticPiece.empty(nv),
-            stop=QuadraticPiece.empty(nv),
-            piece=QuadraticPiece.empty(nv),
+            step=QuadraticPiece(*np.zeros((4, nv))),
+            stop=QuadraticPiece(*np.zeros((4, nv))),
+            piece=QuadraticPiece(*np.zeros((4, nv))),
             deviation=np.zeros(nv),
         )
 
@@ -139,11 +122,6 @@ class ActiveBounds(NamedTuple):
     kind: IntArray  # (k,) POSITION, VELOCITY or ACCELERATION of a joint, or SEPARATION of a pair
     subject: IntArray  # (k,) index of the joint or the pair
     used: IntArray  # (1,)
-
-    @classmethod
-    def empty(cls, pairs: int, nv: int) -> ActiveBounds:
-        k = nv + _ROWS_PER_PAIR * pairs
-        return cls(np.zeros(k, dtype=np.int64), np.zeros(k, dtype=np.int64), np.zeros(1, dtype=np.int64))
 
 
 class SafetyData(NamedTuple):
@@ -167,20 +145,27 @@ class SafetyData(NamedTuple):
     @classmethod
     def empty(cls, model: SafetyModel) -> SafetyData:
         pairs, nv = len(model.collision.pairs.first), len(model.limits.lower)
+        rows = _ROWS_PER_PAIR * pairs
         return cls(
-            state=ReferenceState(np.zeros(nv), np.zeros(nv), np.zeros(nv)),
+            state=ReferenceState(*np.zeros((3, nv))),
             collision=CollisionData.empty(model.collision),
             velocities=BodyVelocities.empty(model.collision),
             distance=np.zeros(pairs),
             near=np.zeros(pairs, dtype=np.int64),
-            rows=SeparationRows.empty(pairs, nv),
+            rows=SeparationRows(
+                matrix=np.zeros((rows, nv)),
+                lower=np.zeros(rows),
+                pair=np.zeros(rows, dtype=np.int64),
+                used=np.zeros(1, dtype=np.int64),
+                ahead=np.zeros(len(INSTANTS)),
+            ),
             box=VelocityBox.empty(nv),
             wanted=np.zeros(nv),
             braked=np.zeros(nv),
             certified=np.ones(nv),
-            candidate=Candidate.empty(nv),
+            candidate=Candidate(*np.zeros((2, nv)), *np.ones((1, nv))),
             rollout=Rollout.empty(model.collision),
-            active=ActiveBounds.empty(pairs, nv),
+            active=ActiveBounds(*np.zeros((2, nv + rows), dtype=np.int64), *np.zeros((1, 1), dtype=np.int64)),
             unproven=np.zeros(1, dtype=np.int64),
         )
 
@@ -191,7 +176,6 @@ def provable_distances(model: SafetyModel, data: SafetyData) -> Array:
     Needs the distances at the reference as it is. A pair may be asked to keep as much from now on: then the stop at
     hand is proven with that, as if it had always been so.
     """
-    pairs, state = model.collision.pairs, data.state
-    travel = 0.5 * state.v**2 / data.certified
+    pairs, travel = model.collision.pairs, 0.5 * data.state.v**2 / data.certified
     way = (pairs.reach * travel[pairs.joint - 1]).sum(axis=1)  # reach is 0 where there is no joint
     return np.asarray(data.distance - way)

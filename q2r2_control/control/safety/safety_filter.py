@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.control.geometry.closest_points import clamp
+from q2r2_control.control.geometry.closest_points import clamp, dot
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.safety.joint_limits import ACCELERATION, NO_LIMIT
 from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
+from q2r2_control.control.safety.speed_bound import fastest_approach, fastest_body
 from q2r2_control.control.safety.stop_certificate import certify, is_too_close
-from q2r2_control.control.safety.stop_rollout import SHAPES, brake, write_stop
-from q2r2_control.control.safety.velocity_bounds import fastest_approach, fastest_body
+from q2r2_control.control.safety.stop_rollout import SHAPES, TOGETHER, brake, stay_with_stop, write_stop
 from q2r2_control.types import Array
 
 FOLLOWED, REDUCED, STOPPED = 0, 1, 2
@@ -63,50 +63,36 @@ def apply_safety_filter(
 def certify_start(model: SafetyModel, data: SafetyData) -> bool:
     """Whether a full stop from the reference as it is keeps all apart; it becomes the stop that is at hand.
 
-    Where none does, joints that stop on their own are what is at hand.
+    Where none does, joints that stop together are what is at hand.
     """
-    for j in range(data.state.q.shape[0]):
-        data.candidate.q[j] = data.state.q[j]
-        data.candidate.v[j] = data.state.v[j]
-    for attempt in range(SHAPES + 1):
-        shape = attempt % SHAPES
-        write_stop(model, data.state.q, data.state.v, shape, data.candidate.deceleration)
-        if attempt < SHAPES and certify(model, data, 0.0):
-            break
+    stay_with_stop(data)
+    proven = _some_stop_certified(model, data, 0.0, SHAPES)
+    if not proven:
+        write_stop(model, data.state.q, data.state.v, TOGETHER, data.candidate.deceleration)
     _keep_stop(data)
-    return attempt < SHAPES
+    return proven
 
 
 @kernel
 def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int:
-    """Whether bodies may be as they are now, some of them having ``grown`` (g,) since the reference was certified.
+    """The pair in the way of bodies that have ``grown`` (g,) since the reference was certified and measured; -1: none.
 
-    They may where each of their pairs keeps its distance at the reference, and the stop that is at hand, or else one of
-    some other shape, which becomes the one at hand, keeps all apart. Then the invariant holds with the grown bodies as
-    if they had always been so. Returns the pair that is in the way, or -1.
-
-    Needs the distances measured with the bodies as they are now. A pair that is too close already must not be made
-    closer by growing, so that what is in recovery stays as it is.
+    They may be as they are where each of their pairs keeps its distance at the reference, and the stop that is at hand,
+    or else one of some other shape, which becomes the one at hand, keeps all apart. Then the invariant holds with the
+    grown bodies as if they had always been so. A pair that is too close already must not be made closer by growing.
     """
-    pairs = model.collision.pairs
-    any_grown = False
+    pairs, any_grown = model.collision.pairs, False
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
             if data.distance[p] < model.min_distance[p]:  # no rounding: it could have grown less
                 return p
-    if not any_grown:
+    stay_with_stop(data)
+    if not any_grown or certify(model, data, 0.0):
         return -1
-    for j in range(data.state.q.shape[0]):
-        data.candidate.q[j] = data.state.q[j]
-        data.candidate.v[j] = data.state.v[j]
-        data.candidate.deceleration[j] = data.certified[j]
-    for attempt in range(SHAPES + 1):
-        if attempt > 0:
-            write_stop(model, data.state.q, data.state.v, attempt - 1, data.candidate.deceleration)
-        if certify(model, data, 0.0):
-            _keep_stop(data)
-            return -1
+    if _some_stop_certified(model, data, 0.0, SHAPES):
+        _keep_stop(data)
+        return -1
     return data.unproven[0]
 
 
@@ -130,8 +116,7 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
     if _certify_mixture(model, data, 1.0, h, too_close):
         _keep_stop(data)
         return FOLLOWED
-    low = 0.0
-    high = 1.0
+    low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):
         share = 0.5 * (low + high)
         if _certify_mixture(model, data, share, h, too_close):
@@ -147,14 +132,19 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
 
 @kernel
 def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: float, together: bool) -> bool:
-    """Whether some shape of stop proves a mixture, which becomes the candidate.
+    """Whether some shape of stop proves a mixture, which becomes the candidate; the first that does is kept.
 
-    The first that does is kept: rows of the QP that are made for joints that stop together move the arms most calmly
-    near each other, since they correct along the normal and not by the fastest joints. Out of a position that is too
-    close the joints stop ``together`` or not at all: then a pair that was opening goes on opening.
+    Out of a position that is too close the joints stop ``together`` or not at all: then a pair that was opening goes on
+    opening.
     """
     _mix(data, share, h)
-    for shape in range(1 if together else SHAPES):
+    return _some_stop_certified(model, data, h, 1 if together else SHAPES)
+
+
+@kernel
+def _some_stop_certified(model: SafetyModel, data: SafetyData, h: float, shapes: int) -> bool:
+    """Whether one of the first ``shapes`` of stops proves the candidate; it is the candidate's then."""
+    for shape in range(shapes):
         write_stop(model, data.candidate.q, data.candidate.v, shape, data.candidate.deceleration)
         if certify(model, data, h):
             return True
@@ -183,18 +173,14 @@ def _note_active(data: SafetyData) -> float:
         elif v[j] <= box.lower[j] + _ACTIVE:
             kind = box.lower_limit[j]
         if kind != NO_LIMIT:
-            active.kind[count] = kind
-            active.subject[count] = j
+            active.kind[count], active.subject[count] = kind, j
             count += 1
     slack = 0.0
     for i in range(rows.used[0]):
-        rate = 0.0
-        for j in range(v.shape[0]):
-            rate += rows.matrix[i, j] * v[j]
+        rate = dot(rows.matrix[i], v)
         slack = max(slack, rows.lower[i] - rate)
         if rate <= rows.lower[i] + _ACTIVE:
-            active.kind[count] = SEPARATION
-            active.subject[count] = rows.pair[i]
+            active.kind[count], active.subject[count] = SEPARATION, rows.pair[i]
             count += 1
     active.used[0] = count
     return slack
@@ -205,10 +191,9 @@ def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
     """List the pairs that were too close when nothing could be certified: they hold the arms."""
     active = data.active
     for p in range(data.distance.shape[0]):
-        if is_too_close(model, data, p) and active.used[0] < active.kind.shape[0]:
-            active.kind[active.used[0]] = SEPARATION
-            active.subject[active.used[0]] = p
-            active.used[0] += 1
+        count = active.used[0]
+        if is_too_close(model, data, p) and count < active.kind.shape[0]:
+            active.kind[count], active.subject[count], active.used[0] = SEPARATION, p, count + 1
 
 
 @kernel
@@ -220,10 +205,7 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     """
     collision, approach, distance, v = model.collision, model.approach, data.distance, data.state.v
     pairs = collision.pairs
-    closest = 0
-    least = np.inf
-    surge = 0.0
-    duration = 0.0
+    closest, least, surge, duration = 0, np.inf, 0.0, 0.0
     for j in range(v.shape[0]):
         surge = max(surge, model.limits.acceleration[j] * model.limits.longest_step)
         duration = max(duration, abs(v[j]) / data.certified[j])
@@ -246,7 +228,6 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
             continue
         distance[p] = measure(collision, data.collision, p)
         if distance[p] < least:
-            least = distance[p]
-            closest = p
+            closest, least = p, distance[p]
         data.near[p] = 1 if distance[p] <= relevant else 0
     return closest

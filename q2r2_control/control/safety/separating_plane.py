@@ -1,8 +1,7 @@
 """Proof that two geometries stay apart while the joints move, where their distance alone leaves no room, compiled.
 
 The bound by reach (stop_certificate.py) counts every way a joint travels as if it led straight to the other body. A
-pair that rests at min_distance to the micrometre could then never be shown to part again, nor could arms be that carry
-a box between them at full speed and close in by nothing. Here the direction counts.
+pair that rests at min_distance to the micrometre could then never be shown to part again. Here the direction counts.
 
 **Claim.** Let n be the unit normal of two convex cores that do not meet, e_1 and e_2 their corners (the ends of a
 segment, the corners of a box), J_e the Jacobian of a corner at the start, r the joints' reach. If the joints move by
@@ -53,17 +52,6 @@ class Gap(NamedTuple):
 
 @kernel
 def stays_beyond(
-    model: CollisionModel, data: CollisionData, p: int, piece: QuadraticPiece, length: float, threshold: float
-) -> bool:
-    """Whether the plane between pair ``p`` proves it beyond ``threshold`` [m] in a ``piece`` of ``length`` [s].
-
-    The pair has been measured in ``data``, where the piece begins, just before.
-    """
-    return stay_beyond(model, data, p, piece, length, piece, 0.0, threshold)
-
-
-@kernel
-def stay_beyond(
     model: CollisionModel,
     data: CollisionData,
     p: int,
@@ -73,20 +61,23 @@ def stay_beyond(
     then_length: float,
     threshold: float,
 ) -> bool:
-    """As :func:`stays_beyond`, for a ``piece`` and another one after it."""
+    """Whether the plane between pair ``p`` proves it beyond ``threshold`` [m] in a ``piece`` and in ``then``, after it.
+
+    Their lengths are in s; that of ``then`` may be 0. The pair has been measured in ``data``, where the piece begins.
+    """
     pairs, bodies, posed = model.pairs, model.bodies, data.posed
     first, second = pairs.first[p], pairs.second[p]
     needed = threshold + bodies.radius[first] + bodies.radius[second]
     needed += curvature(pairs, p, piece.travel, then.travel, 1.0 if then_length > 0.0 else 0.0)
-    start, end = _gaps(model, data, p, -1.0, posed.start[first], posed.end[first], piece, then)
-    if bodies.box[second] == 0:
-        other_start, other_end = _gaps(model, data, p, 1.0, posed.start[second], posed.end[second], piece, then)
-        return _all_open(start, end, other_start, other_end, needed, length, then_length)
-    for edge in range(4):
-        _write_edge(bodies, posed, second, edge, data.contact.local)
-        corner, next_corner = data.contact.local[0], data.contact.local[1]
-        other_start, other_end = _gaps(model, data, p, 1.0, corner, next_corner, piece, then)
-        if not _all_open(start, end, other_start, other_end, needed, length, then_length):
+    start = _gap(model, data, p, -1.0, posed.start[first], piece, then)
+    end = _gap(model, data, p, -1.0, posed.end[first], piece, then)
+    corner = data.contact.local[0]
+    for number in range(8 if bodies.box[second] == 1 else 2):
+        _write_corner(bodies, posed, second, number, corner)
+        other = _gap(model, data, p, 1.0, corner, piece, then)
+        if not _opens(start, other, needed, length, then_length):
+            return False
+        if not _opens(end, other, needed, length, then_length):
             return False
     return True
 
@@ -97,54 +88,47 @@ def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) ->
 
     The joints of a pair are listed from the base outwards.
     """
-    total = 0.0
-    before_first = 0.0
-    before_second = 0.0
+    total, before_first, before_second = 0.0, 0.0, 0.0
     for k in range(pairs.joint.shape[1]):
         joint = pairs.joint[p, k]
         if joint == 0:
             break
         w = travel[joint - 1] + share * then[joint - 1]
-        before = before_first if pairs.sign[p, k] < 0.0 else before_second
-        total += pairs.reach[p, k] * w * (0.5 * w + before)
         if pairs.sign[p, k] < 0.0:
+            total += pairs.reach[p, k] * w * (0.5 * w + before_first)
             before_first += w
         else:
+            total += pairs.reach[p, k] * w * (0.5 * w + before_second)
             before_second += w
     return total
 
 
-@kernel
-def _write_edge(bodies: CollisionBodies, posed: BodyPlacements, box: int, number: int, out: Array) -> None:
-    """Ends of one of a box's four edges along its third axis, into the first two rows of ``out``."""
+@inlined_kernel
+def _write_corner(bodies: CollisionBodies, posed: BodyPlacements, body: int, number: int, out: Array) -> None:
+    """One of a segment's two ends or a box's eight corners into ``out`` (3,)."""
     for k in range(3):
-        middle = posed.start[box, k]
-        for axis in range(2):
-            sign = 1.0 if (number >> axis) & 1 else -1.0
-            middle += sign * bodies.half[box, axis] * posed.rotation[box, k, axis]
-        half = bodies.half[box, 2] * posed.rotation[box, k, 2]
-        out[0, k] = middle - half
-        out[1, k] = middle + half
+        out[k] = posed.end[body, k] if number == 0 else posed.start[body, k]
+        if bodies.box[body] == 1:
+            for axis in range(3):
+                sign = 1.0 if (number >> axis) & 1 else -1.0
+                out[k] += sign * bodies.half[body, axis] * posed.rotation[body, k, axis]
 
 
-@kernel
-def _gaps(
+@inlined_kernel
+def _gap(
     model: CollisionModel,
     data: CollisionData,
     p: int,
     side: float,
-    start: Array,
-    end: Array,
+    corner: Array,
     piece: QuadraticPiece,
     then: QuadraticPiece,
-) -> tuple[Gap, Gap]:
-    """What two corners of one side of a pair, -1 the first's or 1 the second's, add to the gap."""
+) -> Gap:
+    """What a ``corner`` (3,) of one side of a pair, -1 the first's or 1 the second's, adds to the gap."""
     chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal
     nx, ny, nz = side * normal[0], side * normal[1], side * normal[2]
-    gap = nx * start[0] + ny * start[1] + nz * start[2]
-    end_gap = nx * end[0] + ny * end[1] + nz * end[2]
+    x, y, z = corner[0], corner[1], corner[2]
     rate, change, loose, then_rate, then_change, then_loose = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    end_rate, end_change, end_loose, end_then_rate, end_then_change, end_then_loose = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(pairs.joint.shape[1]):
         joint = pairs.joint[p, k]
         if joint == 0:
@@ -155,42 +139,18 @@ def _gaps(
         ax, ay, az = placements.axis[joint, 0], placements.axis[joint, 1], placements.axis[joint, 2]
         if chain.prismatic[joint] == 1:
             along = nx * ax + ny * ay + nz * az
-            end_along = along
         else:
-            # n'(axis x r) = (n x axis)'r, for the levers r of both corners.
+            # n'(axis x r) = (n x axis)'r, for the lever r of the corner.
             mx, my, mz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
             origin = placements.translation[joint]
-            along = mx * (start[0] - origin[0]) + my * (start[1] - origin[1]) + mz * (start[2] - origin[2])
-            end_along = mx * (end[0] - origin[0]) + my * (end[1] - origin[1]) + mz * (end[2] - origin[2])
+            along = mx * (x - origin[0]) + my * (y - origin[1]) + mz * (z - origin[2])
         rate += along * piece.rate[j]
         change += along * piece.change[j]
         loose += min(0.0, along * piece.loose[j])
         then_rate += along * then.rate[j]
         then_change += along * then.change[j]
         then_loose += min(0.0, along * then.loose[j])
-        end_rate += end_along * piece.rate[j]
-        end_change += end_along * piece.change[j]
-        end_loose += min(0.0, end_along * piece.loose[j])
-        end_then_rate += end_along * then.rate[j]
-        end_then_change += end_along * then.change[j]
-        end_then_loose += min(0.0, end_along * then.loose[j])
-    return (
-        Gap(gap, rate, change, loose, then_rate, then_change, then_loose),
-        Gap(end_gap, end_rate, end_change, end_loose, end_then_rate, end_then_change, end_then_loose),
-    )
-
-
-@kernel
-def _all_open(
-    start: Gap, end: Gap, other_start: Gap, other_end: Gap, needed: float, length: float, then_length: float
-) -> bool:
-    """Whether all four gaps between corners of one body and of the other stay beyond what is ``needed`` [m]."""
-    return (
-        _opens(start, other_start, needed, length, then_length)
-        and _opens(start, other_end, needed, length, then_length)
-        and _opens(end, other_start, needed, length, then_length)
-        and _opens(end, other_end, needed, length, then_length)
-    )
+    return Gap(nx * x + ny * y + nz * z, rate, change, loose, then_rate, then_change, then_loose)
 
 
 @inlined_kernel

@@ -4,33 +4,24 @@ The rows tell the QP what the stop can do. Let B be the least free distance of a
 
     B = min over the stop of  d - min_distance - buffer.
 
-It may be used up no faster than at a rate:
-
-    B(q+, v+) >= (1 - gain h) B(q, v)
-
-(a control barrier function made of a backup manoeuvre: Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its
-distance uses up nothing and is not slowed, however fast it is; motion that closes in is slowed in time for the stop,
-with the curvature of the way, by all pairs alike. B is linearised at the instants of the stop where it is least, or may
-soon be: with a row for the nearest alone, each of two that are about as near would be forgotten at every other tick.
-What an instant has free beyond B may be used up at 50 /s, so that its row comes in gradually. At
-t of a stop that takes T joints that stop together have travelled v s, s = t - t^2 / 2T. With the same T after the step,
+It may be used up no faster than at a rate, B(q+, v+) >= (1 - gain h) B(q, v): a control barrier function made of a
+backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its distance uses up nothing and is not
+slowed; motion that closes in is slowed in time for the stop. B is linearised at the instants of the stop where it is
+least, or may soon be, so that no row comes and goes from tick to tick. The rest beyond B may be used up at 50 /s. At t
+of a stop that takes T joints that stop together have travelled v s, s = t - t^2 / 2T. With the same T after the step,
 
     D q = h (v + v+) / 2 + s (v+ - v),    n'(J_2 - J_1) D q >= -gain h B.
 
 For a pair at rest this is the usual row, n'(J_2 - J_1) v+ >= -gain B. The change of speed counts alike for all joints,
-also in stops in which they rest one after the other, and that T shrinks as the slowest joint brakes is left out: so the
-row is always along the pair's own normal. With a lever of its own for each joint the correction of a strong pull leaves
-the normal, by another angle in each shape of stop, and joints alternate from tick to tick as the shape does.
+in every shape of stop, so that the row is along the pair's own normal. With a lever for each joint its direction would
+change from tick to tick as the shape does.
 
 Closer than the buffer the row asks for opening, as fast as a part of the acceleration limits gives. Pairs that may
 touch have a distance below zero, and a zone before and in contact where B is used up no faster than a speed of their
 own. The rows give comfort only: they are soft, so that the QP always has a solution; safety is the certificate's.
 
-**The gain may change between any two ticks.** It stands in the bound above, and in how near a pair has to be for a row
-and for an exact distance. The certificate reads no row and no gain; it reads distances, and where one is a lower bound
-that proves less, never more. So what is taken of a solution is proven whatever the gain was, is or will be. A gain that
-falls makes pairs that close in brake, no harder than the joints' limits allow. The speed of pairs that touch is their
-own, with any gain: B counts the stop, so that they are slowed to it in time.
+**The gain may change between any two ticks.** The certificate reads no row and no gain; it reads distances, and where
+one is a lower bound that proves less, never more. So what is taken of a solution is proven whatever the gain is.
 """
 
 from __future__ import annotations
@@ -39,14 +30,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.control.geometry.closest_points import segment_segment
+from q2r2_control.control.geometry.closest_points import dot, segment_segment, size_of, way_between
 from q2r2_control.control.geometry.collision import CollisionData
 from q2r2_control.control.geometry.pair_distance import distance_row, measure, measure_part
 from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.safety.safety_data import INSTANTS, SafetyData, SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
-from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of
-from q2r2_control.control.safety.velocity_bounds import BodyVelocities
+from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, stay_with_stop
 from q2r2_control.types import Array
 
 
@@ -77,11 +67,7 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
 
     Uses the candidate and its rollout for the certified stop from here.
     """
-    candidate = data.candidate
-    for j in range(data.state.v.shape[0]):
-        candidate.q[j] = data.state.q[j]
-        candidate.v[j] = data.state.v[j]
-        candidate.deceleration[j] = data.certified[j]
+    stay_with_stop(data)
     duration = begin_rollout(data)
     stop = data.rollout.stop.travel
     count = 0
@@ -91,7 +77,9 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
         straight = curvature(model.collision.pairs, p, stop, stop, 0.0) < _STRAIGHT
         least = _distances_ahead(model, data, p, duration, straight)
         for i in range(len(INSTANTS)):
-            lever = _lever(i, duration, h)
+            t = duration * INSTANTS[i] / INSTANTS[-1]
+            s = t - 0.5 * t * t / duration if duration > 0.0 else 0.0
+            lever = max(s, 0.5 * h) + 0.5 * h  # at rest a faster step lengthens the stop by as much as the step itself
             if data.rows.ahead[i] > least + _SAME_DISTANCE or (i > 0 and lever <= h):
                 continue
             along = straight and i > 0
@@ -105,7 +93,6 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
             if count > before:
                 count = _append_end_rows(model, data, at, p, distance, moment, count)
     data.rows.used[0] = count
-    _normalise_rows(data)
 
 
 @inlined_kernel
@@ -134,50 +121,20 @@ def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: flo
 @inlined_kernel
 def _tangent(data: SafetyData, row: Array) -> float:
     """By how much the certified stop opens a pair with the given ``row`` along the tangent [m]."""
-    v = data.state.v
-    change = 0.0
+    v, change = data.state.v, 0.0
     for j in range(row.shape[0]):
         change += row[j] * 0.5 * v[j] * abs(v[j]) / data.certified[j]
     return change
 
 
-@kernel
-def _lever(number: int, duration: float, h: float) -> float:
-    """By s + h / 2 the next speeds lengthen the way until an instant, of the step and of the stop [s]."""
-    t = duration * INSTANTS[number] / INSTANTS[-1]
-    s = t - 0.5 * t * t / duration if duration > 0.0 else 0.0
-    # At rest a faster step lengthens the stop by as much as the step itself.
-    return max(s, 0.5 * h) + 0.5 * h
-
-
-@kernel
-def _normalise_rows(data: SafetyData) -> None:
-    """Give every row unit norm, so that what it lacks is a joint speed."""
-    rows = data.rows
-    for i in range(rows.used[0]):
-        square = 0.0
-        for j in range(rows.matrix.shape[1]):
-            square += rows.matrix[i, j] ** 2
-        size = np.sqrt(square)
-        for j in range(rows.matrix.shape[1]):
-            rows.matrix[i, j] /= size
-        rows.lower[i] /= size
-
-
 @inlined_kernel
 def _append_row(
-    model: SafetyModel,
-    data: SafetyData,
-    at: CollisionData,
-    p: int,
-    distance: float,
-    moment: StopTime,
-    count: int,
+    model: SafetyModel, data: SafetyData, at: CollisionData, p: int, distance: float, moment: StopTime, count: int
 ) -> int:
     """Keep the row if some velocity that the acceleration allows (v +- a h) breaks it; any other cannot bind.
 
     Pair ``p`` has been measured in ``at``, the posture at the ``moment``, or at the start of a straight stop whose end
-    the row looks at along the tangent.
+    the row looks at along the tangent. It gets unit norm, so that what it lacks is a joint speed.
     """
     h = moment.h
     a, v, row, lever = model.limits.acceleration, data.state.v, data.rows.matrix[count], moment.lever
@@ -185,10 +142,9 @@ def _append_row(
     free = distance - model.approach.stop_distance[p]
     if moment.along:
         free += _tangent(data, row)
-    rate = 0.0  # of the distance [m/s]: with v kept up, B changes by as much in a second
+    rate = dot(row, v)  # of the distance [m/s]: with v kept up, B changes by as much in a second
     change = 0.0  # how much the acceleration can do about that in this step [m]
     for j in range(row.shape[0]):
-        rate += row[j] * v[j]
         change += abs(row[j]) * a[j]
     change *= h * lever
     gain = model.approach.gain[0]
@@ -196,44 +152,37 @@ def _append_row(
     allowed = -gain * h * min(free, moment.least) - min(_CATCH_UP * h, 1.0) * beyond_least
     slow = model.approach.contact_speed[p]
     if slow < np.inf:
-        beyond = free - model.approach.contact_zone[p]
-        allowed = max(allowed, -h * max(slow, gain * beyond))
+        allowed = max(allowed, -h * max(slow, gain * (free - model.approach.contact_zone[p])))
     if free < 0.0:
         # Asked for more than the joints can do in this step, rows of several pairs would be weighed against each other,
         # and the deeper pair would be opened at the cost of closing another one.
-        allowed = min(allowed, model.approach.recovery_speed * h)
-        allowed = min(allowed, max(h * rate, 0.0) + _SHARE * change)
+        allowed = min(allowed, model.approach.recovery_speed * h, max(h * rate, 0.0) + _SHARE * change)
     if h * rate - change >= allowed or change <= 0.0:
         return count
-    data.rows.lower[count] = rate + (allowed - h * rate) / lever
+    size = size_of(row)
+    row /= size
+    data.rows.lower[count] = (rate + (allowed - h * rate) / lever) / size
     data.rows.pair[count] = p
     return count + 1
 
 
 @inlined_kernel
 def _append_end_rows(
-    model: SafetyModel,
-    data: SafetyData,
-    at: CollisionData,
-    p: int,
-    distance: float,
-    moment: StopTime,
-    count: int,
+    model: SafetyModel, data: SafetyData, at: CollisionData, p: int, distance: float, moment: StopTime, count: int
 ) -> int:
-    """Rows at those ends of both bodies of a pair that may soon be as close as its ``distance``.
+    """Rows at those ends of both bodies of a pair that may soon be as close as its ``distance``, measured in ``at``.
 
     The closest points of near-parallel bodies jump from end to end; rows at the ends leave nothing to jump. An end that
     is farther by more than the bodies turn it towards each other while the row looks ahead does not take part.
-    Pair ``p`` has been measured in ``at``.
     """
-    bodies, posed, contact = model.collision.bodies, at.posed, at.contact
+    bodies, posed, contact, angular = model.collision.bodies, at.posed, at.contact, data.velocities.angular
     first, second = model.collision.pairs.first[p], model.collision.pairs.second[p]
     start, end, closest = posed.start[first], posed.end[first], contact.kept
-    _copy(contact.first, closest[0])
-    _copy(contact.second, closest[1])
-    turned = _turning(data.velocities, bodies.joint[first], bodies.joint[second]) * moment.ahead
+    for k in range(3):
+        closest[0, k], closest[1, k] = contact.first[k], contact.second[k]
+    turned = way_between(angular[bodies.joint[first]], angular[bodies.joint[second]]) * moment.ahead
     for point in (start, end):
-        apart = _way_between(point, closest[0])
+        apart = way_between(point, closest[0])
         if apart < _SAME_POINT:
             continue
         reached = measure_part(model.collision, at, p, point, point)
@@ -242,7 +191,7 @@ def _append_end_rows(
     if bodies.box[second] == 1:
         return count
     for point in (posed.start[second], posed.end[second]):
-        apart = _way_between(point, closest[1])
+        apart = way_between(point, closest[1])
         if apart < _SAME_POINT:
             continue
         cores = segment_segment(start, end, point, point, contact.first, contact.second)
@@ -252,26 +201,3 @@ def _append_end_rows(
                 contact.normal[k] = (contact.second[k] - contact.first[k]) / cores
             count = _append_row(model, data, at, p, reached, moment, count)
     return count
-
-
-@kernel
-def _turning(velocities: BodyVelocities, joint: int, other: int) -> float:
-    """How fast the link of one joint turns relative to that of another [rad/s]."""
-    square = 0.0
-    for k in range(3):
-        square += (velocities.angular[joint, k] - velocities.angular[other, k]) ** 2
-    return np.sqrt(square)
-
-
-@kernel
-def _way_between(point: Array, other: Array) -> float:
-    square = 0.0
-    for k in range(3):
-        square += (point[k] - other[k]) ** 2
-    return np.sqrt(square)
-
-
-@kernel
-def _copy(point: Array, to: Array) -> None:
-    for k in range(3):
-        to[k] = point[k]

@@ -1,8 +1,12 @@
-"""Bound on how much closer two geometries come in a step and the stop after it, from how fast they are, compiled.
+"""How fast geometries move, and how much closer two of them come in a step and the stop after it at most, compiled.
 
 The bound by reach (stop_certificate.py) takes every joint's way for one that leads straight to the other body. Most
 pairs of two moving arms need no more than to know how fast their bodies are: joints that stop together go on as they
-began, and arms that move alike do not close in at all (velocity_bounds.py).
+began, and arms that move alike do not close in at all.
+
+**Speed.** A geometry lies in the ball of radius s around its middle. With the middle moving at u and the link turning
+at w, no point of it is faster than |u| + |w| s, so the distance of two geometries falls no faster than
+|u_2 - u_1| + |w_1| s_1 + |w_2| s_2.
 
 **Claim.** Let d be the distance of two bodies at the reference that share no joint, and V the most that they can close
 in by per second there, |u_2 - u_1| + |w_1| s_1 + |w_2| s_2, where the joints have the velocities v. Let a step of h
@@ -31,10 +35,80 @@ than how fast the bodies close in. So pairs that share a joint are left to the o
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from q2r2_control.control.geometry.closest_points import size_of, way_between
+from q2r2_control.control.geometry.collision import CollisionData, CollisionModel
 from q2r2_control.control.jit import inlined_kernel, kernel
-from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
-from q2r2_control.control.safety.velocity_bounds import fastest_approach
 from q2r2_control.types import Array
+
+if TYPE_CHECKING:
+    from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
+
+
+class BodyVelocities(NamedTuple):
+    """Velocities in world axes, written by :func:`update_body_velocities`."""
+
+    linear: Array  # (n, 3) of joint frames' origins [m/s]
+    angular: Array  # (n, 3) [rad/s]
+    middle: Array  # (g, 3) of geometries' middles [m/s]
+    swing: Array  # (g,) fastest of a geometry's points about its middle [m/s]
+
+    @classmethod
+    def empty(cls, model: CollisionModel) -> BodyVelocities:
+        n, g = len(model.chain.parent), len(model.bodies.joint)
+        return cls(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((g, 3)), np.zeros(g))
+
+
+@kernel
+def update_body_velocities(model: CollisionModel, data: CollisionData, v: Array, velocities: BodyVelocities) -> None:
+    """Velocities of all joint frames and geometries where they are placed, at joint velocities ``v`` (nv,)."""
+    chain, bodies, placements, posed = model.chain, model.bodies, data.placements, data.posed
+    linear, angular = velocities.linear, velocities.angular
+    for i in range(1, chain.parent.shape[0]):
+        parent, origin = chain.parent[i], placements.translation
+        _velocity_at(linear[parent], angular[parent], origin[parent], origin[i], linear[i])
+        rate = v[i - 1]
+        slides = chain.prismatic[i] == 1
+        for k in range(3):
+            along = rate * placements.axis[i, k]
+            angular[i, k] = angular[parent, k] + (0.0 if slides else along)
+            if slides:
+                linear[i, k] += along
+    for g in range(bodies.joint.shape[0]):
+        joint = bodies.joint[g]
+        middle = velocities.middle[g]
+        for k in range(3):
+            middle[k] = 0.5 * (posed.start[g, k] + posed.end[g, k])
+        _velocity_at(linear[joint], angular[joint], placements.translation[joint], middle, middle)
+        velocities.swing[g] = size_of(angular[joint]) * bodies.size[g]
+
+
+@kernel
+def _velocity_at(linear: Array, angular: Array, origin: Array, point: Array, out: Array) -> None:
+    """Velocity of ``point`` on a link whose frame at ``origin`` moves; ``out`` may be ``point`` itself."""
+    x, y, z = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
+    out[0] = linear[0] + angular[1] * z - angular[2] * y
+    out[1] = linear[1] + angular[2] * x - angular[0] * z
+    out[2] = linear[2] + angular[0] * y - angular[1] * x
+
+
+@kernel
+def fastest_body(velocities: BodyVelocities) -> float:
+    """Bound on the speed of any point of any geometry [m/s]."""
+    fastest = 0.0
+    for g in range(velocities.swing.shape[0]):
+        fastest = max(fastest, size_of(velocities.middle[g]) + velocities.swing[g])
+    return fastest
+
+
+@kernel
+def fastest_approach(velocities: BodyVelocities, first: int, second: int) -> float:
+    """Bound on how fast two geometries close in [m/s]."""
+    between = way_between(velocities.middle[first], velocities.middle[second])
+    return between + velocities.swing[first] + velocities.swing[second]
 
 
 @kernel
@@ -61,8 +135,8 @@ def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: f
 def least_distance(model: SafetyModel, data: SafetyData, p: int, time: float) -> float:
     """Least distance [m] of pair ``p``, which shares no joint, in the step and the stop; ``time`` is h + T / 2 [s].
 
-    Needs :func:`write_deviations`. ``data.velocities`` are those at the reference, of the bodies as they are now, and
-    ``data.distance`` is measured there, or a lower bound.
+    Needs :func:`write_deviations`, the velocities of the bodies as they are now and distances at the reference, or
+    lower bounds.
     """
     pairs = model.collision.pairs
     approach = fastest_approach(data.velocities, pairs.first[p], pairs.second[p])

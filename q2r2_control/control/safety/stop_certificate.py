@@ -11,9 +11,9 @@ their bodies are at the reference (speed_bound.py), enough for most. Where it is
 proves a piece of the motion, with the direction of it (separating_plane.py): the stop is walked through in pieces as
 long as can be proven, each from a sample of its own.
 
-**Rounding.** A motion that is proven to end exactly at a pair's distance may end 1e-16 m below it. That is no
-penetration. Within ROUNDING below its distance a pair keeps its full proof, with the distance that it has now as the
-one to keep. So rounding never leads into recovery, where a pair is only sampled.
+**Rounding.** A motion that is proven to end exactly at a pair's distance may end 1e-16 m below it. Within ROUNDING
+below its distance a pair keeps its full proof, with the distance that it has now as the one to keep. So rounding never
+leads into recovery, where a pair is only sampled.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from q2r2_control.control.geometry.pair_distance import distance_row, measure
 from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.safety.safety_data import ROUNDING, SafetyData, SafetyModel
-from q2r2_control.control.safety.separating_plane import stay_beyond, stays_beyond
+from q2r2_control.control.safety.separating_plane import stays_beyond
 from q2r2_control.control.safety.speed_bound import least_distance, way, write_deviations
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece
 
@@ -49,16 +49,16 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
     ``data.distance`` holds distances at the reference, or lower bounds of them; a bound that does not suffice is
     replaced by the distance. ``data.velocities`` are those at the reference, of the bodies as they are now. A pair that
-    is too close already must not come closer at the step's end and during the stop. Where a pair fails,
-    ``data.unproven`` says which.
+    is too close already must not come closer at the step's end and during the stop. ``data.unproven``: what failed.
     """
-    distance = data.distance
     duration = begin_rollout(data)
     write_step(data, h)
-    farthest = _farthest_travel(data)
     time = write_deviations(model, data, h, duration)
-    for p in range(distance.shape[0]):
-        if distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
+    farthest = 0.0  # that any joint travels in the step and the stop [rad or m]
+    for j in range(data.rollout.step.travel.shape[0]):
+        farthest = max(farthest, data.rollout.step.travel[j] + data.rollout.stop.travel[j])
+    for p in range(data.distance.shape[0]):
+        if data.distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
             continue  # no joint travels farther, so the way is no longer
         if _has_room(model, data, p, time):
             continue
@@ -82,7 +82,7 @@ def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duratio
     """Prove pair ``p`` apart in the step and in the stop: with one plane, or else piece by piece."""
     data.distance[p] = measure(model.collision, data.collision, p)
     threshold = min(model.min_distance[p], data.distance[p] - _LAST_DIGITS)
-    if stay_beyond(model.collision, data.collision, p, data.rollout.step, h, data.rollout.stop, duration, threshold):
+    if stays_beyond(model.collision, data.collision, p, data.rollout.step, h, data.rollout.stop, duration, threshold):
         return True
     if not _step_keeps_apart(model, data, p, h, duration, threshold):
         return False
@@ -99,15 +99,6 @@ def write_step(data: SafetyData, h: float) -> None:
         piece.travel[j] = step_travel(v[j], v_next[j], h)
 
 
-@kernel
-def _farthest_travel(data: SafetyData) -> float:
-    """The farthest that any joint travels in the step and the stop [rad or m]."""
-    farthest = 0.0
-    for j in range(data.rollout.step.travel.shape[0]):
-        farthest = max(farthest, data.rollout.step.travel[j] + data.rollout.stop.travel[j])
-    return farthest
-
-
 @inlined_kernel
 def _has_room(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
     """Whether pair ``p`` is farther apart than it can come closer: by its speed; by the ways if it shares a joint."""
@@ -118,34 +109,29 @@ def _has_room(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool
 
 
 @kernel
-def _distance_at(model: SafetyModel, data: SafetyData, p: int, i: int, duration: float) -> float:
-    """Distance of pair ``p`` at sample ``i`` of the candidate's stop."""
-    return measure(model.collision, sample_of(model, data, i, duration), p)
-
-
-@kernel
 def _step_keeps_apart(
     model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, threshold: float
 ) -> bool:
     """Prove pair ``p`` apart in the step: from both of its ends by the way, or else from the first by a plane."""
-    after = _distance_at(model, data, p, 0, duration)
+    after = measure(model.collision, sample_of(model, data, 0, duration), p)
     if after < threshold:
         return False
     if 0.5 * (data.distance[p] + after - way(model, p, data.rollout.step.travel)) >= threshold:
         return True
     measure(model.collision, data.collision, p)
-    return stays_beyond(model.collision, data.collision, p, data.rollout.step, h, threshold)
+    step = data.rollout.step
+    return stays_beyond(model.collision, data.collision, p, step, h, step, 0.0, threshold)
 
 
 @kernel
 def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: float, threshold: float) -> bool:
     """Prove pair ``p`` apart along the whole stop, piece by piece."""
     rollout = data.rollout
-    last = rollout.q.shape[0] - 1
+    i, last = 0, rollout.q.shape[0] - 1
     stride = last
-    i = 0
     while i < last:
-        distance = _distance_at(model, data, p, i, duration)
+        sample = sample_of(model, data, i, duration)
+        distance = measure(model.collision, sample, p)
         if distance < threshold:
             return False
         rest = 0.0
@@ -160,15 +146,13 @@ def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: fl
         stride = min(4 * stride, last)
         while stride > last - i or i % stride != 0:
             stride //= 2
-        proven = False
-        while not proven and stride >= 1:
+        while stride >= 1:
             length = duration * stride / last
             write_piece(data, rollout.v[i], duration * i / last, length, rollout.piece)
-            sample = sample_of(model, data, i, duration)
-            proven = stays_beyond(model.collision, sample, p, rollout.piece, length, threshold)
-            if not proven:
-                stride //= 2
-        if not proven:
+            if stays_beyond(model.collision, sample, p, rollout.piece, length, rollout.piece, 0.0, threshold):
+                break
+            stride //= 2
+        if stride < 1:
             return False
         i += stride
     return True
@@ -185,11 +169,12 @@ def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: flo
     before = data.distance[p]
     last = data.rollout.q.shape[0] - 1
     for i in range(last + 1):
-        now = _distance_at(model, data, p, i, duration)
+        sample = sample_of(model, data, i, duration)
+        now = measure(model.collision, sample, p)
         if now < before - _CLOSER:
             return False
         before = now
-        distance_row(model.collision, sample_of(model, data, i, duration), p, row)
+        distance_row(model.collision, sample, p, row)
         rate = 0.0
         for j in range(row.shape[0]):
             v = data.rollout.v[i, j]

@@ -22,19 +22,16 @@ def write_stop(model: SafetyModel, q: Array, v: Array, shape: int, deceleration:
     a = model.limits.acceleration
     for j in range(v.shape[0]):
         deceleration[j] = a[j]
-    if shape == OWN:
-        return
-    for j in range(v.shape[0]):
+        if shape == OWN:
+            continue
         leader = j
         for i in range(v.shape[0]):
             same = shape == TOGETHER or model.arm[i] == model.arm[j]
             if same and abs(v[i]) * a[leader] > abs(v[leader]) * a[i]:
                 leader = i
-        speed = abs(v[j])
-        if leader == j or speed == 0.0:
-            continue
-        shared = speed * a[leader] / abs(v[leader])
-        deceleration[j] = min(max(shared, _least_deceleration(model.limits, j, q[j], v[j])), a[j])
+        if leader != j and v[j] != 0.0:
+            shared = abs(v[j]) * a[leader] / abs(v[leader])
+            deceleration[j] = min(max(shared, _least_deceleration(model.limits, j, q[j], v[j])), a[j])
 
 
 @kernel
@@ -72,31 +69,33 @@ def begin_rollout(data: SafetyData) -> float:
     rollout.known[:] = 0.0
     duration = 0.0
     for j in range(candidate.v.shape[0]):
-        speed, deceleration = abs(candidate.v[j]), candidate.deceleration[j]
-        duration = max(duration, speed / deceleration)
+        duration = max(duration, abs(candidate.v[j]) / candidate.deceleration[j])
     write_piece(data, candidate.v, 0.0, duration, rollout.stop)
     return duration
+
+
+@kernel
+def stay_with_stop(data: SafetyData) -> None:
+    """Make the candidate the reference as it is, with the stop that is at hand."""
+    for j in range(data.state.v.shape[0]):
+        data.candidate.q[j] = data.state.q[j]
+        data.candidate.v[j] = data.state.v[j]
+        data.candidate.deceleration[j] = data.certified[j]
 
 
 @inlined_kernel
 def sample_of(model: SafetyModel, data: SafetyData, i: int, duration: float) -> CollisionData:
     """The bodies at sample ``i`` of the candidate's stop."""
-    rollout = data.rollout
+    candidate, rollout = data.candidate, data.rollout
     placements = Placements(rollout.frame, rollout.translation[i], rollout.axis[i])
     posed = BodyPlacements(rollout.start[i], rollout.end[i], rollout.rotation[i])
     sample = CollisionData(placements, posed, rollout.contact)
     if rollout.known[i] == 0.0:
-        _place_sample(model, data, i, duration, sample)
+        t = duration * i / (rollout.q.shape[0] - 1)
+        brake(candidate.q, candidate.v, candidate.deceleration, t, rollout.q[i], rollout.v[i])
+        update_placements(model.collision, sample, rollout.q[i])
+        rollout.known[i] = 1.0
     return sample
-
-
-@kernel
-def _place_sample(model: SafetyModel, data: SafetyData, i: int, duration: float, sample: CollisionData) -> None:
-    candidate, rollout = data.candidate, data.rollout
-    t = duration * i / (rollout.q.shape[0] - 1)
-    brake(candidate.q, candidate.v, candidate.deceleration, t, rollout.q[i], rollout.v[i])
-    update_placements(model.collision, sample, rollout.q[i])
-    rollout.known[i] = 1.0
 
 
 @kernel
@@ -110,9 +109,7 @@ def write_piece(data: SafetyData, v: Array, start: float, length: float, piece: 
         deceleration = candidate.deceleration[j]
         sign = 1.0 if v[j] >= 0.0 else -1.0
         rest = abs(candidate.v[j]) / deceleration - start  # until the joint rests
-        piece.rate[j] = 0.0
-        piece.change[j] = 0.0
-        piece.loose[j] = 0.0
+        piece.rate[j], piece.change[j], piece.loose[j] = 0.0, 0.0, 0.0
         if v[j] == 0.0:
             piece.travel[j] = 0.0
         elif rest < length - _SAME_TIME:

@@ -68,7 +68,9 @@ class ElbowSwivel:
         pin.computeJointJacobians(self._robot.model, self._data, q)
         for arm, wanted in self._angles.items():
             angle, share, row = self._swivel(arm)
-            row = self._without_tool_motion(arm, row)
+            frame = self._robot.arms[arm].frame_id
+            J = pin.getFrameJacobian(self._robot.model, self._data, frame, pin.LOCAL_WORLD_ALIGNED)
+            row = row - J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), J @ row)
             error = math.remainder(wanted - angle, 2.0 * math.pi)
             H += share * self._weight * np.outer(row, row)
             g -= share * self._weight * self._gain * error * row
@@ -77,10 +79,9 @@ class ElbowSwivel:
     def _swivel(self, arm: str) -> tuple[float, float, Array]:
         """Angle [rad], the share of 0 .. 1 to which it is defined, and its gradient (nv,)."""
         model, data = self._robot.model, self._data
-        S, E, W = (data.oMi[joint].translation for joint in self._joints[arm])
-        J_S, J_E, J_W = (
-            pin.getJointJacobian(model, data, joint, pin.LOCAL_WORLD_ALIGNED)[:3] for joint in self._joints[arm]
-        )
+        joints, axes = self._joints[arm], pin.LOCAL_WORLD_ALIGNED
+        S, E, W = (data.oMi[joint].translation for joint in joints)
+        J_S, J_E, J_W = (pin.getJointJacobian(model, data, joint, axes)[:3] for joint in joints)
         length = math.dist(W, S)
         w, e = (W - S) / max(length, _TINY), E - S
         p, reference = e - (w @ e) * w, _UP - (w @ _UP) * w
@@ -94,11 +95,6 @@ class ElbowSwivel:
         share = min(radius / _FULL_RADIUS, 1.0) * min(sine / _FULL_SINE, 1.0)
         # V = (0, 0, 1): V x p = (-p_y, p_x, 0)
         return math.atan2(w[1] * p[0] - w[0] * p[1], p[2]), share, row
-
-    def _without_tool_motion(self, arm: str, row: Array) -> Array:
-        frame = self._robot.arms[arm].frame_id
-        J = pin.getFrameJacobian(self._robot.model, self._data, frame, pin.LOCAL_WORLD_ALIGNED)
-        return row - J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), J @ row)
 
 
 def _joint(robot: Robot, arm: str, name: str) -> int:

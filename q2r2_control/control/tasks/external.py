@@ -30,7 +30,6 @@ class Task(Protocol):
         (nv,) each. The weight of a tool's error is 1 [s^2/m^2], that of the posture 1e-3. Called at every substep: keep
         it under 20 us. A cost with a number that is not finite is not used.
         """
-        ...
 
 
 def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> tuple[Task, ...]:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.geometry.closest_points import dot, size_of
 from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
 from q2r2_control.control.jit import kernel
 from q2r2_control.robot.robot import Robot
@@ -62,28 +62,15 @@ class Motion(NamedTuple):
     stretch_gain: Array  # (1,) k [1/s]
 
 
-def motion_of(settings: ControllerSettings) -> Motion:
-    """The part of the settings that says how tools move."""
-    return Motion(
-        gain=np.array([settings.position_gain, settings.rotation_gain]),
-        deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
-        full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
-        stretch_gain=np.array([settings.stretch_gain]),
-    )
-
-
 @kernel
 def tool_pose(placements: Placements, tools: Tools, i: int, rotation: Array, translation: Array) -> None:
     """World pose of tool ``i`` into ``rotation`` (3, 3) and ``translation`` (3,)."""
     joint = tools.joint[i]
     for row in range(3):
-        translation[row] = placements.translation[joint, row]
+        axes = placements.rotation[joint, row]
+        translation[row] = placements.translation[joint, row] + dot(axes, tools.translation[i])
         for column in range(3):
-            total = 0.0
-            for k in range(3):
-                total += placements.rotation[joint, row, k] * tools.rotation[i, k, column]
-            rotation[row, column] = total
-            translation[row] += placements.rotation[joint, row, column] * tools.translation[i, column]
+            rotation[row, column] = dot(axes, tools.rotation[i, :, column])
 
 
 @kernel
@@ -98,9 +85,8 @@ def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, tr
             for k in range(3):
                 J[k, j] = axis[k]
         else:
-            x = translation[0] - placements.translation[joint, 0]
-            y = translation[1] - placements.translation[joint, 1]
-            z = translation[2] - placements.translation[joint, 2]
+            origin = placements.translation[joint]
+            x, y, z = translation[0] - origin[0], translation[1] - origin[1], translation[2] - origin[2]
             J[0, j] = axis[1] * z - axis[2] * y
             J[1, j] = axis[2] * x - axis[0] * z
             J[2, j] = axis[0] * y - axis[1] * x
@@ -115,27 +101,30 @@ def rotation_vector(R: Array, out: Array) -> None:
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace > 0.0:
         w = 1.0 + trace
-        out[0] = R[2, 1] - R[1, 2]
-        out[1] = R[0, 2] - R[2, 0]
-        out[2] = R[1, 0] - R[0, 1]
+        out[0], out[1], out[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     else:
-        i = 0
-        if R[1, 1] > R[0, 0]:
-            i = 1
+        i = 1 if R[1, 1] > R[0, 0] else 0
         if R[2, 2] > R[i, i]:
             i = 2
-        j = (i + 1) % 3
-        k = (i + 2) % 3
+        j, k = (i + 1) % 3, (i + 2) % 3
         w = R[k, j] - R[j, k]
         sign = 1.0 if w >= 0.0 else -1.0
         w *= sign
         out[i] = sign * (1.0 + R[i, i] - R[j, j] - R[k, k])
         out[j] = sign * (R[j, i] + R[i, j])
         out[k] = sign * (R[k, i] + R[i, k])
-    imaginary = np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    imaginary = size_of(out)
     factor = 2.0 * np.arctan2(imaginary, w) / imaginary if imaginary > 1e-12 else 2.0 / w
     for k in range(3):
         out[k] *= factor
+
+
+@kernel
+def times_transposed(A: Array, B: Array, product: Array) -> None:
+    """A B' of two 3 by 3 matrices."""
+    for i in range(3):
+        for j in range(3):
+            product[i, j] = dot(A[i], B[j])
 
 
 @kernel
@@ -154,25 +143,19 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -> None:
     """Twist of tool ``i`` towards its target into ``data.twist``, and the part that the error makes."""
     twist, feedback, feed_forward = data.twist[i], data.feedback[i], targets.feed_forward[i]
-    for row in range(3):
-        for column in range(3):
-            total = 0.0
-            for k in range(3):
-                total += targets.rotation[i, row, k] * data.rotation[i, column, k]
-            data.turn[row, column] = total
+    times_transposed(targets.rotation[i], data.rotation[i], data.turn)
     for k in range(3):
         twist[k] = targets.translation[i, k] - data.translation[i, k]
     rotation_vector(data.turn, twist[3:6])
     for part in range(2):
         piece = twist[3 * part : 3 * part + 3]
-        error = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
-        cap = motion.full_speed[part]
+        error, cap = size_of(piece), motion.full_speed[part]
         speed = min(approach_speed(error, motion.gain[part], motion.deceleration[part]), cap)
         scale = speed / error if error > 1e-12 else 1.0
         for k in range(3):
             feedback[3 * part + k] = scale * piece[k]
             piece[k] = feedback[3 * part + k] + feed_forward[3 * part + k]
-        size = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
+        size = size_of(piece)
         if size > cap:
             for k in range(3):
                 piece[k] *= cap / size
@@ -207,10 +190,7 @@ def accumulate_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None
     """
     chain, placements, H = model.chain, data.placements, data.H
     J, feedback = data.J[6 * i : 6 * i + 6], data.feedback[i]
-    turning = 0.0
-    for k in range(3):
-        turning += feedback[3 + k] * feedback[3 + k]
-    turning = ROTATION_LENGTH * ROTATION_LENGTH * np.sqrt(turning)
+    turning = ROTATION_LENGTH * ROTATION_LENGTH * size_of(feedback[3:6])
     scale = model.priority.weight[i] / model.motion.stretch_gain[0]
     far = model.tools.joint[i]
     while far != 0:

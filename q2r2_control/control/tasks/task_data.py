@@ -1,4 +1,8 @@
-"""What the arms are asked to do, and the arrays that the task kernels write anew at each tick."""
+"""What the arms are asked to do, the cost of joints that no tool needs, and what the task kernels write at each tick.
+
+For all joints w |v - v_p|^2 with the posture velocity v_p projected into the tools' nullspace, so that at rest it
+leaves no tool error. An arm without a target holds its joints by a cost of their own.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +11,83 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.config.control import EQUAL, ControllerSettings
+from q2r2_control.control.cholesky import factorise, substitute
+from q2r2_control.control.geometry.closest_points import clamp, dot
 from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
-from q2r2_control.control.tasks.frame import Motion, Tools, motion_of, tools_of
-from q2r2_control.control.tasks.posture import Posture, posture_of
+from q2r2_control.control.jit import kernel
+from q2r2_control.control.tasks.frame import Motion, Tools, tools_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
+# A held arm is not pushed about by the other one's task, but may give way to recover separation.
+_HOLD_WEIGHT = 300.0
+HOLD_GAIN = 4.0  # [1/s]
+_PROJECTION_DAMPING = 1e-3
+
+
+class Posture(NamedTuple):
+    """Where joints go that the tools leave free."""
+
+    home: Array  # (nv,) [rad]
+    gain: Array  # (1,), which may change between ticks [1/s]
+    speed: float  # at most [rad/s]
+
+
+@kernel
+def pull_to_posture(model: TaskModel, data: TaskData, targets: TaskTargets, q: Array) -> None:
+    """Velocity of every joint from ``q`` (nv,) towards the posture that is asked for, into ``data.posture``."""
+    gain, speed = model.posture.gain[0], model.posture.speed
+    for j in range(q.shape[0]):
+        data.posture[j] = clamp(gain * (targets.posture[j] - q[j]), -speed, speed)
+
+
+@kernel
+def accumulate_hold_cost(data: TaskData, targets: TaskTargets, i: int, q: Array) -> None:
+    """Joints of the held arm ``i`` return to where they were latched; the posture pull does not move them."""
+    for j in range(q.shape[0]):
+        if targets.member[i, j] == 1.0:
+            data.H[j, j] += _HOLD_WEIGHT
+            data.g[j] -= _HOLD_WEIGHT * HOLD_GAIN * (targets.hold[j] - q[j])
+            data.posture[j] = 0.0
+
+
+@kernel
+def accumulate_posture_cost(model: TaskModel, data: TaskData) -> None:
+    """Add the cost of all joints' distance from ``data.posture``."""
+    for j in range(data.posture.shape[0]):
+        weight = model.priority.posture_weight[j]
+        data.H[j, j] += weight
+        data.g[j] -= weight * data.posture[j]
+
+
+@kernel
+def project_to_nullspace(J: Array, factor: Array, moved: Array, v: Array) -> None:
+    """Remove from ``v`` (nv,) what moves the tools with Jacobians J (6n, nv): v -= J' (J J' + d I)^-1 J v.
+
+    ``factor`` (6n, 6n) and ``moved`` (6n,) are scratch.
+    """
+    for i in range(J.shape[0]):
+        for j in range(i, J.shape[0]):
+            factor[i, j] = dot(J[i], J[j])
+        factor[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
+        moved[i] = dot(J[i], v)
+    factorise(factor)  # positive definite for any finite J; of another, J v is not finite either
+    substitute(factor, moved)
+    for j in range(J.shape[1]):
+        for i in range(J.shape[0]):
+            v[j] -= J[i, j] * moved[i]
+
+
+# A target faster than this many times the tool's own limit did not move, it was put elsewhere.
+_TELEPORT = 3.0
+
 
 class Priority(NamedTuple):
-    """Which arm gives way where two arms are in each other's way.
+    """Which arm gives way where two arms are in each other's way; the weights may change between ticks.
 
-    Arms meet in the QP only where separation rows couple their joints. There the costs decide: all costs of an arm that
-    gives way are multiplied by a small weight, so that a row that both arms need is paid for by its motion. Where no
-    row is active nothing changes, since the least of a sum of independent costs does not depend on their weights; that
-    is why posture and damping are scaled along with the tool's task.
-
-    An arm without a target holds its joints, and holding is never given up: it does not give way. The weights may
-    change between ticks.
+    Arms meet in the QP only where separation rows couple their joints. There all costs of an arm that gives way, also
+    posture and damping, are multiplied by a small weight, so that its motion pays for a row that both arms need. Where
+    no row is active nothing changes. An arm without a target holds its joints, and does not give way.
     """
 
     weight: Array  # (n,) of an arm's costs while it follows a target: 1, less if it gives way
@@ -66,8 +130,13 @@ def task_model_of(robot: Robot, settings: ControllerSettings, chain: Chain) -> T
     return TaskModel(
         chain=chain,
         tools=tools_of(robot),
-        motion=motion_of(settings),
-        posture=posture_of(robot, settings),
+        motion=Motion(
+            gain=np.array([settings.position_gain, settings.rotation_gain]),
+            deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
+            full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
+            stretch_gain=np.array([settings.stretch_gain]),
+        ),
+        posture=Posture(np.array(robot.home), gain=np.array([settings.posture_gain]), speed=settings.posture_speed),
         priority=priority_of(robot, settings),
     )
 
@@ -76,9 +145,9 @@ class PoseScratch(NamedTuple):
     """Scratch of an offered pose that is being checked."""
 
     rotation: Array  # (3, 3)
-    translation: Array  # (3,)
     gram: Array  # (3, 3)
     correction: Array  # (3, 3)
+    translation: Array  # (3,)
     moved: Array  # (6,)
 
 
@@ -101,9 +170,7 @@ class TaskTargets(NamedTuple):
     scratch: PoseScratch
 
     @classmethod
-    def empty(
-        cls, model: TaskModel, feed_forward_time: float, teleport_speed: float, teleport_turn: float
-    ) -> TaskTargets:
+    def empty(cls, model: TaskModel, settings: ControllerSettings) -> TaskTargets:
         n, nv = model.tools.member.shape
         return cls(
             member=model.tools.member,
@@ -116,10 +183,10 @@ class TaskTargets(NamedTuple):
             latched=np.zeros(n, dtype=np.int64),
             offered=np.zeros(n, dtype=np.int64),
             pose=np.zeros((n, 4, 4)),
-            feed_forward_time=feed_forward_time,
-            teleport_speed=teleport_speed,
-            teleport_turn=teleport_turn,
-            scratch=PoseScratch(np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(6)),
+            feed_forward_time=settings.feed_forward_time,
+            teleport_speed=_TELEPORT * settings.max_linear_speed,
+            teleport_turn=_TELEPORT * settings.max_angular_speed,
+            scratch=PoseScratch(*np.zeros((3, 3, 3)), *np.zeros((1, 3)), *np.zeros((1, 6))),
         )
 
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -20,60 +20,27 @@ class Segments(NamedTuple):
     b1: Array
 
 
-def _apart(random: np.random.Generator) -> Segments:
-    return Segments(*random.uniform(-1, 1, (4, 3)))
-
-
-def _parallel(random: np.random.Generator) -> Segments:
-    a0, a1, b0 = random.uniform(-1, 1, (3, 3))
-    return Segments(a0, a1, b0, b0 + random.uniform(-2, 2) * (a1 - a0))
-
-
-def _nearly_parallel(random: np.random.Generator) -> Segments:
-    a0, a1, b0, b1 = _parallel(random)
-    return Segments(a0, a1, b0, b1 + 10.0 ** random.uniform(-10, -3) * random.normal(size=3))
-
-
-def _on_one_line(random: np.random.Generator) -> Segments:
-    origin, direction = random.uniform(-1, 1, (2, 3))
-    return Segments(*(origin + s * direction for s in random.uniform(-1, 1, 4)))
-
-
-def _crossing(random: np.random.Generator) -> Segments:
-    meeting, u, w = random.uniform(-1, 1, (3, 3))
+def _segments(kind: str, random: np.random.Generator) -> Segments:
+    a0, a1, b0, b1 = random.uniform(-1, 1, (4, 3))
     s, t = random.uniform(0.1, 0.9, 2)
-    return Segments(meeting - s * u, meeting + (1 - s) * u, meeting - t * w, meeting + (1 - t) * w)
+    parallel = b0 + random.uniform(-2, 2) * (a1 - a0)
+    ends = {
+        "apart": (a0, a1, b0, b1),
+        "parallel": (a0, a1, b0, parallel),
+        "nearly parallel": (a0, a1, b0, parallel + 10.0 ** random.uniform(-10, -3) * random.normal(size=3)),
+        "on one line": tuple(a0 + share * a1 for share in random.uniform(-1, 1, 4)),
+        "crossing": (a0 - s * a1, a0 + (1 - s) * a1, a0 - t * b1, a0 + (1 - t) * b1),
+        "a point and a segment": (a0, a0.copy(), b0, b1),
+        "two points": (a0, a0.copy(), b0, b0.copy()),
+        "sharing an end": (a0, a1, a0.copy(), b1),
+    }
+    return Segments(*ends[kind])
 
 
-def _point_and_segment(random: np.random.Generator) -> Segments:
-    a0, b0, b1 = random.uniform(-1, 1, (3, 3))
-    return Segments(a0, a0.copy(), b0, b1)
-
-
-def _two_points(random: np.random.Generator) -> Segments:
-    a0, b0 = random.uniform(-1, 1, (2, 3))
-    return Segments(a0, a0.copy(), b0, b0.copy())
-
-
-def _sharing_an_end(random: np.random.Generator) -> Segments:
-    a0, a1, b1 = random.uniform(-1, 1, (3, 3))
-    return Segments(a0, a1, a0.copy(), b1)
-
-
-KINDS = [
-    _apart,
-    _parallel,
-    _nearly_parallel,
-    _on_one_line,
-    _crossing,
-    _point_and_segment,
-    _two_points,
-    _sharing_an_end,
-]
-
-
-def _kind_name(kind: Callable[..., object]) -> str:
-    return kind.__name__.strip("_").replace("_", " ")
+KINDS = (
+    *("apart", "parallel", "nearly parallel", "on one line"),
+    *("crossing", "a point and a segment", "two points", "sharing an end"),
+)
 
 
 def _to_segment(point: Array, start: Array, end: Array) -> float:
@@ -94,14 +61,14 @@ def _least_distance(segments: Segments) -> float:
     return min(candidates)
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=_kind_name)
-def test_segments_are_as_far_apart_as_their_closest_points(kind: Callable[[np.random.Generator], Segments]) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_segments_are_as_far_apart_as_their_closest_points(kind: str) -> None:
     random = np.random.default_rng(1)
     on_a, on_b = np.zeros(3), np.zeros(3)
     # What is parallel but for rounding is measured in the middle of the overlap, not at its nearer end.
-    tolerance = 1e-7 if kind is _nearly_parallel else 1e-9
+    tolerance = 1e-7 if kind == "nearly parallel" else 1e-9
     for _ in range(SAMPLES):
-        segments = kind(random)
+        segments = _segments(kind, random)
         distance = segment_segment(*segments, on_a, on_b)
         assert distance == pytest.approx(_least_distance(segments), abs=tolerance)
         assert distance == pytest.approx(np.linalg.norm(on_a - on_b), abs=1e-12)
@@ -135,10 +102,8 @@ def _nearest_along(a0: Array, a1: Array, half: Array) -> float:
     for _ in range(100):
         middle = 0.5 * (low + high)
         point = a0 + middle * (a1 - a0)
-        if (point - np.clip(point, -half, half)) @ (a1 - a0) > 0.0:
-            high = middle
-        else:
-            low = middle
+        falls = (point - np.clip(point, -half, half)) @ (a1 - a0) <= 0.0
+        low, high = (middle, high) if falls else (low, middle)
     ends = a0 + np.array([[0.0], [low], [high], [1.0]]) * (a1 - a0)
     return float(_outside(ends, half).min())
 
@@ -173,20 +138,15 @@ def _assert_witnesses(answer: BoxAnswer, a0: Array, a1: Array, half: Array) -> N
 
 SPECIAL = {
     "along a face": ([-0.1, 0.0, 0.5], [0.3, 0.1, 0.5], 0.2),
-    "along a face and beyond it": ([-0.5, 0.0, 0.5], [0.9, 0.0, 0.5], 0.2),
     "along an edge": ([0.6, -0.1, 0.7], [0.6, 0.1, 0.7], np.hypot(0.2, 0.4)),
     "upright above a face": ([0.1, 0.0, 0.4], [0.1, 0.0, 0.9], 0.1),
     "pointing at a corner": ([0.6, 0.4, 0.5], [1.2, 0.8, 1.0], np.sqrt(0.12)),
-    "a point before a face": ([0.0, 0.0, 0.8], [0.0, 0.0, 0.8], 0.5),
-    "a point before an edge": ([0.7, 0.0, 0.7], [0.7, 0.0, 0.7], 0.5),
     "touching a face from outside": ([0.0, 0.0, 0.3], [0.0, 0.0, 0.8], 0.0),
     "lying on a face": ([-0.1, 0.0, 0.3], [0.1, 0.0, 0.3], 0.0),
     "ending at a corner": ([0.4, 0.2, 0.3], [0.9, 0.9, 0.9], 0.0),
     "a point inside": ([0.0, 0.1, 0.0], [0.0, 0.1, 0.0], -0.1),
     "wholly inside": ([-0.1, 0.0, 0.2], [0.1, 0.0, 0.2], -0.1),
     "dipping into the top": ([0.0, 0.0, 0.25], [0.0, 0.0, 0.9], -0.05),
-    "dipping into the bottom": ([0.0, 0.0, -0.9], [0.0, 0.0, -0.25], -0.05),
-    "dipping into the left": ([0.0, -0.9, 0.0], [0.0, -0.15, 0.0], -0.05),
 }
 
 

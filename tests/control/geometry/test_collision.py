@@ -145,4 +145,4 @@ def test_two_boxes_are_refused() -> None:
         model.addGeometryObject(pin.GeometryObject(name, 0, pin.SE3.Identity(), coal.Box(1.0, 1.0, 1.0)))
     model.addCollisionPair(pin.CollisionPair(0, 1))
     with pytest.raises(RobotError, match=r"two boxes; allowed: at most one box"):
-        pairs_of(model, arrays.collision.chain, bodies_of(model), np.ones(14))
+        pairs_of(model, arrays.collision.chain, bodies_of(model), np.ones(14), np.ones(2))

@@ -4,10 +4,17 @@ import numpy as np
 import pytest
 
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
-from q2r2_control.control.geometry.pair_distance import at_least, deepest, measure, with_rounded_boxes
+from q2r2_control.control.geometry.pair_distance import (
+    at_least,
+    distance_row,
+    measure,
+    measure_smooth,
+    with_rounded_boxes,
+)
 from q2r2_control.robot.pairs import pair_names
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
-from tests.control.cells import cell, random_posture
+from tests.control.cells import CellArrays, arrays_of, cell, placed, random_posture
 
 ROBOT, MODEL = cell("dual_iiwa7").robot, cell("dual_iiwa7").collision
 NAMES = pair_names(ROBOT.collision_model)
@@ -44,5 +51,81 @@ def test_above_the_face_of_a_box_nothing_changes() -> None:
 
 
 def test_the_cores_of_pairs_with_a_depth_are_that_much_farther_apart() -> None:
-    rounded = deepest(ROUNDED, ROUNDED.bodies.radius) - deepest(MODEL, MODEL.bodies.radius)
-    np.testing.assert_allclose(rounded[TOUCHING], DEPTH)
+    first, second = ((model.bodies.radius[model.pairs.second])[TOUCHING] for model in (MODEL, ROUNDED))
+    np.testing.assert_allclose(second - first, DEPTH)
+
+
+SMOOTHING = 1e-4  # [m^2]
+CORES_APART = 0.03  # [m]
+
+
+def _looked_at(arrays: CellArrays, q: Array, p: int, smooth: bool = True) -> tuple[float, Array]:
+    """Distance of pair ``p`` and its row."""
+    data, row = placed(arrays, q), np.zeros(len(q))
+    distance = measure_smooth(arrays.collision, data, p, SMOOTHING) if smooth else measure(arrays.collision, data, p)
+    distance_row(arrays.collision, data, p, row)
+    return distance, row
+
+
+def _radii(arrays: CellArrays, p: int) -> float:
+    return float(arrays.bodies.radius[arrays.pairs.first[p]] + arrays.bodies.radius[arrays.pairs.second[p]])
+
+
+@pytest.fixture(scope="module")
+def seen() -> list[tuple[Array, int]]:
+    """Postures and pairs, a box in some, whose cores are apart."""
+    arrays, random = cell("dual_iiwa7"), np.random.default_rng(21)
+    found = []
+    for _ in range(300):
+        q, p = random_posture(arrays.robot, random), int(random.integers(len(arrays.pairs.first)))
+        if _looked_at(arrays, q, p, smooth=False)[0] + _radii(arrays, p) > CORES_APART:
+            found.append((q, p))
+    assert sum(arrays.bodies.box[arrays.pairs.second[p]] for _, p in found) > 10
+    return found
+
+
+def test_the_smooth_distance_is_larger_than_the_distance_by_no_more_than_stated(seen: list[tuple[Array, int]]) -> None:
+    arrays = cell("dual_iiwa7")
+    for q, p in seen:
+        exact, smooth = _looked_at(arrays, q, p, smooth=False)[0], _looked_at(arrays, q, p)[0]
+        assert exact - 1e-12 <= smooth <= exact + SMOOTHING / (4 * (exact + _radii(arrays, p))) + 1e-12
+
+
+def test_its_row_is_its_gradient_for_every_pair(seen: list[tuple[Array, int]]) -> None:
+    arrays = cell("dual_iiwa7")
+    for q, p in seen:
+        row = _looked_at(arrays, q, p)[1]
+        for j in range(len(q)):
+            step = 1e-6 * np.eye(len(q))[j]
+            slope = (_looked_at(arrays, q + step, p)[0] - _looked_at(arrays, q - step, p)[0]) / 2e-6
+            assert row[j] == pytest.approx(slope, abs=1e-6)
+
+
+LYING = """<robot name="bars"><link name="base"><collision name="fixed"><origin xyz="0 0 0" rpy="0 {quarter} 0"/>
+<geometry>{fixed}</geometry></collision></link>
+<link name="beam"/><link name="bar"><collision name="bar_shape"><origin rpy="0 1.5707963267948966 0"/>
+<geometry><cylinder radius="0.05" length="0.3"/></geometry></collision>
+<collision_checking><capsule name="bar_shape"/></collision_checking></link>
+<joint name="tilt" type="revolute"><parent link="base"/><child link="beam"/><origin xyz="0 0 {height}"/>
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+<joint name="roll" type="revolute"><parent link="beam"/><child link="bar"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
+FIXED = {
+    "a bar": (1.5707963267948966, '<cylinder radius="0.05" length="0.3"/>', 0.115),
+    "a box": (0.0, '<box size="1 1 0.2"/>', 0.165),
+}
+
+
+@pytest.mark.parametrize("kind", FIXED)
+def test_a_bar_that_tilts_over_another_body_turns_the_row_gradually_where_the_exact_one_jumps(kind: str) -> None:
+    quarter, fixed, height = FIXED[kind]
+    urdf = LYING.format(quarter=quarter, fixed=fixed, height=height)
+    arrays = arrays_of(Robot.from_urdf(urdf, {"left": "bar"}))
+    assert len(arrays.pairs.first) == 1
+    tilts = np.linspace(-0.01, 0.01, 401)
+    smooth, exact = (
+        np.array([_looked_at(arrays, np.array([tilt, 0.0]), 0, kind)[1][0] for tilt in tilts]) for kind in (True, False)
+    )
+    assert np.abs(np.diff(exact)).max() > 0.1, "from one end to the other"
+    assert np.abs(np.diff(smooth)).max() < 0.02
+    np.testing.assert_allclose(smooth[[0, -1]], exact[[0, -1]], atol=0.02)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -19,59 +18,36 @@ RETURN_SPEED = 0.2
 EXACT = 1e-9
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """Limits of many independent joints, (n,) each."""
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    acceleration: Array
-    longest: float  # step [s]
+def _bounds(random: np.random.Generator, longest: float) -> JointLimits:
+    middle, half = random.uniform(-2, 2, JOINTS), 0.5 * 10.0 ** random.uniform(-2, 0.7, JOINTS)
+    v, a = 10.0 ** random.uniform(-1, 0.7, JOINTS), 10.0 ** random.uniform(0, 1.5, JOINTS)
+    return JointLimits(middle - half, middle + half, v, a, longest, RETURN_SPEED)
 
 
-@dataclass(frozen=True)
-class Box:
-    lower: Array
-    upper: Array
-    inside: bool
+def _box(q: Array, v: Array, bounds: JointLimits, h: float) -> tuple[VelocityBox, bool]:
+    box = VelocityBox.empty(len(q))
+    return box, next_velocity_box(bounds, q, v, h, box)
 
 
-def _bounds(random: np.random.Generator, longest: float, n: int = JOINTS) -> Bounds:
-    middle, width = random.uniform(-2, 2, n), 10.0 ** random.uniform(-2, 0.7, n)
-    return Bounds(
-        lower=middle - 0.5 * width,
-        upper=middle + 0.5 * width,
-        velocity=10.0 ** random.uniform(-1, 0.7, n),
-        acceleration=10.0 ** random.uniform(0, 1.5, n),
-        longest=longest,
+def _stoppable(room: Array, v: Array, bounds: JointLimits) -> npt.NDArray[np.bool_]:
+    """P of joint_limits.py towards one side, with rounding."""
+    return np.where(
+        v <= 0.0, room >= -EXACT, v**2 / (2 * bounds.acceleration) + bounds.longest_step * v <= room + EXACT
     )
 
 
-def _box(q: Array, v: Array, bounds: Bounds, h: float) -> Box:
-    limits = JointLimits(bounds.lower, bounds.upper, bounds.velocity, bounds.acceleration, bounds.longest, RETURN_SPEED)
-    box = VelocityBox.empty(len(q))
-    inside = next_velocity_box(limits, q, v, h, box)
-    return Box(box.lower, box.upper, inside)
-
-
-def _stoppable(room: Array, v: Array, bounds: Bounds) -> npt.NDArray[np.bool_]:
-    """P of joint_limits.py towards one side, with rounding."""
-    return np.where(v <= 0.0, room >= -EXACT, v**2 / (2 * bounds.acceleration) + bounds.longest * v <= room + EXACT)
-
-
-def _keeps_p(q: Array, v: Array, bounds: Bounds) -> bool:
+def _keeps_p(q: Array, v: Array, bounds: JointLimits) -> bool:
     up, down = _stoppable(bounds.upper - q, v, bounds), _stoppable(q - bounds.lower, -v, bounds)
     return bool((up & down & (np.abs(v) <= bounds.velocity + EXACT)).all())
 
 
-def _fastest_in_p(room: Array, bounds: Bounds) -> Array:
+def _fastest_in_p(room: Array, bounds: JointLimits) -> Array:
     """Largest speed for which P holds with this much room."""
-    a, H = bounds.acceleration, bounds.longest
+    a, H = bounds.acceleration, bounds.longest_step
     return np.minimum(bounds.velocity, -a * H + np.sqrt((a * H) ** 2 + 2 * a * np.maximum(room, 0.0)))
 
 
-def _start_on_the_edge_of_p(random: np.random.Generator, bounds: Bounds) -> tuple[Array, Array]:
+def _start_on_the_edge_of_p(random: np.random.Generator, bounds: JointLimits) -> tuple[Array, Array]:
     q = random.uniform(bounds.lower, bounds.upper)
     share: Array = random.choice(np.array([0.0, 0.5, 1.0]), len(q))
     upward = random.random(len(q)) < 0.5
@@ -80,26 +56,13 @@ def _start_on_the_edge_of_p(random: np.random.Generator, bounds: Bounds) -> tupl
     )
 
 
-Choice = Callable[[Box, Array, np.random.Generator], Array]
-
-
-def _outwards(box: Box, v: Array, random: np.random.Generator) -> Array:
-    return box.upper
-
-
-def _back_and_forth(box: Box, v: Array, random: np.random.Generator) -> Array:
-    return np.where(random.random(len(v)) < 0.02, box.lower, box.upper)
-
-
-def _either_corner(box: Box, v: Array, random: np.random.Generator) -> Array:
-    return np.where(random.random(len(v)) < 0.5, box.lower, box.upper)
-
-
-def _anything(box: Box, v: Array, random: np.random.Generator) -> Array:
-    return box.lower + random.random(len(v)) * (box.upper - box.lower)
-
-
-CHOICES = {"upwards": _outwards, "turning": _back_and_forth, "either corner": _either_corner, "anything": _anything}
+Choice = Callable[[VelocityBox, Array, np.random.Generator], Array]
+CHOICES: dict[str, Choice] = {
+    "upwards": lambda box, v, random: box.upper,
+    "turning": lambda box, v, random: np.where(random.random(len(v)) < 0.02, box.lower, box.upper),
+    "either corner": lambda box, v, random: np.where(random.random(len(v)) < 0.5, box.lower, box.upper),
+    "anything": lambda box, v, random: box.lower + random.random(len(v)) * (box.upper - box.lower),
+}
 
 
 @pytest.mark.parametrize("longest", [0.0005, 0.002, 0.02], ids="longest step {} s".format)
@@ -110,8 +73,8 @@ def test_whatever_is_chosen_from_the_box_every_limit_holds_also_between_steps(ch
     q, v = _start_on_the_edge_of_p(random, bounds)
     for _ in range(STEPS):
         h = longest * random.choice([1.0, 1.0, 0.5, 1e-3, random.uniform(1e-6, 1.0)])
-        box = _box(q, v, bounds, h)
-        assert box.inside
+        box, inside = _box(q, v, bounds, h)
+        assert inside
         braked = v - np.clip(v, -bounds.acceleration * h, bounds.acceleration * h)
         assert (box.lower <= braked + EXACT).all()
         assert (braked <= box.upper + EXACT).all()
@@ -151,39 +114,35 @@ def test_the_bound_is_the_fastest_that_can_still_stop(
     assert bound >= v - a * h - EXACT
 
 
-def _recover(q: Array, v: Array, bounds: Bounds, choose: Choice, seconds: float) -> tuple[Array, Array]:
+def _recover(q: Array, v: Array, bounds: JointLimits, choose: Choice, seconds: float) -> tuple[Array, Array]:
     """Positions and velocities (t, n) of joints that start outside P; acceleration is checked on the way."""
-    random, h = np.random.default_rng(7), bounds.longest
+    random, h = np.random.default_rng(7), bounds.longest_step
     positions, velocities = [q], [v]
     for _ in range(int(seconds / h)):
-        box = _box(q, v, bounds, h)
+        box, _ = _box(q, v, bounds, h)
         assert (box.lower <= box.upper).all()
         chosen = choose(box, v, random)
         assert (np.abs(chosen - v) <= bounds.acceleration * h * (1 + EXACT) + 1e-15).all()
         q, v = q + 0.5 * h * (v + chosen), chosen
         positions.append(q)
         velocities.append(v)
-    assert _box(q, v, bounds, h).inside
+    assert _box(q, v, bounds, h)[1]
     assert _keeps_p(q, v, bounds)
     return np.array(positions), np.array(velocities)
-
-
-def _wide_bounds(n: int = JOINTS) -> Bounds:
-    ones = np.ones(n)
-    return Bounds(-2.0 * ones, 2.0 * ones, 1.5 * ones, 10.0 * ones, 0.002)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["above", "below"])
 @pytest.mark.parametrize("choose", CHOICES.values(), ids=CHOICES.keys())
 def test_a_joint_outside_returns_without_a_jump_at_bounded_speed(choose: Choice, side: float) -> None:
-    bounds = _wide_bounds()
+    ones = np.ones(JOINTS)
+    bounds = JointLimits(-2.0 * ones, 2.0 * ones, 1.5 * ones, 10.0 * ones, 0.002, RETURN_SPEED)
     outside = np.linspace(1e-6, 0.3, JOINTS)
     start = side * (2.0 + outside)
-    assert not _box(start, np.zeros(JOINTS), bounds, 0.002).inside
+    assert not _box(start, np.zeros(JOINTS), bounds, 0.002)[1]
     positions, velocities = _recover(start, np.zeros(JOINTS), bounds, choose, 3.5)
     beyond = side * positions - 2.0
     while_outside = beyond[:-1] > 0.0
     assert (np.diff(beyond, axis=0)[while_outside] <= EXACT).all(), "never further out"
     assert (side * velocities[:-1][while_outside] <= EXACT).all()
-    if choose is _outwards and side > 0.0:
+    if choose is CHOICES["upwards"] and side > 0.0:
         assert (-velocities[1:][while_outside] <= RETURN_SPEED + EXACT).all(), "no faster inward than asked for"

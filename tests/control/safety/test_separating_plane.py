@@ -22,7 +22,7 @@ def _proven(name: str, p: int, q: Array, v: Array, v_next: Array, threshold: flo
     step.rate[:], step.change[:] = v, (v_next - v) / H
     step.travel[:] = np.abs(_moved(q, v, v_next, np.linspace(0.0, H, 50)) - q).max(axis=0)
     measure(model.collision, data.collision, p)
-    return bool(stays_beyond(model.collision, data.collision, p, step, H, threshold))
+    return bool(stays_beyond(model.collision, data.collision, p, step, H, step, 0.0, threshold))
 
 
 @pytest.mark.parametrize("name", NAMES)

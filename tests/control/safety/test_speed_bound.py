@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.speed_bound import least_distance, write_deviations
+from q2r2_control.control.safety.speed_bound import fastest_approach, least_distance, write_deviations
 from q2r2_control.control.safety.stop_certificate import write_step
 from q2r2_control.control.safety.stop_rollout import OWN, SHAPES, TOGETHER, begin_rollout
 from q2r2_control.types import Array
@@ -116,3 +116,27 @@ def test_pairs_that_a_joint_carries_together_are_told_from_those_that_share_none
     assert (pairs.carried == together).all()
     assert any(together)
     assert not all(together)
+
+
+STEP = 1e-6  # of finite differences [s]
+
+
+def bounds_at(name: str, q: Array, v: Array) -> Array:
+    """Fastest approach (p,) of every pair [m/s]."""
+    model, data = kernel_model(name).safety.collision, kernel_data(name, q, v).safety
+    pairs = zip(model.pairs.first, model.pairs.second, strict=True)
+    return np.array([fastest_approach(data.velocities, first, second) for first, second in pairs])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_pair_closes_in_faster_than_its_bound_and_some_come_near_it(name: str) -> None:
+    random, robot = np.random.default_rng(51), cell(name).robot
+    nearest = 0.0
+    for _ in range(30):
+        q, v = random_posture(robot, random), random.uniform(-robot.velocity_limit, robot.velocity_limit)
+        before, after = distances(cell(name), np.array([q - STEP * v, q + STEP * v]))
+        closing, bounds = (before - after) / (2 * STEP), bounds_at(name, q, v)
+        apart = np.minimum(before, after) > 0.0
+        assert (closing[apart] <= bounds[apart] + 1e-6).all()
+        nearest = max(nearest, float((closing[apart] / np.maximum(bounds[apart], 0.1)).max()))
+    assert nearest > 0.7

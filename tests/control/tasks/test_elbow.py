@@ -1,6 +1,8 @@
-"""The elbow's swivel: its angle and gradient alone, then the task in the controller."""
+"""Tasks in NumPy: the elbow's swivel alone and in the controller, and one that another package brings."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -10,10 +12,8 @@ from q2r2_control import CartesianController, ControllerSettings
 from q2r2_control.control.tasks.elbow import ElbowSwivel
 from q2r2_control.errors import ConfigError
 from q2r2_control.types import Array
-from q2r2_control.verification.contract import Contract
 from tests.control.cells import cell, random_posture
-
-DT = 0.002
+from tests.support.driven import Driven
 
 
 def test_the_angle_is_that_between_the_planes_through_the_line_up_and_to_the_elbow() -> None:
@@ -47,16 +47,12 @@ def test_the_cost_pulls_along_the_angles_gradient_and_does_not_move_the_tool() -
 def run(angles: dict[str, float | None], start: Array) -> tuple[ElbowSwivel, Array, float]:
     """Final posture and motion of the tools [m], while both keep their pose; the contract holds at every tick."""
     robot = cell("dual_iiwa7").robot
-    controller = CartesianController(robot, ControllerSettings(tasks={"swivel": {"angles": angles}}))
-    controller.reset(start)
-    contract = Contract(controller, start)
-    goals = {arm: controller.tool_pose(arm) for arm in robot.arms}
-    for _ in range(2000):
-        reference = controller.step(goals, DT)
-        contract.check(reference, DT)
-    assert np.abs(reference.a).max() < 0.1
-    way = max(float(np.linalg.norm(controller.tool_pose(arm).translation - goals[arm].translation)) for arm in goals)
-    return ElbowSwivel(robot, angles), reference.q, way
+    run = Driven(CartesianController(robot, ControllerSettings(tasks={"swivel": {"angles": angles}})), start)
+    run.drive(4.0, run.start)
+    assert np.abs(run.a).max() < 0.1
+    tools = {arm: run.controller.tool_pose(arm).translation for arm in robot.arms}
+    way = max(float(np.linalg.norm(tools[arm] - run.start[arm].translation)) for arm in robot.arms)
+    return ElbowSwivel(robot, angles), run.q, way
 
 
 def test_elbows_turn_to_their_angles_and_the_tools_stay() -> None:
@@ -84,3 +80,67 @@ def test_a_stretched_arm_has_no_elbow_to_turn_and_rests() -> None:
 def test_settings_that_mean_nothing_are_refused_by_name(settings: dict[str, object], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks={"swivel": settings}))
+
+
+TASK = """
+import numpy as np
+
+class ElbowTask:
+    def __init__(self, robot, joint, angle, weight=0.1):
+        self.index, self.angle, self.weight, self.nv = robot.joint_names.index(joint), angle, weight, robot.model.nv
+
+    def cost(self, q, v):
+        H, g = np.zeros((self.nv, self.nv)), np.zeros(self.nv)
+        H[self.index, self.index] = self.weight
+        g[self.index] = -self.weight * 2.0 * (self.angle - q[self.index])
+        return H, g
+
+class BrokenTask:
+    def __init__(self, robot):
+        self.nv = robot.model.nv
+
+    def cost(self, q, v):
+        return np.full((self.nv, self.nv), np.nan), np.zeros(self.nv)
+"""
+ENTRIES = "[q2r2_control.tasks]\nelbow = elbow_package:ElbowTask\nbroken = elbow_package:BrokenTask\n"
+
+
+@pytest.fixture(autouse=True)
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An installed package with two tasks."""
+    (tmp_path / "elbow_package.py").write_text(TASK)
+    information = tmp_path / "elbow_package-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: elbow-package\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(ENTRIES)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def moved_by(settings: ControllerSettings) -> float:
+    """Final angle of the left arm's third joint while both tools keep their pose; the contract holds at every tick."""
+    robot = cell("dual_iiwa7").robot
+    controller = CartesianController(robot, settings)
+    reference = Driven(controller).drive(2.0, lambda _, start: start)
+    assert np.abs(reference.a).max() < 0.1
+    return float(reference.q[2] - robot.home[2])
+
+
+def test_a_task_of_another_package_moves_the_arm_within_every_promise() -> None:
+    settings = {"joint": "left_A3", "angle": float(cell("dual_iiwa7").robot.home[2]) + 0.3}
+    assert moved_by(ControllerSettings(tasks={"elbow": settings})) > 0.1
+
+
+def test_a_cost_that_is_no_number_is_not_used() -> None:
+    assert moved_by(ControllerSettings(tasks={"broken": {}})) == pytest.approx(moved_by(ControllerSettings()), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "message"),
+    [
+        ({"wrist": {}}, "control.tasks.wrist: installed tasks: .*broken, elbow"),
+        ({"elbow": {"gain": 1.0}}, "control.tasks.elbow: .*unexpected keyword argument 'gain'"),
+    ],
+)
+def test_an_unknown_task_and_a_bad_setting_are_refused_by_name(tasks: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks=tasks))

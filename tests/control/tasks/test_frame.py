@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.tasks.frame import (
     ROTATION_LENGTH,
     Motion,
@@ -86,7 +87,7 @@ def test_the_approach_speed_is_continuous_and_so_is_its_slope(gain: float, decel
 
 def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array) -> Array:
     model, arm = kernel_model("dual_iiwa7").tasks, 1
-    data, targets = kernel_data("dual_iiwa7", np.zeros(14)).tasks, TaskTargets.empty(model, 1.0, 1.0, 1.0)
+    data, targets = kernel_data("dual_iiwa7", np.zeros(14)).tasks, TaskTargets.empty(model, ControllerSettings())
     data.rotation[arm], data.translation[arm] = tool.rotation, tool.translation
     targets.rotation[arm], targets.translation[arm] = target.rotation, target.translation
     targets.feed_forward[arm] = feed_forward

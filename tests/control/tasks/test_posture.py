@@ -8,7 +8,7 @@ import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot
 from q2r2_control.control.tasks.frame import tool_jacobian, tool_pose, tools_of
-from q2r2_control.control.tasks.posture import factor_of_tools, project_to_nullspace
+from q2r2_control.control.tasks.task_data import project_to_nullspace
 from q2r2_control.types import Array
 from q2r2_control.verification.contract import Contract
 from tests.control.cells import NAMES, cell, placed
@@ -63,23 +63,8 @@ def test_a_posture_that_cannot_be_is_not_used(controller: CartesianController, r
     assert np.abs(reference.q - posture)[robot.arms["left"].joints].max() < 0.02
 
 
-def test_postures_that_leap_anywhere_at_every_tick_break_no_promise(
-    controller: CartesianController, robot: Robot
-) -> None:
-    controller.reset(robot.home)
-    contract = Contract(controller, robot.home)
-    random = np.random.default_rng(3)
-    goal = {arm: controller.tool_pose(arm) for arm in robot.arms}
-    for _ in range(3000):
-        posture = random.uniform(robot.position_lower, robot.position_upper)
-        contract.check(controller.step(goal, DT, posture), DT)
-    assert contract.uncertified == 0
-
-
 def project(J: Array, v: Array) -> None:
-    factor = np.zeros((len(J), len(J)))
-    factor_of_tools(J, factor)
-    project_to_nullspace(J, factor, np.zeros(len(J)), v)
+    project_to_nullspace(J, np.zeros((len(J), len(J))), np.zeros(len(J)), v)
 
 
 def test_what_is_left_in_the_nullspace_moves_no_tool() -> None:
@@ -92,12 +77,6 @@ def test_what_is_left_in_the_nullspace_moves_no_tool() -> None:
         project(J, v)
         np.testing.assert_allclose(J @ v, 0.0, atol=1e-4)
         np.testing.assert_allclose(v, exact, atol=1e-4)
-
-
-def test_a_tool_without_a_jacobian_leaves_the_posture_as_it_is() -> None:
-    v = np.arange(14.0)
-    project(np.zeros((12, 14)), v)
-    np.testing.assert_array_equal(v, np.arange(14.0))
 
 
 @pytest.mark.parametrize("name", NAMES)
