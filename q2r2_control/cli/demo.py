@@ -24,7 +24,7 @@ from q2r2_control.cli.output import (
 from q2r2_control.config.cell import load_config
 from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.trajectories import trajectory_named
+from q2r2_control.inputs.scripted import trajectory_named
 from q2r2_control.types import CommandMode
 
 _DEFAULT = ["handover", "stack"]

@@ -9,9 +9,9 @@ from rich.console import Console
 
 from q2r2_control.cli.output import DEMO_CONFIG, Json, as_json_text, positive, stderr_console
 from q2r2_control.config.cell import Config, HeadsetConfig, load_config
-from q2r2_control.inputs.addresses import access_lines, written
 from q2r2_control.inputs.headset import HeadsetServer, watch_of
 from q2r2_control.inputs.headset_check import watch_headset
+from q2r2_control.inputs.listener import access_lines, written
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.viewer.headset_table import HeadsetDisplay, headset_table
 

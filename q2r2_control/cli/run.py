@@ -27,8 +27,7 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.scripted import DEFAULT_TRAJECTORY
-from q2r2_control.inputs.trajectories import TRAJECTORIES
+from q2r2_control.inputs.scripted import DEFAULT_TRAJECTORY, TRAJECTORIES
 from q2r2_control.plugins import INPUTS, check_installed
 from q2r2_control.types import CommandMode
 

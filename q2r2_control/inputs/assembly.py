@@ -30,12 +30,6 @@ def minimum_jerk(fraction: float) -> float:
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
-def later(point: WayPoint, delay: float) -> WayPoint:
-    """The same place, ``delay`` [s] later."""
-    t, x, y, z, tilt, turn = point
-    return delay + t, x, y, z, tilt, turn
-
-
 class WayPoints:
     """A motion through ``points``, the times of which have to rise; before the first and after the last it rests."""
 

@@ -7,7 +7,7 @@ from ipaddress import ip_address, ip_network
 
 import pytest
 
-from q2r2_control.inputs.addresses import access_lines, app_settings, written
+from q2r2_control.inputs.listener import access_lines, app_settings, written
 
 
 def test_an_ipv6_address_is_written_in_brackets_before_its_port() -> None:

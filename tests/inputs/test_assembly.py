@@ -9,7 +9,7 @@ import pytest
 from q2r2_control import Robot, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.assembly import HOME, WORKS, WayPoints, minimum_jerk
-from q2r2_control.inputs.trajectories import TRAJECTORIES, trajectory_named
+from q2r2_control.inputs.scripted import TRAJECTORIES, trajectory_named
 from q2r2_control.types import SIDES
 
 

@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.framing import KEEPALIVE, MAX_FRAME_BYTES, FrameDecoder, WireFrame, encode_frame
+from q2r2_control.inputs.messages import KEEPALIVE, MAX_FRAME_BYTES, FrameDecoder, WireFrame, encode_frame
 
 # Written by hand from the protocol: length 4, "/abc", length 3, "xyz".
 ABC = b"\x04\x00\x00\x00/abc\x03\x00\x00\x00xyz"
@@ -32,12 +32,6 @@ def test_a_frame_is_read_and_written_as_by_hand_and_the_server_writes_no_nul() -
 
 def test_only_one_nul_is_taken_off() -> None:
     assert frames(b"\x05\x00\x00\x00abc\x00\x00\x00\x00\x00\x00") == [WireFrame("abc\0", b"", terminated=True)]
-
-
-def test_eight_zero_bytes_are_a_keepalive() -> None:
-    (frame,) = frames(KEEPALIVE)
-    assert frame.is_keepalive
-    assert not frames(ABC)[0].is_keepalive
 
 
 def test_a_stream_split_at_any_byte_gives_the_same_frames() -> None:

@@ -11,9 +11,9 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.inputs import moved_frame
-from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.moved_frame import Move
+from q2r2_control.inputs.samples import HandsWatch, Watched
 from q2r2_control.inputs.session import Reception
 from q2r2_control.types import SIDES, HandFault, HandInputs
 from tests.support.two_hands import PERIOD, TwoHands, carry, hand_pose, rest

@@ -19,9 +19,9 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.base import make_input
 from q2r2_control.inputs.connections import MAX_FRAMES_PER_SECOND
-from q2r2_control.inputs.hands_watch import Watched
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.messages import Dialect, HandPose
+from q2r2_control.inputs.samples import Watched
 from q2r2_control.inputs.session import HeadsetSession
 from q2r2_control.types import HandFault, HapticFeedback
 from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, pack_pose

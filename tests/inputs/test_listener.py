@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 
 from q2r2_control.inputs.listener import MAX_HOSTS_NAMED, HostLog, RateLimit
 
@@ -62,7 +63,7 @@ def test_what_matters_most_is_what_is_kept() -> None:
     log = HostLog(lines)
     for level, text in ((INFO, "connected"), (WARNING, "dropped"), (INFO, "connected")):
         log.write("a", level, text, 10.0)
-    log.close()
+    log.flush(math.inf)
     assert lines.lines == ["INFO connected", "WARNING dropped (1 more left out)"]
 
 
@@ -72,5 +73,5 @@ def test_hosts_do_not_silence_each_other_but_beyond_eight_they_share_a_line() ->
     for index in range(100):
         log.write(f"host {index}", WARNING, f"line {index}", 10.0)
     assert lines.lines == [f"WARNING line {index}" for index in range(MAX_HOSTS_NAMED + 1)]
-    log.close()
+    log.flush(math.inf)
     assert lines.lines[MAX_HOSTS_NAMED + 1 :] == ["WARNING line 99 (90 more left out)"]

@@ -11,8 +11,7 @@ import pytest
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.assembly import WORKS
-from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.inputs.trajectories import TRAJECTORIES
+from q2r2_control.inputs.scripted import TRAJECTORIES, ScriptedInput
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 EVERY = pytest.mark.parametrize("trajectory", list(TRAJECTORIES))

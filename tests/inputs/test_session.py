@@ -8,8 +8,7 @@ import re
 import pytest
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.framing import FrameDecoder, WireFrame
-from q2r2_control.inputs.messages import Dialect
+from q2r2_control.inputs.messages import Dialect, FrameDecoder, WireFrame
 from q2r2_control.inputs.session import (
     MAX_COMMAND_BYTES,
     MAX_INCOMPLETE,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from q2r2_control.supervision.message_watch import DelayWatch
+from q2r2_control.supervision.targets import DelayWatch
 
 ALLOWED, PERIOD, USUAL = 0.15, 0.01, 0.0004  # [s]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from q2r2_control.config.strict import STREAM_TIMEOUT
-from q2r2_control.supervision.message_watch import SequenceWatch
+from q2r2_control.supervision.targets import SequenceWatch
 
 PERIOD = 0.01  # [s]
 

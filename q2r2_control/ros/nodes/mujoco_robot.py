@@ -32,7 +32,7 @@ from q2r2_control.ros.bridge.frames import LinkFrames
 from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
 from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
 from q2r2_control.ros.managed_node import ManagedNode
-from q2r2_control.supervision.message_watch import DelayWatch
+from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import Array, RobotState
 
 _LOG_PERIOD = 1.0  # of lines about refusals [s]

@@ -8,8 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from q2r2_control.inputs.messages import HandTwist, MessageType
-from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.inputs.trajectories import FIRST_PRESS, START, TRAJECTORIES
+from q2r2_control.inputs.scripted import FIRST_PRESS, START, TRAJECTORIES, ScriptedInput
 from q2r2_control.ros.base_node import OK, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
 from q2r2_control.ros.monitoring.node_states import HandListeners

@@ -14,11 +14,11 @@ from q2r2_control.config.strict import Network, network_of
 from q2r2_control.config.teleop import GateSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.inputs.addresses import access_lines, written
-from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import SILENCE
+from q2r2_control.inputs.listener import access_lines, written
 from q2r2_control.inputs.messages import HandPose
+from q2r2_control.inputs.samples import HandsWatch, Watched
 from q2r2_control.ros.base_node import OK, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_haptics
 from q2r2_control.types import SIDES, HandFault
