@@ -1,8 +1,8 @@
 """Arms that another controller moves after our safe targets: tools are led, elbows go where that controller puts them.
 
-The reference keeps the arms apart only as far as the arms are where it is. So its elbows follow the measured ones, held
-tools keep their pose instead of joint positions, and the measured pairs are checked themselves: they may not be closer
-than the reference's may, less a tolerance for the lag of an arm.
+The reference keeps the arms apart only as far as the arms are where it is. For that reason its elbows follow the
+measured ones, held tools keep their pose instead of joint positions, and measured pairs may not be closer than the
+reference's may, less a tolerance for the lag of an arm.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.joint_watch import WatchSettings
 from q2r2_control.supervision.target_stream import StreamSettings, apart
-from q2r2_control.types import Array, Reference, RobotState
+from q2r2_control.types import Reference, RobotState
 
 _REST = 0.01  # a held arm's joints are slower before its tool's pose is taken [rad/s]
 # How fast the reference's elbows follow the measured ones [1/s], [rad/s].
@@ -58,24 +58,18 @@ class ExternalArms:
         self._keys = kept_distances(robot, controller.settings).keys
         self._near_at: dict[str, float] = {}  # when an arm's tool was last seen near [s]
         self._held: dict[str, pin.SE3] = {}
-        self._v: Array = np.zeros_like(robot.home)
 
     def begin(self) -> None:
         """Start anew at rest."""
         self._held.clear()
         self._near_at.clear()
-        self._v = np.zeros_like(self._v)
 
-    def note(self, reference: Reference) -> None:
-        """The reference that came of the last targets."""
-        self._v = reference.v
-
-    def targets(self, wanted: dict[str, pin.SE3 | None]) -> dict[str, pin.SE3 | None]:
-        """The same targets with the tool's own pose for each arm that has none and has come to rest."""
+    def targets(self, wanted: dict[str, pin.SE3 | None], last: Reference | None) -> dict[str, pin.SE3 | None]:
+        """The same targets with the tool's own pose for each arm that has none and rests in the ``last`` reference."""
         for arm, pose in wanted.items():
             if pose is not None:
                 self._held.pop(arm, None)
-            elif arm not in self._held and np.abs(self._v[self._robot.arms[arm].joints]).max() < _REST:
+            elif arm not in self._held and (last is None or np.abs(last.v[self._robot.arms[arm].joints]).max() < _REST):
                 self._held[arm] = self._controller.tool_pose(arm)
         return {arm: self._held.get(arm, pose) for arm, pose in wanted.items()}
 

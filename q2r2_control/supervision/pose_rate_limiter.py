@@ -24,9 +24,9 @@ class PoseRateLimiter:
         s(d) = min(d / dt, a (-dt/2 + sqrt(dt^2/4 + 2 d/a))).
 
     A step of the target faster than the limit is no motion of it; then u = 0. Rotations are limited the same way by
-    the rotation vector from pose to target. Poses are in one frame, whichever. A step that comes late moves the pose no
+    the rotation vector from pose to target. All poses are in one frame. A step that comes late moves the pose no
     farther than the velocity limits allow in one period, see :mod:`tick_pacer`. After a gap of more than 0.1 s it
-    begins from rest: whatever followed it stands at the last pose.
+    begins from rest: the follower stands at the last pose.
     """
 
     def __init__(self, settings: GuardSettings, period: float) -> None:
@@ -41,11 +41,10 @@ class PoseRateLimiter:
     def change(self, settings: GuardSettings) -> None:
         """Other limits from the next step on. A pose that is faster than it may be now brakes at the acceleration."""
         self.settings = settings
-        self._linear.limit(settings.max_velocity, settings.max_acceleration)
-        self._angular.limit(settings.max_angular_velocity, settings.max_angular_acceleration)
+        self._linear.limits = settings.max_velocity, settings.max_acceleration
+        self._angular.limits = settings.max_angular_velocity, settings.max_angular_acceleration
         # A step changes the velocity first and moves by the new one for all of dt: |v| dt + a dt^2, not half of that.
-        velocities = np.array([settings.max_velocity, settings.max_angular_velocity])
-        accelerations = np.array([settings.max_acceleration, settings.max_angular_acceleration])
+        velocities, accelerations = np.array([self._linear.limits, self._angular.limits]).T
         self._pacer = TickPacer(self._period, velocities, 2.0 * accelerations)
 
     @property
@@ -56,8 +55,7 @@ class PoseRateLimiter:
     def reset(self, pose: pin.SE3 | None, now: float) -> None:
         """Rest at ``pose``, or at none, from ``now`` [s] on."""
         self.pose, self._target, self._now = pose, None, now
-        self._linear.stop()
-        self._angular.stop()
+        self._linear.velocity = self._angular.velocity = np.zeros(3)
 
     def step(self, target: pin.SE3 | None, now: float) -> pin.SE3 | None:
         """The pose at ``now`` [s], nearer to ``target``; None or a target that is not finite: brake and hold.
@@ -68,8 +66,7 @@ class PoseRateLimiter:
         if self.pose is None or not gap > 0.0:
             return self.pose
         if gap > LONGEST_DT:  # whatever follows has come to rest meanwhile, or is about to
-            self._linear.stop()
-            self._angular.stop()
+            self._linear.velocity = self._angular.velocity = np.zeros(3)
         dt = gap
         if gap > self._period:
             dt = self._pacer.step(gap, np.array([self._linear.speed, self._angular.speed]))
@@ -77,7 +74,7 @@ class PoseRateLimiter:
         at = self.pose
         if target is None or not np.isfinite(target.homogeneous).all():
             self._target, limited = None, False
-            shift, turn = self._linear.brake(dt), self._angular.brake(dt)
+            shift, turn = (motion.towards(np.zeros(3), dt)[0] for motion in (self._linear, self._angular))
         else:
             last, self._target = self._target or at, target
             # Of a late step only the part that is moved now counts as the target's own motion; the rest is lag.
@@ -97,43 +94,34 @@ class _Limited:
     """Velocity of a position or a rotation that is bounded together with its change."""
 
     def __init__(self) -> None:
-        self.limit(0.0, 0.0)
-        self.stop()
-
-    def limit(self, velocity: float, acceleration: float) -> None:
-        self._max, self._acceleration = velocity, acceleration
+        self.limits = 0.0, 0.0  # of velocity and acceleration
+        self.velocity = np.zeros(3)
 
     @property
     def speed(self) -> float:
-        return math.hypot(*self._velocity)
-
-    def stop(self) -> None:
-        self._velocity = np.zeros(3)
-
-    def brake(self, dt: float) -> Array:
-        """What to move in ``dt`` [s] while coming to rest."""
-        return self._towards(np.zeros(3), dt)[0]
+        return math.hypot(*self.velocity)
 
     def follow(self, lag: Array, way: Array, dt: float) -> tuple[Array, bool]:
         """What to move in ``dt`` [s], and whether that is less than asked for.
 
         ``lag`` is from the pose to the last target, ``way`` from that to this one.
         """
-        own = way / dt
-        if math.hypot(*own) > self._max:
+        own, (fastest, a) = way / dt, self.limits
+        if math.hypot(*own) > fastest:
             lag, own = lag + way, np.zeros(3)
         distance, wanted = math.hypot(*lag), own
         if distance > 0.0:
-            a = self._acceleration
             speed = min(distance / dt, a * (-0.5 * dt + math.sqrt(0.25 * dt * dt + 2.0 * distance / a)))
             wanted = own + (speed / distance) * lag
-        shift, limited = self._towards(wanted, dt)
-        return shift, limited or distance > self._max * dt
+        shift, limited = self.towards(wanted, dt)
+        return shift, limited or distance > fastest * dt
 
-    def _towards(self, wanted: Array, dt: float) -> tuple[Array, bool]:
-        change = _at_most(wanted, self._max) - self._velocity
-        self._velocity = self._velocity + _at_most(change, self._acceleration * dt)
-        return self._velocity * dt, math.dist(self._velocity, wanted) > _REST
+    def towards(self, wanted: Array, dt: float) -> tuple[Array, bool]:
+        """What to move in ``dt`` [s] on the way to a ``wanted`` velocity, and whether that is not reached."""
+        fastest, acceleration = self.limits
+        change = _at_most(wanted, fastest) - self.velocity
+        self.velocity = self.velocity + _at_most(change, acceleration * dt)
+        return self.velocity * dt, math.dist(self.velocity, wanted) > _REST
 
 
 def _at_most(vector: Array, length: float) -> Array:

@@ -6,7 +6,6 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array
 
 
 def preflight_faults(
@@ -15,32 +14,23 @@ def preflight_faults(
     """One line for each reason why ``robot`` should not start at home; empty for a cell that may run.
 
     Looked at are position limits with their margin, every monitored pair against the distance that it keeps, and
-    whether the ``controller`` knows a certified stop at home; without one (None: it moves nothing here) only the first
-    two.
-    The controller is left reset at home.
+    whether the ``controller`` knows a certified stop at home, where it is left reset; None: it moves nothing here.
     """
-    too_close = too_close_at_home(robot, kept_distances(robot, settings))
-    faults = [*_outside_limits(robot, robot.home, settings.position_margin), *too_close]
-    if controller is not None and not too_close:  # a pair that is too close leaves no certificate, and says more
-        faults += _without_certificate(controller)
-    return tuple(faults)
-
-
-def _outside_limits(robot: Robot, home: Array, margin: float) -> list[str]:
-    lower, upper = robot.position_lower + margin, robot.position_upper - margin
-    return [
-        f"home: {name} = {home[index]:g}; allowed: {lower[index]:g} .. {upper[index]:g} rad, position_margin included"
-        for index, name in enumerate(robot.joint_names)
-        if not lower[index] <= home[index] <= upper[index]
+    lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
+    faults = [
+        f"home: {name} = {q:g}; allowed: {least:g} .. {most:g} rad, position_margin included"
+        for name, q, least, most in zip(robot.joint_names, robot.home, lower, upper, strict=True)
+        if not least <= q <= most
     ]
-
-
-def _without_certificate(controller: CartesianController) -> list[str]:
-    home = controller.robot.home
-    controller.reset(home)
-    report = controller.step({}, controller.settings.max_substep).report  # every arm holds
-    controller.reset(home)
-    if report.certified:
-        return []
-    tightest = f"{' | '.join(report.tightest_pair)}, {1e3 * report.margin:.1f} mm farther apart than it has to be"
-    return [f"home: the controller knows no certified stop from here; tightest pair: {tightest}"]
+    too_close = too_close_at_home(robot, kept_distances(robot, settings))
+    faults += too_close
+    if controller is not None and not too_close:  # a pair that is too close leaves no certificate, and says more
+        controller.reset(robot.home)
+        report = controller.step({}, controller.settings.max_substep).report  # every arm holds
+        controller.reset(robot.home)
+        if not report.certified:
+            tightest = (
+                f"{' | '.join(report.tightest_pair)}, {1e3 * report.margin:.1f} mm farther apart than it has to be"
+            )
+            faults.append(f"home: the controller knows no certified stop from here; tightest pair: {tightest}")
+    return tuple(faults)

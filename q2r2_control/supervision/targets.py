@@ -1,4 +1,4 @@
-"""The targets of all arms: who may send them, which stream of them is followed, and when one has ended."""
+"""The targets of all arms: who may send them, which come too late, which stream is followed, and when it has ended."""
 
 from __future__ import annotations
 
@@ -13,23 +13,21 @@ from q2r2_control.supervision.target_stream import Origins, StreamSettings, Targ
 
 # The usual delay may grow this fast: clocks of two hosts drift apart by less, and a frozen sender's delay by far more.
 _DRIFT = 1e-3
-# Messages that are late for as long as this show a clock that was set [s].
-_CLOCK_WAS_SET = 1.0
+_CLOCK_WAS_SET = 1.0  # messages that are late for longer show a clock that was set [s]
 
 
 class DelayWatch:
-    """The delays of one topic's messages. Times are receipt times [s]."""
+    """Finds messages of one topic that tell of the past, and must not move an arm. Times are receipt times [s].
+
+    A sender that is frozen in the middle of sending finishes when it goes on: a target of long ago leaves. A delay is
+    the time of receipt less that of sending, on clocks that may be of two hosts: only its change counts.
+    """
 
     def __init__(self, allowed: float) -> None:
         """``allowed``: how much longer than usual a message may take [s]."""
         self._allowed = allowed
-        self._usual, self._stamp = math.inf, 0.0
-        self._late_since: float | None = None
-
-    @property
-    def usual(self) -> float:
-        """The least delay of the past [s], which clocks that drift apart may change; inf before the first message."""
-        return self._usual
+        self.usual = math.inf  # the least delay of the past, which clocks that drift apart may change [s]
+        self._stamp, self._late_since = 0.0, math.inf
 
     def take(self, delay: float, now: float) -> float:
         """How much too late [s] a message is that came at ``now`` [s] with ``delay`` [s]; 0 if it may be used.
@@ -38,21 +36,19 @@ class DelayWatch:
         """
         if not math.isfinite(delay):
             return 0.0
-        usual = self._usual + _DRIFT * max(now - self._stamp, 0.0)
-        if self._late_since is not None and now - self._late_since > _CLOCK_WAS_SET:
+        usual = self.usual + _DRIFT * max(now - self._stamp, 0.0)
+        if now - self._late_since > _CLOCK_WAS_SET:
             usual = math.inf
         if delay - usual <= self._allowed:
-            self._usual, self._stamp = min(delay, usual), now
-            self._late_since = None
+            self.usual, self._stamp, self._late_since = min(delay, usual), now, math.inf
             return 0.0
-        self._late_since = now if self._late_since is None else self._late_since
+        self._late_since = min(self._late_since, now)
         return delay - usual
 
 
 # No publisher sends faster, and none is delivered later than that: a larger step is another one's [Hz], [s].
 _FASTEST, _LATEST = 2000.0, 0.1
-# Numbers have to go on without a break for this long before a stream counts as one publisher's again [s].
-_ALONE = 1.0
+_ALONE = 1.0  # after the last break a stream counts as one publisher's again [s]
 
 
 class SequenceWatch:
@@ -81,8 +77,8 @@ class TargetStreams:
     """One :class:`TargetStream` an arm. Poses are in the world frame, times are receipt times [s].
 
     Linked arms (:attr:`StreamSettings.linked`) are stopped together: where a stream that is followed ceases, or is
-    dropped because two nodes publish it, no arm follows its stream any more. Each needs a stream that begins anew at
-    its tool. A stream that its sender ends with :meth:`release` stops its own arm only: its operator paused it.
+    dropped because two nodes publish it, every arm needs a stream that begins anew at its tool. A stream that its
+    sender ends with :meth:`release` stops its own arm only: its operator paused it.
     """
 
     def __init__(self, arms: Iterable[str], settings: StreamSettings, origins: Origins) -> None:
@@ -95,13 +91,7 @@ class TargetStreams:
 
     def at(self, now: float) -> dict[str, pin.SE3 | None]:
         """What each arm follows at ``now`` [s], see :class:`TargetExtrapolator`; None: it holds."""
-        lines = self._lines
-        return {arm: None if stream.pose is None else lines[arm].at(now) for arm, stream in self._streams.items()}
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        """Names of all arms."""
-        return tuple(self._streams)
+        return {arm: self._lines[arm].at(now) if self.follows(arm) else None for arm in self._streams}
 
     def follows(self, arm: str) -> bool:
         """Whether an arm follows its targets."""
@@ -110,7 +100,7 @@ class TargetStreams:
     def follows_on(self, arm: str, now: float) -> bool:
         """Whether an arm follows its targets, and a target at ``now`` [s] still belongs to them."""
         self._expire(arm, now)
-        return self._streams[arm].following
+        return self.follows(arm)
 
     def age(self, arm: str, now: float) -> float:
         """Time since the last target of an arm that was a pose [s]."""
@@ -191,7 +181,7 @@ class TargetStreams:
         self._newly_ended.append(reason)
 
     def _other_publishers(self, arm: str, number: int, now: float) -> Reason | None:
-        """Says so where an arm's targets came from more than one publisher lately."""
+        """A reason where an arm's targets came from more than one publisher lately, else None."""
         breaks = self._sequences[arm].take(number, now, self._settings.timeout)
         if breaks == 0:
             return None

@@ -1,17 +1,13 @@
 """A late tick is no jump: by how much time the reference may move in one tick.
 
-A plant takes one command a period, so what a joint may do between two commands is what its velocity limit allows in one
-period, however late the second one comes. A reference that moved on by a gap of 100 ms would ask a plant with a period
-of 4 ms to do in one period what takes up to twenty-five.
+A plant takes one command a period: a joint may do what its velocity limit allows in one period, however late the
+command comes. A tick that is late moves the reference by the time t that passed, but no joint by more than its limit V
+allows in a period h:  |v| t + a t^2 / 2 <= V h  for each joint, with the acceleration limit a, or by one period, which
+no joint's limit forbids. Slow motion catches up at once, and fast motion is stretched in time: the same path, later. A
+command that is clipped joint by joint would leave the path that was certified.
 
-A tick that is late moves the reference by the time t that passed, but no joint by more than its limit V allows in a
-period h:  |v| t + a t^2 / 2 <= V h  for each joint, with the acceleration limit a, or by one period, which no joint's
-limit forbids. So slow motion catches up at once, and fast motion is stretched in time: the same path, later. Time is
-stretched, rather than a command clipped joint by joint, because a clipped command leaves the path that was certified.
-The target is an absolute pose, so nothing of it is lost.
-
-Velocity commands are another matter (``coasts``): a plant that is told a velocity goes on at it while no command comes.
-Then the reference goes on too, by the time that passed, up to 0.1 s; what is commanded stays within the velocity limit.
+A plant that is told a velocity goes on at it while no command comes (``coasts``). Then the reference goes on too, by
+the time that passed, up to 0.1 s; what is commanded stays within the velocity limit.
 """
 
 from __future__ import annotations
@@ -42,20 +38,15 @@ class TickPacer:
 
         Not more than ``gap``; 0 for a clock that did not advance.
         """
-        if not gap > 0.0:
-            return 0.0
-        if gap <= self.period * (1.0 + _ROUNDING):
-            return gap
+        if not gap > self.period * (1.0 + _ROUNDING):
+            return gap if gap > 0.0 else 0.0
         # Half a period late is jitter; from there on a command is missing.
         self.missed_ticks += max(round(gap / self.period) - 1, 0)
-        step = min(gap, LONGEST_DT if self._coasts else max(self.period, self._longest(v)))
+        # The time in which each joint can have used up its way.
+        longest = 2.0 * self._way / (np.abs(v) + np.sqrt(v * v + 2.0 * self._acceleration * self._way))
+        step = min(gap, LONGEST_DT if self._coasts else max(self.period, float(longest.min())))
         self.stretched += gap - step
         return step
-
-    def _longest(self, v: Array) -> float:
-        """The time in which the first joint can have used up its way."""
-        a, speed = self._acceleration, np.abs(v)
-        return float((2.0 * self._way / (speed + np.sqrt(speed * speed + 2.0 * a * self._way))).min())
 
 
 _SHARE = 0.02  # of what the even time is off is made up in a tick
