@@ -30,7 +30,7 @@ from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
-from q2r2_control.supervision.preflight import preflight_faults
+from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.live import LiveTable
 

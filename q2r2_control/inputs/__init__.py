@@ -2,6 +2,6 @@
 
 ``scripted`` plays hand motions, those that pick things up from ``assembly``; ``played`` makes samples of them.
 ``headset`` is the TCP server for the Quest2ROS app: ``messages`` and ``session`` are its protocol without sockets,
-``admission`` says who may drive, ``listener`` takes connections in, ``connections`` serves them, ``moved_frame`` and
-``samples`` find poses that must not be followed and queue the others, ``headset_check`` tells people what comes.
+``listener`` takes connections in and says who may drive, ``connections`` serves them, ``moved_frame`` and ``samples``
+find poses that must not be followed and queue the others, ``headset_check`` tells people what comes.
 """

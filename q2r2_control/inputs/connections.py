@@ -12,8 +12,16 @@ from functools import partial
 
 from q2r2_control.config.strict import Network
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.admission import Admission, Peer, decide, is_allowed
-from q2r2_control.inputs.listener import MAX_HOSTS_NAMED, HostLog, RateLimit, TcpListener
+from q2r2_control.inputs.listener import (
+    MAX_HOSTS_NAMED,
+    Admission,
+    HostLog,
+    Peer,
+    RateLimit,
+    TcpListener,
+    decide,
+    is_allowed,
+)
 from q2r2_control.inputs.messages import KEEPALIVE, FrameDecoder, HandPose, WireFrame
 from q2r2_control.inputs.samples import HandTracker
 from q2r2_control.inputs.session import HeadsetSession, Reception, TopicRecorder, log_frame
@@ -67,7 +75,7 @@ class Handlers:
 
 
 class Connections:
-    """Serves the driver, and newcomers until :func:`~q2r2_control.inputs.admission.decide` has decided on them."""
+    """Serves the driver, and newcomers until :func:`~q2r2_control.inputs.listener.decide` has decided on them."""
 
     def __init__(
         self,
@@ -130,7 +138,7 @@ class Connections:
 
     def _watch_door(self, now: float) -> None:
         """Connections beyond the rate wait in the kernel, which costs this process nothing."""
-        watched = self._door.is_open(now)
+        watched = self._door.accepts.is_open(now)
         if watched and not self._door_watched:
             self._selector.register(self._door, selectors.EVENT_READ, self._accept)
         elif self._door_watched and not watched:

@@ -33,9 +33,9 @@ class HeadsetServer:
 
     Samples are stamped with ``clock`` when their bytes are received. The loop's thread never waits for the network
     or for decoding. A client that breaks the protocol, floods, or is silent for 2 s is dropped with one logged line.
-    ``allow`` names the networks whose hosts may connect, None all of them; :mod:`~q2r2_control.inputs.admission` says
-    who of those drives. ``watch`` finds poses that must not be followed. A ``listener`` gets each message at once, in
-    the receiving thread; then :meth:`poll` returns nothing.
+    ``allow`` names the networks whose hosts may connect, None all of them; :func:`~q2r2_control.inputs.listener.decide`
+    says who of those drives. ``watch`` finds poses that must not be followed. A ``listener`` gets each message at once,
+    in the receiving thread; then :meth:`poll` returns nothing.
     """
 
     controls = QUEST_CONTROLS
@@ -49,7 +49,8 @@ class HeadsetServer:
         allow: Sequence[Network] | None = None,
         watch: HandsWatch | None = None,
     ) -> None:
-        self._address, self._allow, self._clock, self._tell = (host, port), allow, clock, listener
+        self.address = host, port  # after ``start`` the port that was bound
+        self._allow, self._clock, self._tell = allow, clock, listener
         self._watch = watch or HandsWatch()
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
@@ -71,25 +72,20 @@ class HeadsetServer:
     def start(self) -> None:
         """Listen. Raises :class:`InputError` when host and port cannot be bound, or when already started."""
         if self._thread is not None:
-            raise InputError(f"headset: already listening on {written(*self._address)}")
+            raise InputError(f"headset: already listening on {written(*self.address)}")
         warm_up()
-        host, port = self._address
+        host, port = self.address
         log = HostLog(_LOG)
         try:
             door = TcpListener(host, port, log)
         except (OSError, OverflowError, ValueError) as error:
             raise InputError(f"headset: cannot listen on {written(host, port)}: {error}") from error
-        self._address = (host, door.port)
+        self.address = (host, door.port)
         handlers = Handlers(admitted=self._admit, lost=self._lose, receive=self._receive, due=self._take_owed)
         self._connections = Connections(door, self._allow, self._clock, handlers, log)
         self._stop.clear()
         self._thread = threading.Thread(target=self._run, args=(self._connections,), name="headset", daemon=True)
         self._thread.start()
-
-    @property
-    def address(self) -> tuple[str, int]:
-        """Host and port; after ``start`` the port that was bound."""
-        return self._address
 
     @property
     def connected(self) -> bool:
@@ -118,7 +114,7 @@ class HeadsetServer:
             client, last = self._client, self._last_client
             session = last.session if last else None
             return HeadsetStatistics(
-                address=self._address,
+                address=self.address,
                 peer=client.peer if client else None,
                 dialect=session.dialect if session else None,
                 topics={name: recorder.snapshot(now) for name, recorder in last.recorders.items()} if last else {},

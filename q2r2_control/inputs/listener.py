@@ -1,4 +1,4 @@
-"""The listening socket, which takes connections in at a bounded rate; its log; and addresses for people."""
+"""The door: connections come in at a bounded rate, one client drives, and people are told addresses. No clocks."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import logging
 import math
 import socket
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import Enum
 from ipaddress import ip_address
 
 from q2r2_control.config.strict import Network
@@ -108,7 +109,7 @@ class TcpListener:
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])  # that was bound
         self._log = log
-        self._accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)
+        self.accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)  # while it is not open, there is no use in waiting
         self._answers: dict[str, RateLimit] = {}
         self._answers_since = -math.inf
 
@@ -116,16 +117,12 @@ class TcpListener:
         """For a selector."""
         return self._socket.fileno()
 
-    def is_open(self, now: float) -> bool:
-        """Whether there is any use in waiting for connections at ``now`` [s]."""
-        return self._accepts.is_open(now)
-
     def arrivals(self, now: float) -> Iterator[tuple[socket.socket, str, str]]:
         """Connections that wait, as many as the rate allows: a socket that does not block, host, and host with port.
 
         An IPv4 address that came in through IPv6 is written as IPv4.
         """
-        while self._accepts.take(now):
+        while self.accepts.take(now):
             try:
                 connection, address = self._socket.accept()
             except BlockingIOError:
@@ -189,3 +186,58 @@ def _reachable(host: str) -> str:
         except OSError:
             continue
     return "of this machine (it has no network now)"
+
+
+# Of all clients one drives. What decides, in this order:
+#  1. A host outside ``headset.allow`` is not served.
+#  2. The place belongs to who sends hand poses. A driver without one for POSES_ALLOWED, keepalives or not, gives way to
+#     the first other client that sends one.
+#  3. A peer that comes back takes its own place: a connection from the driver's address that registers what the driver
+#     registered, while no frame has come from the driver for QUIET_ALLOWED: 37 periods of the app's poses, and three
+#     times as long as what pauses the arms. After a silently lost link the old connection looks alive for seconds.
+#  4. Everybody else is refused while somebody drives.
+QUIET_ALLOWED = 0.5  # without a frame, against the same peer on a new connection [s]
+POSES_ALLOWED = 5.0  # without a hand pose, against a client that sends them [s]
+WAIT_ALLOWED = 2.0  # for a newcomer to show what gives it the place [s]
+
+
+@dataclass
+class Peer:
+    """What is known of a connected client."""
+
+    peer: str  # address and port, for people
+    host: str  # address
+    since: float  # when it connected [s]
+    last_frame: float  # when its last whole frame was received [s]
+    last_pose: float = -math.inf  # when its last hand pose was received [s]
+    registrations: Sequence[Mapping[str, str]] = ({}, {})  # topics that it publishes, and that it listens to
+
+
+class Admission(Enum):
+    """What becomes of a newcomer."""
+
+    ADMIT = "admit"  # drives from now on, instead of the driver if there is one
+    WAIT = "wait"  # may stay, unheard, until more is known
+    REFUSE = "refuse"
+
+
+def decide(driver: Peer | None, newcomer: Peer, now: float) -> tuple[Admission, str]:
+    """What becomes of ``newcomer`` at ``now`` [s] by rules 2 to 4, and why it, or the ``driver``, gets no place."""
+    if driver is None:
+        return Admission.ADMIT, ""
+    if now - driver.last_pose > POSES_ALLOWED:
+        if newcomer.last_pose > -math.inf:
+            return Admission.ADMIT, f"no hand pose for {POSES_ALLOWED:g} s, and {newcomer.peer} sends them"
+    elif newcomer.host == driver.host and now - driver.last_frame > QUIET_ALLOWED:
+        if any(newcomer.registrations) and newcomer.registrations == driver.registrations:
+            return Admission.ADMIT, f"no frame for {QUIET_ALLOWED:g} s, and it came back as {newcomer.peer}"
+    else:
+        return Admission.REFUSE, f"{driver.peer} drives"
+    if now - newcomer.since > WAIT_ALLOWED:
+        return Admission.REFUSE, f"{driver.peer} is connected"
+    return Admission.WAIT, ""
+
+
+def is_allowed(host: str, networks: Sequence[Network] | None) -> bool:
+    """Whether the address ``host`` lies in one of ``networks``; None admits all (rule 1)."""
+    return networks is None or any(ip_address(host) in network for network in networks)

@@ -98,7 +98,13 @@ class HeadsetSession:
         """Take one frame; the hand's message if it was one. Raises :class:`ProtocolError`: drop the client."""
         if not frame.destination and not frame.payload:
             return None  # a keepalive
-        self._agree_on_dialect(frame)
+        dialect = Dialect.ROS2 if frame.terminated else Dialect.ROS1
+        if dialect is not (self.dialect or dialect):
+            raise ProtocolError(
+                f"destination {frame.destination!r:.60} ends {'with' if frame.terminated else 'without'} NUL, which "
+                f"is the {dialect} dialect; earlier ones were {self.dialect}"
+            )
+        self.dialect = dialect
         if self._skip_body:
             self._skip_body = False
             return None
@@ -111,7 +117,7 @@ class HeadsetSession:
                     raise ProtocolError(f"more than {MAX_INCOMPLETE} registrations without topic or type") from error
                 self._answer("__error", {"text": str(error)})
             return None
-        return self._data(frame)
+        return self._data(frame, dialect)
 
     def queue_haptic(self, vibration: HapticFeedback) -> None:
         """Send a vibration, if the client listens; otherwise nothing happens."""
@@ -119,31 +125,20 @@ class HeadsetSession:
         if destination is not None and self.dialect is not None:
             self.outgoing += encode_frame(destination, encode(vibration, self.dialect))
 
-    def _agree_on_dialect(self, frame: WireFrame) -> None:
-        dialect = Dialect.ROS2 if frame.terminated else Dialect.ROS1
-        if self.dialect is None:
-            self.dialect = dialect
-        elif dialect is not self.dialect:
-            raise ProtocolError(
-                f"destination {frame.destination!r:.60} ends {'with' if frame.terminated else 'without'} NUL, which "
-                f"is the {dialect} dialect; earlier ones were {self.dialect}"
-            )
-
-    def _data(self, frame: WireFrame) -> Reception | None:
-        assert self.dialect is not None  # set by _agree_on_dialect
+    def _data(self, frame: WireFrame, dialect: Dialect) -> Reception | None:
         name = _topic_name(frame.destination)
         topic = HAND_TOPICS.get(name)
         if topic is None:
             if name in self.unknown_topics or len(self.unknown_topics) < MAX_TOPICS:
                 self.unknown_topics[name] += 1
             return None
-        if fits(topic.kind, frame.payload, self.dialect.other):
+        if fits(topic.kind, frame.payload, dialect.other):
             raise ProtocolError(
-                f"{name}: {len(frame.payload)} bytes are a message of the {self.dialect.other} dialect, "
-                f"but the destination is written as in {self.dialect}"
+                f"{name}: {len(frame.payload)} bytes are a message of the {dialect.other} dialect, "
+                f"but the destination is written as in {dialect}"
             )
         try:
-            return Reception(name, topic.hand, decode(topic.kind, frame.payload, self.dialect))
+            return Reception(name, topic.hand, decode(topic.kind, frame.payload, dialect))
         except ProtocolError as error:
             raise ProtocolError(f"{name}: {error}") from error
 

@@ -61,8 +61,8 @@ class SequenceWatch:
     def take(self, number: int, now: float, timeout: float) -> int:
         """Look at a message's number; returns the number of recent breaks, 0 for a single publisher.
 
-        Within a stream numbers rise. After a silence of ``timeout`` they may begin anywhere: a publisher that was
-        restarted counts from one. One break is a publisher that replaced another, two are two that take turns.
+        After a silence of ``timeout`` numbers may begin anywhere: a publisher that was restarted counts from one. One
+        break is a publisher that replaced another, two are two that take turns.
         """
         passed = now - self._stamp
         if passed <= timeout and not 0 < number - self._number <= 1 + _FASTEST * (passed + _LATEST):
@@ -118,15 +118,16 @@ class TargetStreams:
     ) -> Reason | None:
         """Offer a target, None for one that was no pose; returns why it is not followed, or None.
 
-        ``tools``: see :meth:`TargetStream.offer`; ``number``: of the message at its publisher, None where that is not
-        known; ``forbidden``: why no arm may follow targets now, or None; ``due``: see :meth:`TargetExtrapolator.put`.
+        ``tools``: see :meth:`TargetStream.offer`; ``number``: of the message at its publisher, where known;
+        ``forbidden``: why no arm may follow targets now; ``due``: see :meth:`TargetExtrapolator.put`.
         """
         stream = self._streams[arm]
-        others = None if number is None else self._other_publishers(arm, number, now)
+        breaks = 0 if number is None else self._sequences[arm].take(number, now, self._settings.timeout)
         if not stream.following:
             self._lines[arm].reset()
         refusal = None if pose is None else stream.offer(pose, tools, now)
-        if others is not None:
+        if breaks:
+            others = self._reason(ReasonKind.PUBLISHER_CHANGED if breaks == 1 else ReasonKind.TWO_PUBLISHERS, arm)
             if stream.following:
                 self._hold_linked(arm, others)
             stream.drop()
@@ -179,13 +180,6 @@ class TargetStreams:
     def _record_end(self, arm: str, reason: Reason) -> None:
         self.ended[arm] = reason
         self._newly_ended.append(reason)
-
-    def _other_publishers(self, arm: str, number: int, now: float) -> Reason | None:
-        """A reason where an arm's targets came from more than one publisher lately, else None."""
-        breaks = self._sequences[arm].take(number, now, self._settings.timeout)
-        if breaks == 0:
-            return None
-        return self._reason(ReasonKind.PUBLISHER_CHANGED if breaks == 1 else ReasonKind.TWO_PUBLISHERS, arm)
 
     def _reason(self, kind: ReasonKind, arm: str) -> Reason:
         return Reason.of(kind, arm=arm, source=self._origins.targets(arm))

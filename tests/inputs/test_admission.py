@@ -9,7 +9,8 @@ from ipaddress import ip_network
 import pytest
 
 from q2r2_control.config.strict import STREAM_TIMEOUT
-from q2r2_control.inputs.admission import (
+from q2r2_control.inputs.connections import SILENCE_ALLOWED
+from q2r2_control.inputs.listener import (
     POSES_ALLOWED,
     QUIET_ALLOWED,
     WAIT_ALLOWED,
@@ -18,7 +19,6 @@ from q2r2_control.inputs.admission import (
     decide,
     is_allowed,
 )
-from q2r2_control.inputs.connections import SILENCE_ALLOWED
 
 NOW = 100.0
 REGISTERED = ({"q2r_left_hand_pose": "geometry_msgs/PoseStamped"}, {"q2r_left_hand_haptic_feedback": "/q2r"})
@@ -60,10 +60,10 @@ POSING = replace(STRANGER, last_pose=NOW)
 def test_the_place_belongs_to_who_sends_poses_and_a_peer_that_comes_back_takes_its_own(
     driver: Peer | None, newcomer: Peer, verdict: Admission
 ) -> None:
-    decision = decide(driver, newcomer, NOW)
-    assert decision.verdict is verdict
+    decided, reason = decide(driver, newcomer, NOW)
+    assert decided is verdict
     if driver is not None and verdict is not Admission.WAIT:
-        assert (newcomer.peer if verdict is Admission.ADMIT else driver.peer) in decision.reason
+        assert (newcomer.peer if verdict is Admission.ADMIT else driver.peer) in reason
 
 
 def test_a_driver_that_gives_way_as_quiet_moves_no_arm_any_more() -> None:

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
-from q2r2_control.supervision.tick_pacer import TickPacer
+from q2r2_control.supervision.tick_pacer import PoseRateLimiter, TickPacer
 from q2r2_control.types import LONGEST_DT
 from tests.teleop.hands import pose
 

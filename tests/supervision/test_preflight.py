@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot
-from q2r2_control.supervision.preflight import preflight_faults
+from q2r2_control.supervision.homing import preflight_faults
 
 SETTINGS = ControllerSettings()
 
