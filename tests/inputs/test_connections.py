@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.config.strict import Network
 from q2r2_control.inputs import connections
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.session import HeadsetSession
@@ -25,6 +24,7 @@ from tests.support.headset_server import (
     eventually,
     next_topic,
     registered,
+    running,
     warnings,
 )
 
@@ -62,9 +62,6 @@ def assert_ended(headset: FakeHeadset, because: bytes) -> None:
 
 def drives(server: HeadsetServer, headset: FakeHeadset) -> bool:
     return server.statistics.peer == "{}:{}".format(*headset.socket.getsockname())
-
-
-# A second headset ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("source", [HERE, ELSEWHERE])
@@ -115,9 +112,6 @@ def test_a_quiet_headset_that_is_heard_again_keeps_its_place(server: HeadsetServ
         move(first, server)
 
 
-# The place belongs to who sends poses --------------------------------------------------------------------------------
-
-
 def test_a_peer_that_only_keeps_alive_gives_way_to_a_headset_that_sends_poses(
     server: HeadsetServer, clock: HandClock
 ) -> None:
@@ -158,9 +152,6 @@ def test_at_most_four_hosts_wait_each_with_its_newest_connection(server: Headset
         eventually(lambda: drives(server, waiting[-1]))
     for headset in waiting:
         headset.close()
-
-
-# What newcomers cannot do --------------------------------------------------------------------------------------------
 
 
 def test_what_a_waiting_newcomer_sends_reaches_nobody_and_its_faults_cost_only_itself(
@@ -208,9 +199,6 @@ def test_a_server_that_stood_still_does_not_take_a_live_headset_for_silent(
         assert server.statistics.last_disconnect is None
 
 
-# Floods --------------------------------------------------------------------------------------------------------------
-
-
 def test_a_flood_of_connections_is_taken_at_a_bounded_rate_and_another_host_is_served_behind_it(
     server: HeadsetServer, clock: HandClock
 ) -> None:
@@ -251,21 +239,9 @@ def test_only_the_first_eight_hosts_that_are_refused_are_named(
         assert len(warnings(caplog)) == 8  # before the first one leaves, which may be a line too
 
 
-# Who may connect -----------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def listening(clock: HandClock, host: str, allow: tuple[Network, ...] | None = None) -> Iterator[HeadsetServer]:
-    server = HeadsetServer(host, 0, clock=clock, allow=allow)
-    server.start()
-    try:
-        yield server
-    finally:
-        server.close()
-
-
 def test_only_hosts_of_allowed_networks_are_served(clock: HandClock, caplog: pytest.LogCaptureFixture) -> None:
-    with listening(clock, HERE, (ip_network("127.0.0.2"), ip_network("10.0.0.0/8"))) as server:
+    allow = ip_network("127.0.0.2"), ip_network("10.0.0.0/8")
+    with running(HeadsetServer(HERE, 0, clock=clock, allow=allow)) as server:
         for _ in range(3):
             with FakeHeadset(server.address) as headset:
                 headset.send(headset.registrations())
@@ -277,20 +253,14 @@ def test_only_hosts_of_allowed_networks_are_served(clock: HandClock, caplog: pyt
     assert "127.0.0.1 is not in headset.allow" in line
 
 
-needs_ipv6 = pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
-
-
-@needs_ipv6
+@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
 def test_an_ipv4_network_is_allowed_through_ipv6_too(clock: HandClock) -> None:
-    with listening(clock, "::", (ip_network("127.0.0.0/8"),)) as server:
+    with running(HeadsetServer("::", 0, clock=clock, allow=(ip_network("127.0.0.0/8"),))) as server:
         with FakeHeadset(("::1", server.address[1])) as headset:
             assert_refused(headset, b"::1 is not in headset.allow")
         with FakeHeadset((HERE, server.address[1])) as headset:
             headset.read_until("__handshake")
             eventually(lambda: drives(server, headset))
-
-
-# Sending -------------------------------------------------------------------------------------------------------------
 
 
 def test_a_headset_that_reads_again_is_sent_the_rest_at_once(
