@@ -45,9 +45,6 @@ HAPTIC = "q2r_left_hand_haptic_feedback"
 every_dialect = pytest.mark.parametrize("dialect", DIALECTS)
 
 
-# What the app relies on ----------------------------------------------------------------------------------------------
-
-
 @every_dialect
 @pytest.mark.parametrize("slash", [False, True], ids=["bare names", "leading slash"])
 def test_a_headset_is_greeted_answered_and_its_hands_arrive(server: HeadsetServer, dialect: str, slash: bool) -> None:
@@ -93,9 +90,6 @@ def test_after_a_second_without_words_the_server_sends_a_keepalive_and_all_witho
         assert headset.socket.recv(100) == KEEPALIVE
 
 
-# Haptics -------------------------------------------------------------------------------------------------------------
-
-
 @every_dialect
 def test_haptics_arrive_as_two_floats_clipped_to_their_range(server: HeadsetServer, dialect: str) -> None:
     with registered(server, dialect) as headset:
@@ -106,6 +100,8 @@ def test_haptics_arrive_as_two_floats_clipped_to_their_range(server: HeadsetServ
         for value in (math.nan, -math.inf):  # is not sent
             server.send_haptic(HapticFeedback("left", value, 1.0))
             server.send_haptic(HapticFeedback("left", 1.0, value))
+        server.send_haptic(HapticFeedback("right", 1.0, 1.0))
+        assert next_topic(headset) == "q2r_right_hand_haptic_feedback"
         server.send_haptic(HapticFeedback("left", frequency=-1.0, amplitude=0.25))
         assert struct.unpack("<2f", headset.read_until(HAPTIC)[-8:]) == (0.0, 0.25)
 
@@ -147,9 +143,6 @@ def test_a_headset_that_does_not_read_is_owed_only_the_newest_vibration_and_the_
         assert next_topic(second) == "q2r_right_hand_haptic_feedback"
 
 
-# A listener ----------------------------------------------------------------------------------------------------------
-
-
 def test_a_listener_gets_every_message_in_order_and_poll_none(clock: HandClock) -> None:
     heard: list[Watched] = []
     with running(HeadsetServer(port=0, clock=clock, listener=heard.append)) as server, connect(server) as headset:
@@ -163,9 +156,6 @@ def test_a_listener_gets_every_message_in_order_and_poll_none(clock: HandClock) 
         poses = [watched.reception.message for watched in heard[::3]]
         assert [pose.position[0] for pose in poses if isinstance(pose, HandPose)] == list(range(100))
         assert server.poll(0.0) == []
-
-
-# Poses that must not be followed -------------------------------------------------------------------------------------
 
 
 def test_a_frozen_pose_arrives_with_its_fault_and_a_new_connection_begins_anew(
@@ -196,9 +186,6 @@ def test_a_cells_settings_reach_the_server() -> None:
         assert faults(server, headset, 2, lambda: time.sleep(0.15)) == [None, HandFault.FROZEN]
 
 
-# Lost connections ----------------------------------------------------------------------------------------------------
-
-
 def test_a_dead_headset_is_dropped_after_two_seconds_of_silence_and_locks_nobody_out(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -226,8 +213,6 @@ def test_nothing_of_a_lost_connection_reaches_the_next(server: HeadsetServer) ->
         assert sample.inputs_stamp == float("-inf")
         assert server.statistics.subscribed == ()
 
-
-# Faults --------------------------------------------------------------------------------------------------------------
 
 # What framing and sessions refuse is tested there; these are one of each kind.
 FAULTS: dict[str, tuple[Callable[[FakeHeadset], bytes], str]] = {
@@ -348,9 +333,6 @@ def test_random_and_mutated_streams_never_stop_the_server(server: HeadsetServer,
     assert threading.active_count() <= threads
 
 
-# Opening, closing, looking -------------------------------------------------------------------------------------------
-
-
 def test_an_address_that_cannot_be_bound_is_said_in_one_line_and_the_default_is_this_machine(
     server: HeadsetServer,
 ) -> None:
@@ -378,8 +360,7 @@ def test_closing_frees_port_and_thread_and_may_come_twice(server: HeadsetServer)
 def test_statistics_show_peer_dialect_counts_rates_ages_and_last_values(
     server: HeadsetServer, clock: HandClock
 ) -> None:
-    assert server.statistics.peer is None
-    assert server.statistics.topics == {}
+    assert (server.statistics.peer, server.statistics.topics) == (None, {})
     with connect(server, "ros1") as headset:
         headset.send(headset.registrations() + headset.frame("q2r_head_pose", b"?"))
         for index in range(90):
@@ -390,12 +371,10 @@ def test_statistics_show_peer_dialect_counts_rates_ages_and_last_values(
         statistics = server.statistics
         assert statistics.peer == "{}:{}".format(*headset.socket.getsockname())
     pose = statistics.topics["q2r_left_hand_pose"]
-    assert statistics.dialect is Dialect.ROS1
-    assert pose.count == 90
+    assert isinstance(pose.last, HandPose)
+    assert (statistics.dialect, pose.count, pose.last.position[0]) == (Dialect.ROS1, 90, 89.0)
     assert pose.rate == pytest.approx(60.0, abs=1.0)  # nothing came in the last 0.2 s of the second
     assert pose.age == pytest.approx(0.2)
-    assert isinstance(pose.last, HandPose)
-    assert pose.last.position[0] == 89.0
     assert statistics.unknown_topics == {"q2r_head_pose": 1}
     assert set(statistics.subscribed) == {HAPTIC, "q2r_right_hand_haptic_feedback"}
     assert "q2r_left_hand_twist" in statistics.published

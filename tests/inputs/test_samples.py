@@ -197,9 +197,6 @@ def test_a_frame_that_turns_with_the_head_is_a_fault_of_both_hands() -> None:
     assert faults(handed_on(coupled, HandsWatch(frame=False))) == set()
 
 
-# Human hands ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("tremor", [True, False], ids=["trembling", "without tremor"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_human_hands_that_carry_a_light_box_are_no_frame_with_a_margin_of_two(

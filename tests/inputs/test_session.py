@@ -66,18 +66,15 @@ def test_the_first_message_is_the_handshake_with_a_version_that_the_app_accepts(
 
 
 @every_dialect
-@pytest.mark.parametrize("suffix", ["pose", "twist", "inputs"])
-def test_a_payload_of_the_wrong_dialect_ends_the_session(
-    session: HeadsetSession, dialect: Dialect, suffix: str
-) -> None:
+def test_a_payload_of_the_wrong_dialect_ends_the_session(session: HeadsetSession, dialect: Dialect) -> None:
     other = dialect.other.lower()
-    wrong = {
-        "pose": pack_pose(other, POSITION, IDENTITY),
-        "twist": pack_twist(other, POSITION, POSITION),
-        "inputs": pack_inputs(other, True, False, (0.0,) * 4),
-    }[suffix]
-    with pytest.raises(ProtocolError, match="dialect"):
-        session.receive(frame(dialect, f"q2r_left_hand_{suffix}", wrong))
+    for suffix, wrong in (
+        ("pose", pack_pose(other, POSITION, IDENTITY)),
+        ("twist", pack_twist(other, POSITION, POSITION)),
+        ("inputs", pack_inputs(other, True, False, (0.0,) * 4)),
+    ):
+        with pytest.raises(ProtocolError, match="dialect"):
+            session.receive(frame(dialect, f"q2r_left_hand_{suffix}", wrong))
 
 
 @every_dialect
@@ -226,9 +223,7 @@ def test_answers_to_a_client_that_never_reads_are_bounded(session: HeadsetSessio
 
 
 @every_dialect
-def test_haptics_go_to_the_subscribed_spelling_in_the_clients_dialect(
-    session: HeadsetSession, dialect: Dialect
-) -> None:
+def test_haptics_go_to_the_subscribed_spelling_in_the_dialect(session: HeadsetSession, dialect: Dialect) -> None:
     session.receive(command(dialect, "__subscribe", topic="/" + HAPTIC, message_name="a/B"))
     session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
     header = b"\0\1\0\0" if dialect is Dialect.ROS2 else b""
