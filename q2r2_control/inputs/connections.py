@@ -15,7 +15,6 @@ from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.listener import (
     MAX_HOSTS_NAMED,
     Admission,
-    HostLog,
     Peer,
     RateLimit,
     TcpListener,
@@ -38,8 +37,6 @@ _LOG = logging.getLogger("q2r2_control.inputs.headset")
 
 
 class Client(Peer):
-    """A connected client."""
-
     def __init__(self, connection: socket.socket, host: str, peer: str, now: float) -> None:
         self.session = HeadsetSession()
         registrations = self.session.published, self.session.subscribed
@@ -78,14 +75,9 @@ class Connections:
     """Serves the driver, and newcomers until :func:`~q2r2_control.inputs.listener.decide` has decided on them."""
 
     def __init__(
-        self,
-        door: TcpListener,
-        allow: Sequence[Network] | None,
-        clock: Callable[[], float],
-        handlers: Handlers,
-        log: HostLog,
+        self, door: TcpListener, allow: Sequence[Network] | None, clock: Callable[[], float], handlers: Handlers
     ) -> None:
-        self._door, self._allow, self._clock, self._handlers, self._log = door, allow, clock, handlers, log
+        self._door, self._allow, self._clock, self._handlers, self._log = door, allow, clock, handlers, door.log
         self._driver: Client | None = None
         self._waiting: list[Client] = []  # in the order of their arrival
         self._unwelcome: set[str] = set()  # hosts outside ``allow`` that the log has named
@@ -125,7 +117,6 @@ class Connections:
         self._last_fault = repr(error)
 
     def end_all(self, reason: str) -> None:
-        """Close every connection."""
         for client in (*self._waiting, *filter(None, (self._driver,))):
             self._end(client, reason)
 
@@ -219,7 +210,6 @@ class Connections:
                 self._write(client, logging.INFO, f"connected, dialect {client.session.dialect}")
 
     def _send(self, client: Client, now: float) -> None:
-        """Send what is due."""
         outgoing = client.session.outgoing
         if not outgoing and client is self._driver:
             # Encoded only now, so that a client that does not read gets the newest vibration and not all of them.

@@ -65,7 +65,6 @@ class HeadsetServer:
 
     @classmethod
     def from_config(cls, config: Config) -> HeadsetServer:
-        """As the cell's block ``headset`` says."""
         headset = config.headset
         return cls(headset.host, headset.port, allow=headset.networks, watch=watch_of(config))
 
@@ -75,14 +74,13 @@ class HeadsetServer:
             raise InputError(f"headset: already listening on {written(*self.address)}")
         warm_up()
         host, port = self.address
-        log = HostLog(_LOG)
         try:
-            door = TcpListener(host, port, log)
+            door = TcpListener(host, port, HostLog(_LOG))
         except (OSError, OverflowError, ValueError) as error:
             raise InputError(f"headset: cannot listen on {written(host, port)}: {error}") from error
         self.address = (host, door.port)
         handlers = Handlers(admitted=self._admit, lost=self._lose, receive=self._receive, due=self._take_owed)
-        self._connections = Connections(door, self._allow, self._clock, handlers, log)
+        self._connections = Connections(door, self._allow, self._clock, handlers)
         self._stop.clear()
         self._thread = threading.Thread(target=self._run, args=(self._connections,), name="headset", daemon=True)
         self._thread.start()

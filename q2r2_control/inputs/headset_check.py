@@ -58,8 +58,6 @@ class HandMovement:
 
 @dataclass(frozen=True, slots=True)
 class HeadsetCheck:
-    """The state of the connection at one time."""
-
     statistics: HeadsetStatistics
     directions: dict[str, str]  # hand -> where it moves
     positions: dict[str, Array | None]  # hand -> world position [m]
@@ -68,7 +66,6 @@ class HeadsetCheck:
     advice: tuple[str, ...]  # lines; empty while all comes that a run needs
 
     def as_json(self) -> dict[str, Any]:
-        """Data for the JSON writer."""
         return {
             **asdict(self.statistics),
             "topics": {

@@ -33,7 +33,6 @@ class RateLimit:
         return self._taken < self._count or now - self._start >= self._period
 
     def take(self, now: float) -> bool:
-        """Count one more, if it is allowed."""
         if now - self._start >= self._period:
             self._start, self._taken = now, 0
         if self._taken >= self._count:
@@ -108,13 +107,12 @@ class TcpListener:
         self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # with SO_REUSEADDR
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])  # that was bound
-        self._log = log
+        self.log = log
         self.accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)  # while it is not open, there is no use in waiting
         self._answers: dict[str, RateLimit] = {}
         self._answers_since = -math.inf
 
     def fileno(self) -> int:
-        """For a selector."""
         return self._socket.fileno()
 
     def arrivals(self, now: float) -> Iterator[tuple[socket.socket, str, str]]:
@@ -141,10 +139,9 @@ class TcpListener:
             with connection, suppress(OSError):
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
             refused = f"headset {host} connects more than {ANSWERS_PER_SECOND} times a second: not answered"
-            self._log.write(host, logging.WARNING, refused, now)
+            self.log.write(host, logging.WARNING, refused, now)
 
     def close(self) -> None:
-        """Stop listening."""
         self._socket.close()
 
 
@@ -188,14 +185,8 @@ def _reachable(host: str) -> str:
     return "of this machine (it has no network now)"
 
 
-# Of all clients one drives. What decides, in this order:
-#  1. A host outside ``headset.allow`` is not served.
-#  2. The place belongs to who sends hand poses. A driver without one for POSES_ALLOWED, keepalives or not, gives way to
-#     the first other client that sends one.
-#  3. A peer that comes back takes its own place: a connection from the driver's address that registers what the driver
-#     registered, while no frame has come from the driver for QUIET_ALLOWED: 37 periods of the app's poses, and three
-#     times as long as what pauses the arms. After a silently lost link the old connection looks alive for seconds.
-#  4. Everybody else is refused while somebody drives.
+# Rules 1 to 4 are those of docs/headset.md, "Who drives". A quiet driver gives way only to its own peer, after 37
+# periods of the app's poses, three times as long as what pauses the arms: a silently lost link looks alive for seconds.
 QUIET_ALLOWED = 0.5  # without a frame, against the same peer on a new connection [s]
 POSES_ALLOWED = 5.0  # without a hand pose, against a client that sends them [s]
 WAIT_ALLOWED = 2.0  # for a newcomer to show what gives it the place [s]
@@ -214,8 +205,6 @@ class Peer:
 
 
 class Admission(Enum):
-    """What becomes of a newcomer."""
-
     ADMIT = "admit"  # drives from now on, instead of the driver if there is one
     WAIT = "wait"  # may stay, unheard, until more is known
     REFUSE = "refuse"

@@ -58,8 +58,6 @@ class HandPose:
 
 @dataclass(frozen=True, slots=True)
 class HandTwist:
-    """A hand's velocity as sent."""
-
     linear: Array  # (3,) [m/s]
     angular: Array  # (3,) [rad/s]
 
@@ -176,8 +174,6 @@ KEEPALIVE = bytes(8)  # a frame without destination and payload
 
 
 class WireFrame(NamedTuple):
-    """One decoded frame."""
-
     destination: str
     payload: bytes
     terminated: bool  # whether the destination came with a trailing NUL
@@ -200,7 +196,6 @@ class FrameDecoder:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> None:
-        """Append what the network delivered."""
         self._buffer += data
 
     def next_frame(self) -> WireFrame | None:

@@ -29,8 +29,6 @@ class Move(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where one hand is."""
-
     position: Array  # (3,) [m]
     rotation: Array  # (3, 3)
 
@@ -96,8 +94,6 @@ _CHORD_SEEN = 0.01  # before a pose that they moved, whoever follows it shall ha
 
 
 class PoseVerdict(Enum):
-    """What becomes of a pose."""
-
     FOLLOW = "as it is"
     WAIT = "not before the other hand's next pose has come"
     DROP = "nobody needs to see it: what it means is told soon"
@@ -130,7 +126,6 @@ class MovedFrame:
             self._chords.pop(hand, None)
 
     def receive(self, hand: str, pose: HandPose, now: float) -> PoseVerdict:
-        """Judge a pose."""
         place = Place.of(pose)
         if self._chords or place is None:
             self._ways[hand] = _Way()

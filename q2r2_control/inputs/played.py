@@ -117,15 +117,12 @@ class PlayedInput:
 
     @property
     def connected(self) -> bool:
-        """Between ``start`` and ``close``."""
         return self._connected
 
     def start(self) -> None:
-        """Let polls return samples."""
         self._connected = True
 
     def close(self) -> None:
-        """Let polls return nothing any more."""
         self._connected = False
 
     def send_haptic(self, feedback: HapticFeedback) -> None:

@@ -54,7 +54,6 @@ class SampleQueue:
         return self._takes_owed > 0
 
     def put(self, sample: HandSample) -> None:
-        """Append the newest sample."""
         with self._lock:
             self._samples.append(sample)
 
@@ -79,8 +78,6 @@ FROZEN_TIME = 0.5  # 37 samples of a headset whose noise changes each of them [s
 
 
 class Watched(NamedTuple):
-    """A message to hand on."""
-
     reception: Reception
     stamp: float  # receipt time [s]
     fault: HandFault | None = None  # of a pose

@@ -190,7 +190,6 @@ class ScriptedInput(PlayedInput):
 
     @classmethod
     def from_config(cls, config: Config) -> ScriptedInput:
-        """The default trajectory."""
         return cls(DEFAULT_TRAJECTORY)
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:

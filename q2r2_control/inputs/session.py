@@ -210,8 +210,7 @@ def _topic_name(name: str) -> str:
     return bare
 
 
-RATE_WINDOW = 1.0  # [s]
-_STAMPS_KEPT = 1000  # more than any headset sends in RATE_WINDOW
+_STAMPS_KEPT = 1000  # more than any headset sends in a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,12 +248,11 @@ class TopicRecorder:
         self._count = 0
 
     def record(self, message: HandMessage, now: float) -> None:
-        """A message has come."""
         self._stamps.append(now)
         self._count += 1
         self._last = message
 
     def snapshot(self, now: float) -> TopicStatistics:
         """The figures at ``now`` [s]; only after the first :meth:`record`."""
-        rate = sum(stamp > now - RATE_WINDOW for stamp in self._stamps) / RATE_WINDOW
+        rate = float(sum(stamp > now - 1.0 for stamp in self._stamps))
         return TopicStatistics(self._count, rate, now - self._stamps[-1], self._last)

@@ -173,11 +173,9 @@ class Homing:
 
     @property
     def active(self) -> bool:
-        """Whether the arms are led."""
         return self._way is not None
 
     def begin(self) -> None:
-        """Begin the way home."""
         self.outcome = None
         if self._tools_only:
             self._way = ToolHoming(self._home, self._controller.tool_pose)

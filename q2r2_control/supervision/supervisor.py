@@ -20,9 +20,8 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
-from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.homing import Homing
-from q2r2_control.supervision.joint_watch import JointWatch, WatchSettings
+from q2r2_control.supervision.joint_watch import ExternalArms, JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
 from q2r2_control.types import Reference, RobotState
@@ -36,8 +35,6 @@ Displace = Callable[[dict[str, pin.SE3 | None], RobotState, float], dict[str, pi
 
 
 class Phase(StrEnum):
-    """What the supervisor lets happen."""
-
     INACTIVE = "inactive"  # waits for joint states that are good and at rest
     ACTIVE = "active"
     BRAKING = "braking"
@@ -98,7 +95,6 @@ class Supervisor:
         return "following" if self.follows(arm) else "holding"
 
     def follows(self, arm: str) -> bool:
-        """Whether an arm follows its targets."""
         return self.phase is Phase.ACTIVE and self.targets.follows(arm)
 
     def update_state(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:

@@ -94,7 +94,6 @@ class TargetStreams:
         return {arm: self._lines[arm].at(now) if self.follows(arm) else None for arm in self._streams}
 
     def follows(self, arm: str) -> bool:
-        """Whether an arm follows its targets."""
         return self._streams[arm].following
 
     def follows_on(self, arm: str, now: float) -> bool:

@@ -146,7 +146,7 @@ class PoseRateLimiter:
             share = dt / gap
             lag, way = last.translation - at.translation, target.translation - last.translation
             shift, slow = self._linear.follow(lag + (1.0 - share) * way, share * way, dt)
-            lag, way = _turn(at, last), _turn(last, target)
+            lag, way = pin.log3(last.rotation @ at.rotation.T), pin.log3(target.rotation @ last.rotation.T)
             turn, slow_turn = self._angular.follow(lag + (1.0 - share) * way, share * way, dt)
             limited = slow or slow_turn
         self.clipped += limited
@@ -192,9 +192,3 @@ class _Limited:
 def _at_most(vector: Array, length: float) -> Array:
     norm = math.hypot(*vector)
     return vector if norm <= length else vector * (length / norm)
-
-
-def _turn(start: pin.SE3, end: pin.SE3) -> Array:
-    """The rotation vector from one pose to another, in the axes that both are told in [rad]."""
-    turn: Array = pin.log3(end.rotation @ start.rotation.T)
-    return turn

@@ -13,7 +13,7 @@ from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.cell import Config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.events import ReasonKind
-from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
+from q2r2_control.supervision.joint_watch import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
