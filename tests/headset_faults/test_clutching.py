@@ -43,9 +43,7 @@ def assert_still(run: InStepRun) -> None:
     [("lower", 1.0, 0), ("upper", 0.1, 1)],
     ids=["far, with the second button", "by less than the gates, in the next sample"],
 )
-def test_an_alignment_within_30_ms_moves_no_arm_and_no_gripper_wherever_the_frame_goes(
-    first: str, shift: float, samples: int
-) -> None:
+def test_an_alignment_within_30_ms_moves_no_arm_and_no_gripper(first: str, shift: float, samples: int) -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield 0.2
@@ -64,9 +62,7 @@ def test_an_alignment_within_30_ms_moves_no_arm_and_no_gripper_wherever_the_fram
     [(1.0, ("right",)), (0.1, SIDES)],
     ids=["far, the other arm alone engaged", "by less than the gates, both arms engaged"],
 )
-def test_an_alignment_by_one_hand_moves_no_arm_although_the_arms_are_not_linked(
-    shift: float, engaged: tuple[str, ...]
-) -> None:
+def test_an_alignment_by_one_hand_moves_no_arm_that_is_not_linked(shift: float, engaged: tuple[str, ...]) -> None:
     def script(op: Operator) -> Iterator[float]:
         yield 0.1
         yield from op.press(*engaged)

@@ -41,7 +41,7 @@ def moved(axes: tuple[str, str, str], way: tuple[float, float, float], duration:
         (WORLD, (0.01, 0.0, 0.0), "still"),
     ],
 )
-def test_the_dominant_direction_is_named_in_the_worlds_axes(
+def test_the_dominant_direction_is_named(
     axes: tuple[str, str, str], way: tuple[float, float, float], words: str
 ) -> None:
     assert moved(axes, way).in_words(5.45) == words

@@ -112,9 +112,7 @@ def test_nothing_comes_before_start_nor_after_close_and_it_waits_while_nobody_po
         ({"jitter": 0.01}, r"jitter = 0\.01: allowed is 0 \.\. 0\.00667"),
     ],
 )
-def test_a_wrong_setting_is_refused_in_one_line_that_says_what_is_allowed(
-    arguments: dict[str, object], message: str
-) -> None:
+def test_a_wrong_setting_is_refused_with_what_is_allowed(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         ScriptedInput(**{"trajectory": "circle", **arguments})  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)

@@ -85,20 +85,16 @@ def world(config: Config) -> World:
     return made
 
 
-def test_elbows_may_swing_while_the_tools_stay(world: World) -> None:
-    postures = swing(world.robot, 0.7)
+def test_elbows_may_swing_while_the_tools_stay_but_not_too_close_to_what_is_near(world: World) -> None:
+    postures, far = swing(world.robot, 1.5), round(0.7 / (SPEED * DT))
     home = world.controller.tool_pose("left").translation
-    world.show(postures + postures[-1:] * round(1.0 / DT))  # longer than a deviation may last
-    assert np.abs(postures[-1] - world.robot.home).max() > 0.5
+    world.show(postures[:far] + postures[far : far + 1] * round(1.0 / DT))  # longer than a deviation may last
+    assert np.abs(postures[far] - world.robot.home).max() > 0.5
     assert world.supervisor.phase is Phase.ACTIVE
     assert world.supervisor.events == []
     assert np.linalg.norm(world.controller.tool_pose("left").translation - home) < 1e-3
-
-
-def test_measured_arms_that_come_too_close_stop_the_reference_and_are_named(world: World) -> None:
-    postures = swing(world.robot, 1.5)
-    world.show(postures + postures[-1:] * round(0.5 / DT))
-    assert world.supervisor.phase is Phase.STOPPED
+    world.show(postures[far:] + postures[-1:] * round(0.5 / DT))
+    assert world.supervisor.arm_state("left") == "stopped"
     (event,) = world.supervisor.events
     assert event.kind is ReasonKind.TOO_CLOSE
     assert event.detail["pair"].startswith("left_link_")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import patch
 
 import numpy as np
 import pinocchio as pin
@@ -60,91 +60,73 @@ class Cell:
         assert self.granted["right"] == 1.0
 
 
-def test_a_gripper_that_has_closed_takes_up_less_room_and_at_rest_nothing_is_worked_out(
-    controller: CartesianController,
-) -> None:
-    gripper = Cell(controller)
+@pytest.fixture
+def gripper(controller: CartesianController) -> Cell:
+    return Cell(controller)
+
+
+def test_a_closed_gripper_takes_up_less_room_and_asks_nothing_at_rest(gripper: Cell) -> None:
     gripper.run(0.0, 0.5)
     assert gripper.granted["left"] == gripper.motion.openings["left"] == 0.0
-    assert controller.openings["left"][0] == 0.0
-    assert controller.openings["left"][1] == pytest.approx(TOLERANCE / STROKE)
+    assert gripper.controller.openings["left"][0] == 0.0
+    assert gripper.controller.openings["left"][1] == pytest.approx(TOLERANCE / STROKE)
     asked = gripper.asked
     gripper.run(0.0, 0.2)
     assert gripper.asked == asked < 12
 
 
-def test_beside_a_block_it_opens_as_far_as_is_proven_and_by_itself_to_the_end_where_there_is_room(
-    controller: CartesianController,
-) -> None:
-    gripper = Cell(controller)
+def test_it_opens_as_far_as_is_proven_asking_once_in_5_ms_and_to_the_end_where_there_is_room(gripper: Cell) -> None:
     gripper.run(0.0, 1.6, BESIDE)
     assert not gripper.limiter.held
     gripper.run(1.0, 0.4, BESIDE)
     assert 0.35 < gripper.granted["left"] < 0.5
     assert gripper.motion.openings["left"] == pytest.approx(gripper.granted["left"])
     assert "block_0" in gripper.limiter.held["left"]
+    with patch.object(gripper.controller, "set_opening", wraps=gripper.controller.set_opening) as asked:
+        gripper.run(1.0, 0.1, BESIDE)
+    assert 10 <= asked.call_count <= 0.1 / 0.005 + 1
+    gripper.run(0.0, DT, BESIDE)
+    assert gripper.granted["left"] == 0.0
+    assert not gripper.limiter.held
+    gripper.run(1.0, 0.4, BESIDE)
     gripper.run(1.0, 1.0, ABOVE)
     assert gripper.granted["left"] == gripper.motion.openings["left"] == 1.0
     assert not gripper.limiter.held
 
 
-def test_one_that_is_held_asks_once_in_five_milliseconds_and_closes_at_once(
-    controller: CartesianController, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gripper = Cell(controller)
-    gripper.run(0.0, 1.6, BESIDE)
-    gripper.run(1.0, 0.3, BESIDE)
-    counted = Mock(wraps=controller.set_opening)
-    with monkeypatch.context() as patch:
-        patch.setattr(controller, "set_opening", counted)
-        gripper.run(1.0, 0.1, BESIDE)
-    assert {call.args[0] for call in counted.mock_calls} == {"left"}
-    assert 10 <= counted.call_count <= 0.1 / 0.005 + 1
-    gripper.run(0.0, DT, BESIDE)
-    assert gripper.granted["left"] == 0.0
-    assert not gripper.limiter.held
-
-
-def test_what_is_not_measured_is_passed_through_and_its_fingers_stay_all_of_their_way(
-    controller: CartesianController,
-) -> None:
-    gripper = Cell(controller)
+def test_what_is_not_measured_is_passed_through_with_its_fingers_all_way(gripper: Cell) -> None:
     for wanted in (1.0, 0.0, 0.5):
         gripper.tick(wanted, {})
         assert gripper.granted == {"left": wanted, "right": 1.0}
-    assert controller.openings == dict.fromkeys(("left", "right"), ALL_OF_THE_WAY)
+    assert gripper.controller.openings == dict.fromkeys(("left", "right"), ALL_OF_THE_WAY)
 
 
 @pytest.mark.parametrize("measured", [{}, {"left": math.nan}, {"left": 7.0}], ids=["none", "no number", "absurd"])
 def test_without_a_measurement_that_can_be_believed_a_gripper_stays_commanded_as_it_was(
-    controller: CartesianController, measured: dict[str, float]
+    gripper: Cell, measured: dict[str, float]
 ) -> None:
-    gripper = Cell(controller)
     gripper.run(0.0, 0.5)
-    openings = controller.openings
+    openings = gripper.controller.openings
     for _ in range(100):
         gripper.tick(1.0, measured)
         assert gripper.granted["left"] == 0.0
-    assert controller.openings == openings
+    assert gripper.controller.openings == openings
 
 
-def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(controller: CartesianController) -> None:
-    gripper = Cell(controller)
+def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(gripper: Cell) -> None:
     gripper.run(0.0, 1.6, BESIDE)
-    openings = controller.openings["left"]
+    openings = gripper.controller.openings["left"]
     for _ in range(20):
         gripper.tick(0.0, {"left": 0.9, "right": 1.0})
     assert "block_0" in gripper.limiter.held["left"]
-    assert controller.openings["left"] == openings
+    assert gripper.controller.openings["left"] == openings
     gripper.run(0.4, 0.2, BESIDE)
     for wanted in (0.4, 0.1, 0.0):
         gripper.tick(wanted, {"left": 0.9, "right": 1.0})
         assert gripper.granted["left"] == wanted
 
 
-def test_one_that_was_commanded_before_takes_up_what_it_does_from_the_first_step_on(
-    controller: CartesianController,
-) -> None:
+def test_one_that_was_commanded_before_takes_up_what_it_does_at_once(controller: CartesianController) -> None:
     controller.reset(controller.robot.home)
     limiter = GripperLimiter(controller)
     limiter.resume({"left": 0.0, "right": 0.3}, {"left": 0.2, "right": math.nan}, 1.0)
@@ -155,9 +137,7 @@ def test_one_that_was_commanded_before_takes_up_what_it_does_from_the_first_step
     assert controller.openings["left"][1] < 0.3
 
 
-def test_an_opening_counts_for_as_long_as_the_gripper_may_take_to_do_what_it_is_commanded_to(
-    controller: CartesianController,
-) -> None:
+def test_an_opening_counts_for_as_long_as_the_gripper_may_take(controller: CartesianController) -> None:
     least = {}
     for remembered in (0.05, 0.3):
         controller.reset(controller.robot.home)
@@ -204,13 +184,10 @@ def test_fingers_that_turn_wait_above_the_table_with_closing_and_go_on_by_themse
     assert controller.tool_pose("left").translation[2] > above_table(0.006).translation[2] + 0.005
 
 
-def test_one_whose_bodies_may_not_get_smaller_yet_is_not_held(
-    controller: CartesianController, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gripper = Cell(controller)
+def test_one_whose_bodies_may_not_get_smaller_yet_is_not_held(gripper: Cell) -> None:
+    controller = gripper.controller
     gripper.run(0.0, 0.05)
-    with monkeypatch.context() as patch:
-        patch.setattr(controller, "set_opening", lambda *_: ("finger", "table"))
+    with patch.object(controller, "set_opening", return_value=("finger", "table")):
         gripper.run(0.0, 0.4)
         assert not gripper.limiter.held
     assert gripper.motion.openings["left"] == gripper.granted["left"] == 0.0

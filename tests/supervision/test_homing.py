@@ -78,9 +78,7 @@ def postures(robot: Robot, controller: CartesianController, count: int, seed: in
 
 
 @pytest.mark.slow
-def test_from_fifty_random_postures_all_joints_come_home_from_all_but_two_at_most(
-    robot: Robot, controller: CartesianController
-) -> None:
+def test_from_48_of_50_random_postures_all_joints_come_home(robot: Robot, controller: CartesianController) -> None:
     ends = []
     for q in postures(robot, controller, POSTURES, seed=0):
         world = World(robot, controller, q)
@@ -96,9 +94,7 @@ def test_the_contract_holds_at_every_tick_of_the_way(robot: Robot, controller: C
         World(robot, controller, q, checked=True).go_home()
 
 
-def test_a_motion_is_braked_before_the_way_home_begins_and_the_arms_stay_there(
-    robot: Robot, controller: CartesianController
-) -> None:
+def test_a_motion_is_braked_before_the_way_home_begins(robot: Robot, controller: CartesianController) -> None:
     world = World(robot, controller, robot.home, checked=True)
     tool = controller.tool_pose("left")
     for step in range(100):
@@ -188,9 +184,7 @@ def test_every_pair_closer_than_min_distance_is_named_once_and_nearest_first(rob
     assert "allowed: at least min_distance" in faults[0]
 
 
-def test_a_home_without_a_certified_stop_is_a_fault_and_the_controller_is_left_at_rest_there(
-    robot: Robot, controller: CartesianController
-) -> None:
+def test_a_home_without_a_certified_stop_is_a_fault(robot: Robot, controller: CartesianController) -> None:
     nearest = min(pair.distance for pair in robot.distances(robot.home))
     asking_for_more = CartesianController(robot, ControllerSettings(min_distance=nearest + 0.01))
     (fault,) = preflight_faults(robot, SETTINGS, asking_for_more)
