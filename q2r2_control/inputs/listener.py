@@ -116,10 +116,7 @@ class TcpListener:
         return self._socket.fileno()
 
     def arrivals(self, now: float) -> Iterator[tuple[socket.socket, str, str]]:
-        """Connections that wait, as many as the rate allows: a socket that does not block, host, and host with port.
-
-        An IPv4 address that came in through IPv6 is written as IPv4.
-        """
+        """Connections within the rate: a socket that does not block, host (IPv4 through IPv6 as IPv4), and peer."""
         while self.accepts.take(now):
             try:
                 connection, address = self._socket.accept()

@@ -21,10 +21,7 @@ _ROTATION_NOISE = math.radians(0.03)
 
 
 class SampleTiming(ABC):
-    """How the samples of one hand come about: exact and at once, unless a subclass says otherwise.
-
-    For each of ``times`` ``measured`` is asked first, then ``lateness``.
-    """
+    """How the samples of one hand come about; at each of ``times``, ``measured`` is asked first, then ``lateness``."""
 
     @abstractmethod
     def times(self) -> Iterator[float]:

@@ -127,10 +127,7 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
 
 
 def trajectory_named(name: str) -> HandTrajectory:
-    """One of :data:`TRAJECTORIES`, or several works one after the other, such as ``handover+stack``.
-
-    Raises :class:`ConfigError` for any other name.
-    """
+    """One of :data:`TRAJECTORIES`, or works such as ``handover+stack``. Raises :class:`ConfigError` for others."""
     if name in TRAJECTORIES:
         return TRAJECTORIES[name]
     works = name.split("+")

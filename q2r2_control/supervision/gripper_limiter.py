@@ -40,10 +40,7 @@ class GripperLimiter:
         self.changed = False  # whether the controller's openings did, in the last tick
 
     def limit(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> dict[str, float]:
-        """What may be commanded at ``now`` [s], before the controller's step; openings 0 closed .. 1 fully open.
-
-        Where a measured opening is missing, or is no opening, the gripper stays commanded as it was.
-        """
+        """What may be commanded at ``now`` [s], 0 closed .. 1 open; as it was where nothing believable is measured."""
         self.changed = False
         granted = dict(wanted)
         for arm, gripper in self._grippers.items():
@@ -56,10 +53,7 @@ class GripperLimiter:
         return granted
 
     def resume(self, commanded: Mapping[str, float], measured: Mapping[str, float], now: float) -> None:
-        """Begin with grippers that have been ``commanded`` already: at once their fingers take up no more than they do.
-
-        Then arms that came to rest near each other with closed grippers are not too close to go on.
-        """
+        """Begin with grippers that were ``commanded`` already: closed fingers take up no more than they do at once."""
         for arm, gripper in self._grippers.items():
             if arm in commanded and _BELIEVABLE[0] <= measured.get(arm, math.nan) <= _BELIEVABLE[1]:
                 gripper.granted = commanded[arm]
@@ -186,10 +180,7 @@ class GraspWatch:
                 self._controller.set_holding(arm, True)
 
     def update(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> bool:
-        """Look at openings 0 closed .. 1 fully open at ``now`` [s], before the controller's step; whether one changed.
-
-        While a measurement fails, what was known stays.
-        """
+        """Look at openings, 0 closed .. 1 open, at ``now`` [s], before the controller's step; whether one changed."""
         changed = False
         for arm, grip in self._grips.items():
             if arm in wanted:

@@ -45,10 +45,7 @@ class JointHoming:
         self.outcome: ReasonKind | None = None  # how it ended
 
     def step(self, q: Array, v: Array, dt: float) -> Array | None:
-        """Where the joints shall be (nv,) after another ``dt`` [s], with the reference at ``q`` and ``v`` (nv,).
-
-        None: where they come to rest.
-        """
+        """Where the joints shall be (nv,) in ``dt`` [s], with the reference at ``q``, ``v``; None: where they rest."""
         if self._search is None:
             if float(np.abs(v).max()) > _AT_REST:
                 return None
@@ -127,10 +124,7 @@ _PATIENCE = 5.0  # after the targets have arrived [s]
 
 
 class ToolHoming:
-    """Targets on a straight line from where the tools are to where they are at home, all arms at once.
-
-    The QP keeps limits and distances on the way; where it holds the tools up the homing ends there.
-    """
+    """Targets on straight lines home for all tools at once; where the QP holds one up, the homing ends there."""
 
     def __init__(self, home: Mapping[str, pin.SE3], tool_pose: Callable[[str], pin.SE3]) -> None:
         """``tool_pose``: where the controller's reference has an arm's tool."""
@@ -183,10 +177,7 @@ class Homing:
             self._way = JointHoming(self._robot, self._controller.kept_distances, self._robot.home)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """What each tool is asked for after another ``dt`` [s] from the ``last`` reference, None: before the first.
-
-        Where the joints are led, that is nothing: the controller holds joint positions.
-        """
+        """What each tool is asked for in ``dt`` [s]: nothing where joints are led, from the ``last`` reference."""
         if isinstance(self._way, ToolHoming):
             return self._way.targets(dt)
         if self._way is not None and last is not None:

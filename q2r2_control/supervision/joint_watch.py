@@ -68,10 +68,7 @@ class JointWatch:
         self._near_at: float | None = None
 
     def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
-        """Judge a state, or what is wrong with it.
-
-        ``passed`` [s] since the state before, on the clock of a simulated plant: it makes up for a late tick after it.
-        """
+        """Judge a state, or what is wrong with it, ``passed`` [s] after the last one on a simulated plant's clock."""
         if isinstance(state, Reason):
             self._fail(state)
             return

@@ -30,10 +30,7 @@ class DelayWatch:
         self._stamp, self._late_since = 0.0, math.inf
 
     def take(self, delay: float, now: float) -> float:
-        """How much too late [s] a message is that came at ``now`` [s] with ``delay`` [s]; 0 if it may be used.
-
-        A delay that is not finite is not known, and such a message may be used.
-        """
+        """How much too late [s] a message is that came at ``now`` with ``delay`` [s]; 0 also where that is unknown."""
         if not math.isfinite(delay):
             return 0.0
         usual = self.usual + _DRIFT * max(now - self._stamp, 0.0)

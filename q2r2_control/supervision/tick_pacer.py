@@ -36,10 +36,7 @@ class TickPacer:
         self._coasts = coasts
 
     def step(self, gap: float, v: Array) -> float:
-        """Time [s] for the reference to move by, ``gap`` [s] after the last tick, from velocities ``v`` (nv,) [rad/s].
-
-        Not more than ``gap``; 0 for a clock that did not advance.
-        """
+        """Time [s] to move by, at most the ``gap`` [s] since the last tick, from velocities ``v`` (nv,) [rad/s]."""
         if not gap > self.period * (1.0 + _ROUNDING):
             return gap if gap > 0.0 else 0.0
         # Half a period late is jitter; from there on a command is missing.
@@ -62,10 +59,7 @@ class TickClock:
         self._last = -math.inf
 
     def at(self, now: float) -> float:
-        """The time for which a tick that runs at ``now`` counts: within half a period of it, or again the last one.
-
-        Time begins anew after more than 0.1 s, and where it was set back.
-        """
+        """The time for which a tick at ``now`` counts; time begins anew after over 0.1 s, and where it was set back."""
         off = now - self._last - self._period
         if not -2.0 * self._period < off < LONGEST_DT:
             self._last = now
@@ -167,10 +161,7 @@ class _Limited:
         return math.hypot(*self.velocity)
 
     def follow(self, lag: Array, way: Array, dt: float) -> tuple[Array, bool]:
-        """What to move in ``dt`` [s], and whether that is less than asked for.
-
-        ``lag`` is from the pose to the last target, ``way`` from that to this one.
-        """
+        """What to move in ``dt`` [s], ``lag`` behind a target that goes ``way``; whether it is less than asked for."""
         own, (fastest, a) = way / dt, self.limits
         if math.hypot(*own) > fastest:
             lag, own = lag + way, np.zeros(3)
