@@ -1,4 +1,4 @@
-"""Poses that are no motion of a hand: signs, jumps, frames that move, frozen numbers, and clocks."""
+"""Poses that are no motion of a hand: jumps, frames that move, frozen numbers, and clocks."""
 
 from __future__ import annotations
 
@@ -21,25 +21,6 @@ STILL = 5e-4  # of a tool, whose hand trembles by the noise of its sensor [m]
 def assert_still(run: InStepRun) -> None:
     for tool in map(run.tool, SIDES):
         assert np.linalg.norm(tool - tool[0], axis=1).max() < STILL
-
-
-def test_quaternions_of_alternating_sign_are_one_rotation() -> None:
-    def script(op: Operator) -> Iterator[float]:
-        signs = dict.fromkeys(SIDES, 1.0)
-
-        def flipped(hand: str, position: Array, quaternion: Array) -> bytes:
-            signs[hand] *= -1.0
-            return op.pose(hand, position, signs[hand] * quaternion)
-
-        op.send_pose = flipped
-        yield from op.engage()
-        yield from op.move((0.0, 0.05, 0.0), (0.0, 0.0, 0.4), seconds=0.5)
-        yield 0.2
-
-    run = InStepRun(script)
-    assert run.reasons("lost") == []
-    first, last = (run.ticks[index].tools["left"].rotation for index in (0, -1))
-    np.testing.assert_allclose(pin.log3(last @ first.T), [0.0, 0.0, 0.4], atol=0.02)
 
 
 def jumping(op: Operator, hands: tuple[str, ...], count: float) -> Sender:
