@@ -31,46 +31,32 @@ def aligned(op: Operator, shift: float, samples: int) -> Iterator[float]:
     yield 0.2
 
 
-def assert_still(run: InStepRun) -> None:
-    assert run.reasons("lost") == []
-    assert {tick.targets[arm].gripper for tick in run.ticks for arm in SIDES} == {1.0}
-    for arm in SIDES:
-        assert np.linalg.norm(run.tool(arm) - run.tool(arm)[0], axis=1).max() < STILL
-
-
 @pytest.mark.parametrize(
-    ("first", "shift", "samples"),
-    [("lower", 1.0, 0), ("upper", 0.1, 1)],
-    ids=["far, with the second button", "by less than the gates, in the next sample"],
+    ("engaged", "first", "shift", "samples"),
+    [
+        pytest.param(SIDES, "lower", 1.0, 0, id="far, with the second button"),
+        pytest.param(SIDES, "upper", 0.1, 1, id="by less than the gates, in the next sample"),
+        pytest.param(("right",), None, 1.0, 1, id="far, the other arm alone engaged, not linked"),
+        pytest.param(SIDES, None, 0.1, 1, id="by less than the gates, both arms engaged, not linked"),
+    ],
 )
-def test_an_alignment_within_30_ms_moves_no_arm_and_no_gripper(first: str, shift: float, samples: int) -> None:
-    def script(op: Operator) -> Iterator[float]:
-        yield from op.engage()
-        yield 0.2
-        getattr(op, first).add("left")
-        yield 0.03
-        yield from aligned(op, shift, samples)
-
-    run = InStepRun(script)
-    assert_still(run)
-    assert len(run.reasons("aligning")) == 2
-    assert run.states == {"engaged"}
-
-
-@pytest.mark.parametrize(
-    ("shift", "engaged"),
-    [(1.0, ("right",)), (0.1, SIDES)],
-    ids=["far, the other arm alone engaged", "by less than the gates, both arms engaged"],
-)
-def test_an_alignment_by_one_hand_moves_no_arm_that_is_not_linked(shift: float, engaged: tuple[str, ...]) -> None:
+def test_an_alignment_by_one_hand_moves_no_arm_and_no_gripper(
+    engaged: tuple[str, ...], first: str | None, shift: float, samples: int
+) -> None:
     def script(op: Operator) -> Iterator[float]:
         yield 0.1
         yield from op.press(*engaged)
         yield 0.2
-        yield from aligned(op, shift, samples=1)
+        if first is not None:  # of the buttons, by 30 ms
+            getattr(op, first).add("left")
+            yield 0.03
+        yield from aligned(op, shift, samples)
 
-    run = InStepRun(script, linked=False)
-    assert_still(run)
+    run = InStepRun(script, linked=first is not None)
+    assert run.reasons("lost") == []
+    assert {tick.targets[arm].gripper for tick in run.ticks for arm in SIDES} == {1.0}
+    for arm in SIDES:
+        assert np.linalg.norm(run.tool(arm) - run.tool(arm)[0], axis=1).max() < STILL
     assert run.reasons("aligning") == ["alignment_chord"] * len(engaged)
     assert {arm for arm, state in run.ticks[-1].states.items() if state == "engaged"} == set(engaged)
 

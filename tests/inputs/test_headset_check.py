@@ -77,9 +77,6 @@ def test_advice_is_about_what_is_most_likely(changes: dict[str, Any], says: tupl
     assert not not_said or not_said not in text
 
 
-# What a run needs -----------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def cell() -> Config:
     return load_config("config/dual_iiwa7.yaml")

@@ -89,16 +89,10 @@ def test_hosts_do_not_silence_each_other_but_beyond_eight_they_share_a_line() ->
     assert lines.lines[MAX_HOSTS_NAMED + 1 :] == ["WARNING line 99 (90 more left out)"]
 
 
-# Addresses -----------------------------------------------------------------------------------------------------------
-
-
-def test_an_ipv6_address_is_written_in_brackets_before_its_port() -> None:
-    assert written("127.0.0.1", 10000) == "127.0.0.1:10000"
-    assert written("::", 10000) == "[::]:10000"
-
-
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", ""])
 def test_a_server_on_every_network_is_told_to_the_app_by_an_address_that_can_be_typed(host: str) -> None:
+    assert written("127.0.0.1", 10007) == "127.0.0.1:10007"
+    assert written("::", 10007) == "[::]:10007"
     settings = app_settings(host, 10007)
     assert settings.endswith(", port 10007, protocol ROS2")
     address = settings.removeprefix("address ").split(",")[0]
@@ -119,8 +113,6 @@ def test_a_server_says_who_can_drive_and_how_to_change_that() -> None:
     assert "this machine only" in line
     assert "--host 0.0.0.0" in line
 
-
-# Who may drive -------------------------------------------------------------------------------------------------------
 
 NOW = 100.0
 REGISTERED = ({"q2r_left_hand_pose": "geometry_msgs/PoseStamped"}, {"q2r_left_hand_haptic_feedback": "/q2r"})

@@ -163,8 +163,6 @@ def test_random_and_mutated_bytes_raise_nothing_but_protocol_errors() -> None:
     assert 1800 < refused < 2400
 
 
-# Frames --------------------------------------------------------------------------------------------------------------
-
 # Written by hand from the protocol: length 4, "/abc", length 3, "xyz".
 ABC = b"\x04\x00\x00\x00/abc\x03\x00\x00\x00xyz"
 ABC_NUL = b"\x05\x00\x00\x00/abc\x00\x03\x00\x00\x00xyz"

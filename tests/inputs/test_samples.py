@@ -77,8 +77,6 @@ def test_a_cut_shows_at_one_look_per_tick_whether_before_or_after_the_take() -> 
         assert stamps == [5.0], "the new connection's samples wait until the loss was seen"
 
 
-# Poses that are no motion of the hands -------------------------------------------------------------------------------
-
 Message = tuple[float, str, HandPose | HandInputs]
 STEP_AT = 30 * PERIOD  # [s]
 CHORD, RELEASED = HandInputs(button_upper=True, button_lower=True), HandInputs()

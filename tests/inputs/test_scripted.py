@@ -118,9 +118,6 @@ def test_a_wrong_setting_is_refused_with_what_is_allowed(arguments: dict[str, ob
     assert "\n" not in str(caught.value)
 
 
-# Assembly work -------------------------------------------------------------------------------------------------------
-
-
 def test_way_points_begin_where_the_shipped_cell_has_its_tools() -> None:
     robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
     for arm, home in HOME.items():

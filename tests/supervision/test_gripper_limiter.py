@@ -196,8 +196,6 @@ def test_one_whose_bodies_may_not_get_smaller_yet_is_not_held(gripper: Cell) -> 
     assert controller.openings["left"][1] < 0.1
 
 
-# What a gripper holds ------------------------------------------------------------------------------------------------
-
 BLOCK_CELL, TICK = cell(BLOCK), 0.004
 
 

@@ -203,15 +203,11 @@ def test_targets_are_followed_no_longer_than_nothing_forbids_it(world: World) ->
     assert not world.supervisor.follows("left")
 
 
-def test_a_stream_that_begins_elsewhere_is_refused_even_where_it_comes_by() -> None:
-    stream = TargetStream(StreamSettings())
+def test_targets_that_begin_elsewhere_are_followed_once_they_jump_to_the_tool_or_after_a_silence() -> None:
+    passing, jumping, silent = (TargetStream(StreamSettings()) for _ in range(3))
     for step in range(100):
-        assert stream.offer(raised(TOOL, 0.5 - 0.01 * step), [TOOL], 0.01 * step) is not None
-    assert stream.pose is None
-
-
-def test_targets_that_were_refused_are_followed_once_they_jump_to_the_tool_or_begin_there_after_a_silence() -> None:
-    jumping, silent = TargetStream(StreamSettings()), TargetStream(StreamSettings())
+        assert passing.offer(raised(TOOL, 0.5 - 0.01 * step), [TOOL], 0.01 * step) is not None
+    assert passing.pose is None
     for stream in (jumping, silent):
         assert stream.offer(raised(TOOL, 0.2), [TOOL], 0.0) is not None
     assert jumping.offer(TOOL, [TOOL], 0.01) is None

@@ -80,8 +80,6 @@ def test_time_begins_anew_after_a_long_gap_and_where_it_was_set_back(gap: float)
     assert clock.at(now + PERIOD) == pytest.approx(now + PERIOD)
 
 
-# The guard of poses ---------------------------------------------------------------------------------------------------
-
 DT = 0.01
 LIMITS = GuardSettings(max_velocity=0.5, max_acceleration=5.0, max_angular_velocity=2.0, max_angular_acceleration=20.0)
 FASTEST = np.array([LIMITS.max_velocity, LIMITS.max_angular_velocity])
