@@ -14,8 +14,7 @@ import pinocchio as pin
 from q2r2_control.benchmark.work_motions import WorkMotion
 from q2r2_control.config.teleop import Stance, TeleopSettings
 from q2r2_control.inputs.played import EvenSampling, HeadsetSampling, PlayedInput, SampleTiming
-from q2r2_control.inputs.scripted import HANDS_AT_REST
-from q2r2_control.inputs.trajectories import PRESS_DURATION
+from q2r2_control.inputs.scripted import HANDS_AT_REST, PRESS_DURATION
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import SIDES, HandInputs
 

@@ -8,8 +8,7 @@ import mujoco
 from PIL import Image
 
 from q2r2_control import Pipeline, load_config
-from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.inputs.trajectories import trajectory_named
+from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
 

@@ -19,7 +19,7 @@ from q2r2_control.plugins import INPUTS, PLANTS, check_installed, load_class
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.robot.stop_torque import StopTorque, stop_torques
-from q2r2_control.supervision.preflight import preflight_faults
+from q2r2_control.supervision.homing import preflight_faults
 
 _NEAREST = 8
 

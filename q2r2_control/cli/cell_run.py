@@ -24,9 +24,9 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
-from q2r2_control.inputs.addresses import access_lines, written
 from q2r2_control.inputs.base import Input, make_input
 from q2r2_control.inputs.headset import HeadsetServer, watch_of
+from q2r2_control.inputs.listener import access_lines, written
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
@@ -38,7 +38,7 @@ from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
-from q2r2_control.supervision.preflight import preflight_faults
+from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.live import LiveTable
 

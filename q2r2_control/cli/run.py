@@ -18,8 +18,7 @@ from q2r2_control.config.cell import Config, HeadsetConfig, load_config
 from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.headset_check import watch_headset
-from q2r2_control.inputs.scripted import DEFAULT_TRAJECTORY
-from q2r2_control.inputs.trajectories import TRAJECTORIES, trajectory_named
+from q2r2_control.inputs.scripted import DEFAULT_TRAJECTORY, TRAJECTORIES, trajectory_named
 from q2r2_control.plugins import INPUTS, check_installed
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.types import CommandMode

@@ -22,18 +22,9 @@ _X, _Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def minimum_jerk(fraction: float) -> float:
-    """Share of the way at a ``fraction`` of the time: 0 to 1, at rest at both ends; fractions beyond them are cut.
-
-    Flash and Hogan, The coordination of arm movements, 1985.
-    """
+    """Share of the way at a ``fraction`` of the time, which is cut to 0 .. 1 (Flash and Hogan, 1985)."""
     s = min(max(fraction, 0.0), 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-
-
-def later(point: WayPoint, delay: float) -> WayPoint:
-    """The same place, ``delay`` [s] later."""
-    t, x, y, z, tilt, turn = point
-    return delay + t, x, y, z, tilt, turn
 
 
 class WayPoints:

@@ -12,10 +12,16 @@ from functools import partial
 
 from q2r2_control.config.strict import Network
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.admission import Admission, Peer, decide, is_allowed
-from q2r2_control.inputs.framing import FrameDecoder, WireFrame
-from q2r2_control.inputs.listener import MAX_HOSTS_NAMED, HostLog, RateLimit, TcpListener
-from q2r2_control.inputs.messages import HandPose
+from q2r2_control.inputs.listener import (
+    MAX_HOSTS_NAMED,
+    Admission,
+    Peer,
+    RateLimit,
+    TcpListener,
+    decide,
+    is_allowed,
+)
+from q2r2_control.inputs.messages import KEEPALIVE, FrameDecoder, HandPose, WireFrame
 from q2r2_control.inputs.samples import HandTracker
 from q2r2_control.inputs.session import HeadsetSession, Reception, TopicRecorder, log_frame
 from q2r2_control.types import HapticFeedback
@@ -25,15 +31,12 @@ SILENCE_ALLOWED = 2.0  # without a whole frame [s]; the app sends a keepalive af
 MAX_WAITING = 4  # newcomers of which it is not yet known whether they may drive, one of each host
 TURN = 0.05  # longest wait for the network; timeouts are looked at this often [s]
 _RECEIVE_BYTES = 1 << 12  # some 40 messages: the control loop gets the interpreter between two such portions
-
 MAX_FRAMES_PER_SECOND = 2000  # the app sends about 450; more would take processor time from the control loop
 
 _LOG = logging.getLogger("q2r2_control.inputs.headset")
 
 
 class Client(Peer):
-    """A connected client."""
-
     def __init__(self, connection: socket.socket, host: str, peer: str, now: float) -> None:
         self.session = HeadsetSession()
         registrations = self.session.published, self.session.subscribed
@@ -48,10 +51,7 @@ class Client(Peer):
         self._frames = RateLimit(MAX_FRAMES_PER_SECOND)
 
     def receive(self, frame: WireFrame, now: float) -> Reception | None:
-        """Take one frame; the hand's message if it was one.
-
-        Raises :class:`ProtocolError` when the client breaks the protocol or floods.
-        """
+        """Take one frame; the hand's message if it was one. Raises :class:`ProtocolError` also for a flood."""
         self.last_frame = now
         if not self._frames.take(now):
             raise ProtocolError(f"more than {MAX_FRAMES_PER_SECOND} frames in a second")
@@ -59,10 +59,6 @@ class Client(Peer):
         if reception is not None and isinstance(reception.message, HandPose):
             self.last_pose = now
         return reception
-
-    def record(self, reception: Reception, now: float) -> None:
-        """Count a message for people to see."""
-        self.recorders.setdefault(reception.topic, TopicRecorder()).record(reception.message, now)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,17 +72,12 @@ class Handlers:
 
 
 class Connections:
-    """Serves the driver, and newcomers until :func:`~q2r2_control.inputs.admission.decide` has decided on them."""
+    """Serves the driver, and newcomers until :func:`~q2r2_control.inputs.listener.decide` has decided on them."""
 
     def __init__(
-        self,
-        door: TcpListener,
-        allow: Sequence[Network] | None,
-        clock: Callable[[], float],
-        handlers: Handlers,
-        log: HostLog,
+        self, door: TcpListener, allow: Sequence[Network] | None, clock: Callable[[], float], handlers: Handlers
     ) -> None:
-        self._door, self._allow, self._clock, self._handlers, self._log = door, allow, clock, handlers, log
+        self._door, self._allow, self._clock, self._handlers, self._log = door, allow, clock, handlers, door.log
         self._driver: Client | None = None
         self._waiting: list[Client] = []  # in the order of their arrival
         self._unwelcome: set[str] = set()  # hosts outside ``allow`` that the log has named
@@ -95,7 +86,7 @@ class Connections:
         self._waker.setblocking(False)
         self._waiter.setblocking(False)
         self._selector = selectors.DefaultSelector()
-        self._selector.register(self._waiter, selectors.EVENT_READ, self._drain_waiter)
+        self._selector.register(self._waiter, selectors.EVENT_READ, partial(self._waiter.recv, _RECEIVE_BYTES))
         self._door_watched = False
 
     def wake(self) -> None:
@@ -126,23 +117,19 @@ class Connections:
         self._last_fault = repr(error)
 
     def end_all(self, reason: str) -> None:
-        """Close every connection."""
         for client in (*self._waiting, *filter(None, (self._driver,))):
             self._end(client, reason)
 
     def close(self) -> None:
         """Close every connection and stop listening."""
         self.end_all("server closed")
-        self._log.close()
+        self._log.flush(float("inf"))
         for open_one in (self._door, self._waker, self._waiter, self._selector):
             open_one.close()
 
-    def _drain_waiter(self) -> None:
-        self._waiter.recv(_RECEIVE_BYTES)
-
     def _watch_door(self, now: float) -> None:
         """Connections beyond the rate wait in the kernel, which costs this process nothing."""
-        watched = self._door.is_open(now)
+        watched = self._door.accepts.is_open(now)
         if watched and not self._door_watched:
             self._selector.register(self._door, selectors.EVENT_READ, self._accept)
         elif self._door_watched and not watched:
@@ -171,19 +158,16 @@ class Connections:
             driver = self._driver
             verdict, reason = decide(driver, client, now)
             if verdict is Admission.ADMIT:
-                self._admit(client, reason)
+                if driver is not None:
+                    self._drop(driver, reason)
+                self._waiting.remove(client)
+                self._driver = client
+                self._handlers.admitted(client)
             elif verdict is Admission.REFUSE or newest[client.host] is not client or still_waiting == MAX_WAITING:
                 assert driver is not None  # without one, everybody is admitted
                 self._refuse(client, reason or f"{driver.peer} is connected", driver.refused_hosts)
             else:
                 still_waiting += 1
-
-    def _admit(self, client: Client, reason: str) -> None:
-        if self._driver is not None:
-            self._drop(self._driver, reason)
-        self._waiting.remove(client)
-        self._driver = client
-        self._handlers.admitted(client)
 
     def _refuse(self, client: Client, reason: str, named: set[str]) -> None:
         """Send a newcomer away. The app tries again every second: one line for each host is enough."""
@@ -226,14 +210,13 @@ class Connections:
                 self._write(client, logging.INFO, f"connected, dialect {client.session.dialect}")
 
     def _send(self, client: Client, now: float) -> None:
-        """Send what is due."""
         outgoing = client.session.outgoing
         if not outgoing and client is self._driver:
             # Encoded only now, so that a client that does not read gets the newest vibration and not all of them.
             for vibration in self._handlers.due():
                 client.session.queue_haptic(vibration)
             if not outgoing and now - client.last_sent > KEEPALIVE_AFTER:
-                client.session.queue_keepalive()
+                outgoing += KEEPALIVE
         try:
             if outgoing:
                 del outgoing[: client.socket.send(outgoing)]

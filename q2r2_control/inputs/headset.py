@@ -12,14 +12,11 @@ from contextlib import suppress
 from q2r2_control.config.cell import Config
 from q2r2_control.config.strict import Network
 from q2r2_control.errors import InputError
-from q2r2_control.inputs.addresses import written
 from q2r2_control.inputs.connections import TURN, Client, Connections, Handlers
-from q2r2_control.inputs.framing import WireFrame
-from q2r2_control.inputs.hands_watch import HandsWatch, Watched
-from q2r2_control.inputs.listener import HostLog, TcpListener
-from q2r2_control.inputs.messages import warm_up
-from q2r2_control.inputs.samples import SampleQueue
-from q2r2_control.inputs.session import HeadsetStatistics
+from q2r2_control.inputs.listener import HostLog, TcpListener, written
+from q2r2_control.inputs.messages import WireFrame, warm_up
+from q2r2_control.inputs.samples import HandsWatch, SampleQueue, Watched
+from q2r2_control.inputs.session import HeadsetStatistics, TopicRecorder
 from q2r2_control.types import QUEST_CONTROLS, SIDES, HandSample, HapticFeedback
 
 _LOG = logging.getLogger(__name__)
@@ -35,12 +32,10 @@ class HeadsetServer:
     """Hand samples from, and vibrations to, the Quest2ROS app. Implements :class:`~q2r2_control.inputs.base.Input`.
 
     Samples are stamped with ``clock`` when their bytes are received. The loop's thread never waits for the network
-    or for decoding. A client that breaks the protocol, floods, or is silent for 2 s is dropped with one logged line,
-    and another one may connect. ``allow`` names the networks whose hosts may connect, None all of them; who of those
-    drives is decided in :mod:`~q2r2_control.inputs.admission`. ``watch`` finds poses that must not be followed.
-
-    Where a ``listener`` is given, each message goes only to it, at once and in the receiving thread, and :meth:`poll`
-    returns nothing: this is for forwarding messages one by one, but for those with a fault.
+    or for decoding. A client that breaks the protocol, floods, or is silent for 2 s is dropped with one logged line.
+    ``allow`` names the networks whose hosts may connect, None all of them; :func:`~q2r2_control.inputs.listener.decide`
+    says who of those drives. ``watch`` finds poses that must not be followed. A ``listener`` gets each message at once,
+    in the receiving thread; then :meth:`poll` returns nothing.
     """
 
     controls = QUEST_CONTROLS
@@ -54,10 +49,8 @@ class HeadsetServer:
         allow: Sequence[Network] | None = None,
         watch: HandsWatch | None = None,
     ) -> None:
-        self._address = (host, port)
-        self._allow = allow
-        self._clock = clock
-        self._tell = listener
+        self.address = host, port  # after ``start`` the port that was bound
+        self._allow, self._clock, self._tell = allow, clock, listener
         self._watch = watch or HandsWatch()
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
@@ -72,32 +65,25 @@ class HeadsetServer:
 
     @classmethod
     def from_config(cls, config: Config) -> HeadsetServer:
-        """As the cell's block ``headset`` says."""
         headset = config.headset
         return cls(headset.host, headset.port, allow=headset.networks, watch=watch_of(config))
 
     def start(self) -> None:
         """Listen. Raises :class:`InputError` when host and port cannot be bound, or when already started."""
         if self._thread is not None:
-            raise InputError(f"headset: already listening on {written(*self._address)}")
+            raise InputError(f"headset: already listening on {written(*self.address)}")
         warm_up()
-        host, port = self._address
-        log = HostLog(_LOG)
+        host, port = self.address
         try:
-            door = TcpListener(host, port, log)
+            door = TcpListener(host, port, HostLog(_LOG))
         except (OSError, OverflowError, ValueError) as error:
             raise InputError(f"headset: cannot listen on {written(host, port)}: {error}") from error
-        self._address = (host, door.port)
+        self.address = (host, door.port)
         handlers = Handlers(admitted=self._admit, lost=self._lose, receive=self._receive, due=self._take_owed)
-        self._connections = Connections(door, self._allow, self._clock, handlers, log)
+        self._connections = Connections(door, self._allow, self._clock, handlers)
         self._stop.clear()
         self._thread = threading.Thread(target=self._run, args=(self._connections,), name="headset", daemon=True)
         self._thread.start()
-
-    @property
-    def address(self) -> tuple[str, int]:
-        """Host and port; after ``start`` the port that was bound."""
-        return self._address
 
     @property
     def connected(self) -> bool:
@@ -126,7 +112,7 @@ class HeadsetServer:
             client, last = self._client, self._last_client
             session = last.session if last else None
             return HeadsetStatistics(
-                address=self._address,
+                address=self.address,
                 peer=client.peer if client else None,
                 dialect=session.dialect if session else None,
                 topics={name: recorder.snapshot(now) for name, recorder in last.recorders.items()} if last else {},
@@ -177,18 +163,15 @@ class HeadsetServer:
         with self._statistics_lock:
             reception = client.receive(frame, now)
             if reception is not None:
-                client.record(reception, now)
+                client.recorders.setdefault(reception.topic, TopicRecorder()).record(reception.message, now)
         if reception is None:
             return
         for watched in self._watch.receive(reception, now):
-            self._hand_on(client, watched)
-
-    def _hand_on(self, client: Client, watched: Watched) -> None:
-        hand, message = watched.reception.hand, watched.reception.message
-        if self._tell is not None:
-            self._tell(watched)
-        elif (sample := client.tracker.update(hand, message, watched.stamp, watched.fault)) is not None:
-            self._samples.put(sample)
+            hand, message = watched.reception.hand, watched.reception.message
+            if self._tell is not None:
+                self._tell(watched)
+            elif (sample := client.tracker.update(hand, message, watched.stamp, watched.fault)) is not None:
+                self._samples.put(sample)
 
     def _take_owed(self) -> Iterable[HapticFeedback]:
         with self._owed_lock:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import Stance, axes_matrix
-from q2r2_control.inputs.addresses import ONLY_THIS_MACHINE, app_settings, written
 from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.listener import ONLY_THIS_MACHINE, app_settings, written
 from q2r2_control.inputs.messages import MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, HeadsetStatistics
 from q2r2_control.types import SIDES, Array, HandSample
@@ -22,8 +22,6 @@ SILENCE = 2.0  # without data before advice is given [s]
 _PERIOD = 0.05  # [s]
 _WINDOW = 0.5  # of the movement that is put in words [s]
 _STILL = 0.02  # a hand that moved less in the window is still [m]
-_NEEDED = (MessageType.POSE, MessageType.INPUTS)
-_OTHER = {"left": "right", "right": "left"}
 _DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
 
 
@@ -60,8 +58,6 @@ class HandMovement:
 
 @dataclass(frozen=True, slots=True)
 class HeadsetCheck:
-    """The state of the connection at one time."""
-
     statistics: HeadsetStatistics
     directions: dict[str, str]  # hand -> where it moves
     positions: dict[str, Array | None]  # hand -> world position [m]
@@ -70,22 +66,13 @@ class HeadsetCheck:
     advice: tuple[str, ...]  # lines; empty while all comes that a run needs
 
     def as_json(self) -> dict[str, Any]:
-        """Data for the JSON writer."""
-        statistics = self.statistics
         return {
-            "address": list(statistics.address),
-            "connected": statistics.peer is not None,
-            "peer": statistics.peer,
-            "dialect": statistics.dialect,
-            "connections": statistics.connections,
-            "last_disconnect": statistics.last_disconnect,
+            **asdict(self.statistics),
             "topics": {
                 name: {"count": topic.count, "rate_hz": topic.rate, "age_s": topic.age, "last": topic.last}
-                for name, topic in statistics.topics.items()
+                for name, topic in self.statistics.topics.items()
             },
-            "unknown_topics": statistics.unknown_topics,
-            "published": statistics.published,
-            "subscribed": statistics.subscribed,
+            "connected": self.statistics.peer is not None,
             "hands": {hand: {"direction": self.directions[hand], "position_m": self.positions[hand]} for hand in SIDES},
             "heard": self.heard,
             "missing": self.missing,
@@ -100,15 +87,11 @@ def watch_headset(
     show: Callable[[HeadsetCheck], None],
     stopping: Callable[[], bool],
 ) -> HeadsetCheck:
-    """Watch a started server for ``duration`` [s] or until ``stopping``; ``show`` gets every state.
-
-    Returns the last one.
-    """
+    """Watch a started server for ``duration`` [s] or until ``stopping``; returns the last state, ``show`` gets all."""
     hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
-    start = time.monotonic()
+    start, heard = time.monotonic(), False
     last_data = dict.fromkeys(needed_topics(config), start)
     missing = tuple(last_data)
-    heard = False
     while True:
         now = time.monotonic()
         ends = stopping() or (duration is not None and now - start >= duration)  # before the last look
@@ -139,8 +122,10 @@ def watch_headset(
 
 def needed_topics(config: Config) -> tuple[str, ...]:
     """What a run needs: poses and inputs, which have the button that engages, of each hand that leads an arm."""
-    hands = set(config.arms) if config.teleop.stance is Stance.SIDE_BY_SIDE else {_OTHER[arm] for arm in config.arms}
-    return tuple(name for name, topic in HAND_TOPICS.items() if topic.hand in hands and topic.kind in _NEEDED)
+    same_side = config.teleop.stance is Stance.SIDE_BY_SIDE
+    hands = {hand for hand in SIDES for arm in config.arms if (hand == arm) is same_side}
+    needed = (MessageType.POSE, MessageType.INPUTS)
+    return tuple(name for name, topic in HAND_TOPICS.items() if topic.hand in hands and topic.kind in needed)
 
 
 def advice_on_some(silent: tuple[str, ...]) -> tuple[str, ...]:
@@ -148,16 +133,12 @@ def advice_on_some(silent: tuple[str, ...]) -> tuple[str, ...]:
     lines = []
     for hand in SIDES:
         kinds = {HAND_TOPICS[name].kind: name for name in silent if HAND_TOPICS[name].hand == hand}
-        match list(kinds):
-            case []:
-                continue
-            case [MessageType.INPUTS]:
-                what = f"no inputs ({kinds[MessageType.INPUTS]}): without its buttons a run cannot engage an arm"
-            case [MessageType.POSE]:
-                what = f"no poses ({kinds[MessageType.POSE]}): a run has nothing to follow"
-            case _:
-                what = "nothing arrives: switch its controller on and keep it in the headset's view"
-        lines.append(f"{hand} hand: {what}")
+        if len(kinds) == 2:
+            lines.append(f"{hand} hand: nothing arrives: switch its controller on and keep it in the headset's view")
+        elif name := kinds.get(MessageType.INPUTS):
+            lines.append(f"{hand} hand: no inputs ({name}): without its buttons a run cannot engage an arm")
+        elif name := kinds.get(MessageType.POSE):
+            lines.append(f"{hand} hand: no poses ({name}): a run has nothing to follow")
     return tuple(lines)
 
 

@@ -1,20 +1,23 @@
-"""The listening socket: connections come in at a bounded rate, however many there are."""
+"""The door: connections come in at a bounded rate, one client drives, and people are told addresses. No clocks."""
 
 from __future__ import annotations
 
 import logging
+import math
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from ipaddress import IPv6Address, ip_address
-from typing import NamedTuple
+from enum import Enum
+from ipaddress import ip_address
 
-from q2r2_control.inputs.addresses import written
+from q2r2_control.config.strict import Network
 
 LINES_PERIOD = 1.0  # between two lines about one host [s]
 MAX_HOSTS_NAMED = 8  # with lines of their own within LINES_PERIOD; all others share theirs
+EVERY_NETWORK = ("", "0.0.0.0", "::")  # as hosts to listen on
+ONLY_THIS_MACHINE = ("127.0.0.1", "::1", "localhost")
 _OTHERS = "other hosts"
 
 
@@ -23,15 +26,13 @@ class RateLimit:
 
     def __init__(self, count: int, period: float = 1.0) -> None:
         self._count, self._period = count, period
-        self._start = -float("inf")
-        self._taken = 0
+        self._start, self._taken = -math.inf, 0
 
     def is_open(self, now: float) -> bool:
         """Whether one more is allowed at ``now`` [s]."""
         return self._taken < self._count or now - self._start >= self._period
 
     def take(self, now: float) -> bool:
-        """Count one more, if it is allowed."""
         if now - self._start >= self._period:
             self._start, self._taken = now, 0
         if self._taken >= self._count:
@@ -74,7 +75,7 @@ class HostLog:
             known.level, known.text = level, text
 
     def flush(self, now: float) -> None:
-        """Write the lines whose second is over."""
+        """Write the lines whose second is over; all of them at ``now`` = inf."""
         for host, known in list(self._hosts.items()):
             if now - known.since >= LINES_PERIOD:
                 del self._hosts[host]
@@ -82,10 +83,6 @@ class HostLog:
                     left_out = known.held_back - 1
                     self._write(known.level, known.text + (f" ({left_out} more left out)" if left_out else ""))
                     self._hosts[host] = _Host(now)
-
-    def close(self) -> None:
-        """Write all that was held back."""
-        self.flush(float("inf"))
 
     def _write(self, level: int, text: str) -> None:
         self._logger.log(level, "%s", text)  # the text is no format: it may quote what a client sent
@@ -95,16 +92,7 @@ class HostLog:
 # 128 is taken within 0.35 s; when that is full, the kernel drops what comes, and the client tries again after 1 s.
 ACCEPTS, ACCEPTS_PERIOD = 20, 0.05  # [s]
 ANSWERS_PER_SECOND = 10  # to one host; the app connects once a second
-
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with a reset, which leaves nothing behind in the kernel
-
-
-class Arrival(NamedTuple):
-    """A new connection."""
-
-    connection: socket.socket  # not blocking
-    host: str  # an IPv4 address that came in through IPv6 is written as IPv4
-    peer: str  # with its port
 
 
 class TcpListener:
@@ -118,27 +106,18 @@ class TcpListener:
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
         self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # with SO_REUSEADDR
         self._socket.setblocking(False)
-        self._log = log
-        self._accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)
+        self.port = int(self._socket.getsockname()[1])  # that was bound
+        self.log = log
+        self.accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)  # while it is not open, there is no use in waiting
         self._answers: dict[str, RateLimit] = {}
-        self._answers_since = -float("inf")
-
-    @property
-    def port(self) -> int:
-        """The port that was bound."""
-        return int(self._socket.getsockname()[1])
+        self._answers_since = -math.inf
 
     def fileno(self) -> int:
-        """For a selector."""
         return self._socket.fileno()
 
-    def is_open(self, now: float) -> bool:
-        """Whether there is any use in waiting for connections at ``now`` [s]."""
-        return self._accepts.is_open(now)
-
-    def arrivals(self, now: float) -> Iterator[Arrival]:
-        """Connections that wait, as many as the rate allows."""
-        while self._accepts.take(now):
+    def arrivals(self, now: float) -> Iterator[tuple[socket.socket, str, str]]:
+        """Connections within the rate: a socket that does not block, host (IPv4 through IPv6 as IPv4), and peer."""
+        while self.accepts.take(now):
             try:
                 connection, address = self._socket.accept()
             except BlockingIOError:
@@ -146,33 +125,105 @@ class TcpListener:
             except OSError as error:  # out of file descriptors, or the peer has gone again
                 logging.getLogger(__name__).debug("accept: %s", error)
                 continue
-            host = _plain(address[0])
-            if self._answers_to(host, now).take(now):
+            host = str(getattr(ip_address(address[0]), "ipv4_mapped", None) or address[0])
+            if now - self._answers_since >= 1.0:
+                self._answers_since = now
+                self._answers.clear()
+            if self._answers.setdefault(host, RateLimit(ANSWERS_PER_SECOND)).take(now):
                 connection.setblocking(False)
-                yield Arrival(connection, host, written(host, address[1]))
+                yield connection, host, written(host, address[1])
                 continue
             with connection, suppress(OSError):
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
-            self._log.write(
-                host,
-                logging.WARNING,
-                f"headset {host} connects more than {ANSWERS_PER_SECOND} times a second: not answered",
-                now,
-            )
+            refused = f"headset {host} connects more than {ANSWERS_PER_SECOND} times a second: not answered"
+            self.log.write(host, logging.WARNING, refused, now)
 
     def close(self) -> None:
-        """Stop listening."""
         self._socket.close()
 
-    def _answers_to(self, host: str, now: float) -> RateLimit:
-        if now - self._answers_since >= 1.0:
-            self._answers_since = now
-            self._answers.clear()
-        return self._answers.setdefault(host, RateLimit(ANSWERS_PER_SECOND))
+
+def written(host: str, port: int) -> str:
+    """Host and port in one text, as ``[::1]:10000`` with IPv6."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def _plain(host: str) -> str:
-    if not host.startswith("::ffff:"):
+def app_settings(host: str, port: int) -> str:
+    """What to enter in the app, for a server that listens on ``host``."""
+    return f"address {_reachable(host)}, port {port}, protocol ROS2"
+
+
+def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple[str, ...]:
+    """What to enter in the app, and who can drive now, for a server that listens on ``host``."""
+    if host in ONLY_THIS_MACHINE:
+        return (f"{host} can be reached from this machine only; --host 0.0.0.0 admits the network",)
+    if allow is None:
+        drivers = (
+            "whoever reaches this port can drive the arms; headset.allow in the cell's YAML restricts it, such as to "
+            "[192.168.1.0/24]"
+        )
+    else:
+        drivers = f"only {', '.join(map(str, allow))} can drive the arms (headset.allow in the cell's YAML)"
+    return (f"enter in the app: {app_settings(host, port)}", drivers)
+
+
+def _reachable(host: str) -> str:
+    """The address by which others reach a server on ``host``."""
+    if host not in EVERY_NETWORK:
         return host
-    address = ip_address(host)
-    return str((isinstance(address, IPv6Address) and address.ipv4_mapped) or address)
+    # Addresses for documentation only. Connecting a UDP socket sends nothing; it only picks the way out.
+    ways = [(socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")]
+    for family, elsewhere in ways if host == "::" else ways[:1]:
+        try:
+            with socket.socket(family, socket.SOCK_DGRAM) as probe:
+                probe.connect((elsewhere, 9))
+                return str(probe.getsockname()[0])
+        except OSError:
+            continue
+    return "of this machine (it has no network now)"
+
+
+# Rules 1 to 4 are those of docs/headset.md, "Who drives". A quiet driver gives way only to its own peer, after 37
+# periods of the app's poses, three times as long as what pauses the arms: a silently lost link looks alive for seconds.
+QUIET_ALLOWED = 0.5  # without a frame, against the same peer on a new connection [s]
+POSES_ALLOWED = 5.0  # without a hand pose, against a client that sends them [s]
+WAIT_ALLOWED = 2.0  # for a newcomer to show what gives it the place [s]
+
+
+@dataclass
+class Peer:
+    """What is known of a connected client."""
+
+    peer: str  # address and port, for people
+    host: str  # address
+    since: float  # when it connected [s]
+    last_frame: float  # when its last whole frame was received [s]
+    last_pose: float = -math.inf  # when its last hand pose was received [s]
+    registrations: Sequence[Mapping[str, str]] = ({}, {})  # topics that it publishes, and that it listens to
+
+
+class Admission(Enum):
+    ADMIT = "admit"  # drives from now on, instead of the driver if there is one
+    WAIT = "wait"  # may stay, unheard, until more is known
+    REFUSE = "refuse"
+
+
+def decide(driver: Peer | None, newcomer: Peer, now: float) -> tuple[Admission, str]:
+    """What becomes of ``newcomer`` at ``now`` [s] by rules 2 to 4, and why it, or the ``driver``, gets no place."""
+    if driver is None:
+        return Admission.ADMIT, ""
+    if now - driver.last_pose > POSES_ALLOWED:
+        if newcomer.last_pose > -math.inf:
+            return Admission.ADMIT, f"no hand pose for {POSES_ALLOWED:g} s, and {newcomer.peer} sends them"
+    elif newcomer.host == driver.host and now - driver.last_frame > QUIET_ALLOWED:
+        if any(newcomer.registrations) and newcomer.registrations == driver.registrations:
+            return Admission.ADMIT, f"no frame for {QUIET_ALLOWED:g} s, and it came back as {newcomer.peer}"
+    else:
+        return Admission.REFUSE, f"{driver.peer} drives"
+    if now - newcomer.since > WAIT_ALLOWED:
+        return Admission.REFUSE, f"{driver.peer} is connected"
+    return Admission.WAIT, ""
+
+
+def is_allowed(host: str, networks: Sequence[Network] | None) -> bool:
+    """Whether the address ``host`` lies in one of ``networks``; None admits all (rule 1)."""
+    return networks is None or any(ip_address(host) in network for network in networks)

@@ -1,15 +1,16 @@
-"""The Quest2ROS app's messages in both dialects, (de)serialised by rosbags and checked more strictly than it does.
+"""What the Quest2ROS app sends and is sent: frames of ROS-TCP-Connector 0.7, and the messages in them. No sockets.
 
-Strict checks distinguish the dialects: read with the wrong one, a pose is noise and a button stays pressed.
+A frame is ``u32 n | n bytes destination | u32 m | m bytes payload``, little-endian, in both directions (public source
+of Unity ROS-TCP-Connector 0.7.0). Messages are (de)serialised by rosbags and checked more strictly than it does, which
+distinguishes the dialects: read with the wrong one, a pose is noise and a button stays pressed.
 """
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.serde import SerdeError
@@ -57,8 +58,6 @@ class HandPose:
 
 @dataclass(frozen=True, slots=True)
 class HandTwist:
-    """A hand's velocity as sent."""
-
     linear: Array  # (3,) [m/s]
     angular: Array  # (3,) [rad/s]
 
@@ -85,7 +84,6 @@ _FIXED_SIZES = {
     (MessageType.INPUTS, Dialect.ROS1): 18,
     (MessageType.INPUTS, Dialect.ROS2): 24,
 }
-_EMPTY_FRAME_ID_LENGTH = {Dialect.ROS1: 0, Dialect.ROS2: 1}
 
 
 def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
@@ -103,7 +101,10 @@ def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
         raise ProtocolError(f"not a {dialect} {kind}: {error}") from error
     match kind:
         case MessageType.POSE:
-            return _pose(message)
+            stamp, orientation = message.header.stamp, message.pose.orientation
+            quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
+            sent = stamp.sec + 1e-9 * stamp.nanosec
+            return HandPose(_vector(message.pose.position), quaternion, sent, message.header.frame_id)
         case MessageType.TWIST:
             return HandTwist(_vector(message.linear), _vector(message.angular))
         case _:
@@ -144,52 +145,90 @@ def message_types(dialect: Dialect) -> Typestore:
 
 def _check_bytes(kind: MessageType, payload: bytes, dialect: Dialect) -> None:
     """Refuse what rosbags accepts: spare bytes, other encapsulations, strings without their NUL, booleans above 1."""
-    expected = _expected_size(kind, payload, dialect)
+    ros2 = dialect is Dialect.ROS2
+    length = int.from_bytes(payload[12:16], "little")  # of a pose's frame_id, in both dialects
+    if kind is not MessageType.POSE:
+        expected = _FIXED_SIZES[kind, dialect]
+    elif ros2:
+        expected = 4 + (12 + length + 7) // 8 * 8 + 56  # doubles are aligned to 8, behind the encapsulation
+    else:
+        expected = 16 + length + 56
     if len(payload) != expected:
         raise ProtocolError(f"a {dialect} {kind} has {expected} bytes here, got {len(payload)}")
-    if dialect is Dialect.ROS2 and payload[:4] != _PLAIN_LITTLE_ENDIAN_CDR:
+    if ros2 and payload[:4] != _PLAIN_LITTLE_ENDIAN_CDR:
         raise ProtocolError(f"a {dialect} {kind} starts with 00 01 00 00, got {payload[:4].hex(' ')}")
-    if kind is MessageType.POSE:
-        _check_frame_id(payload, dialect)
-    if kind is MessageType.INPUTS:
-        start = 4 if dialect is Dialect.ROS2 else 0
-        buttons = payload[start : start + 2]
-        if max(buttons) > 1:
-            raise ProtocolError(f"a button is 00 or 01, got {buttons.hex(' ')}")
-
-
-def _expected_size(kind: MessageType, payload: bytes, dialect: Dialect) -> int:
-    if kind is not MessageType.POSE:
-        return _FIXED_SIZES[kind, dialect]
-    length = _frame_id_length(payload) if len(payload) >= 16 else _EMPTY_FRAME_ID_LENGTH[dialect]
-    if dialect is Dialect.ROS1:
-        return 16 + length + 56
-    return 4 + (12 + length + 7) // 8 * 8 + 56  # doubles are aligned to 8, counted from behind the encapsulation
-
-
-def _frame_id_length(payload: bytes) -> int:
-    """The length field of frame_id; offset 12 in both dialects, behind seq or the encapsulation, sec and nsec."""
-    (length,) = struct.unpack_from("<I", payload, 12)
-    return int(length)
-
-
-def _check_frame_id(payload: bytes, dialect: Dialect) -> None:
-    """With a frame_id of 4, 12, ... bytes a pose has the same size in both dialects: only the NUL tells them apart."""
-    terminated = payload[16 : 16 + _frame_id_length(payload)].endswith(b"\0")
-    if terminated != (dialect is Dialect.ROS2):
-        raise ProtocolError(f"frame_id of a {dialect} pose ends {'with' if terminated else 'without'} NUL")
-
-
-def _pose(message: Any) -> HandPose:
-    orientation = message.pose.orientation
-    stamp = message.header.stamp
-    return HandPose(
-        position=_vector(message.pose.position),
-        quaternion=np.array([orientation.x, orientation.y, orientation.z, orientation.w]),
-        stamp=stamp.sec + 1e-9 * stamp.nanosec,
-        frame_id=message.header.frame_id,
-    )
+    # With a frame_id of 4, 12, ... bytes a pose has the same size in both dialects: only the NUL tells them apart.
+    if kind is MessageType.POSE and payload[16 : 16 + length].endswith(b"\0") is not ros2:
+        raise ProtocolError(f"frame_id of a {dialect} pose ends {'without' if ros2 else 'with'} NUL")
+    buttons = payload[4:6] if ros2 else payload[:2]
+    if kind is MessageType.INPUTS and max(buttons) > 1:
+        raise ProtocolError(f"a button is 00 or 01, got {buttons.hex(' ')}")
 
 
 def _vector(message: Any) -> Array:
     return np.array([message.x, message.y, message.z])
+
+
+MAX_FRAME_BYTES = 1 << 20  # a hand message has under 200; a longer frame means that the stream is out of step
+KEEPALIVE = bytes(8)  # a frame without destination and payload
+
+
+class WireFrame(NamedTuple):
+    destination: str
+    payload: bytes
+    terminated: bool  # whether the destination came with a trailing NUL
+
+
+def encode_frame(destination: str, payload: bytes) -> bytes:
+    """The bytes of one frame from the server, whose destinations carry no NUL in either dialect."""
+    name = destination.encode()
+    return len(name).to_bytes(4, "little") + name + len(payload).to_bytes(4, "little") + payload
+
+
+class FrameDecoder:
+    """Cuts a byte stream into frames, however the network has split or joined them.
+
+    Frames are taken one by one: whole frames before a fault are still used. Holds at most one frame of
+    ``MAX_FRAME_BYTES`` and what :meth:`feed` was last given. Of no use any more after a :class:`ProtocolError`.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> None:
+        self._buffer += data
+
+    def next_frame(self) -> WireFrame | None:
+        """The next whole frame, or None until more bytes come.
+
+        Raises :class:`ProtocolError` for a frame above ``MAX_FRAME_BYTES``, as soon as its length fields say so, for a
+        destination that is not UTF-8, and for payload without a destination.
+        """
+        name_size = self._length_at(0)
+        if name_size is None:
+            return None
+        payload_size = self._length_at(4 + name_size)
+        size = 8 + name_size + (payload_size or 0)
+        if size > MAX_FRAME_BYTES:
+            raise ProtocolError(f"frame of {size} bytes announced, at most {MAX_FRAME_BYTES} are allowed")
+        if payload_size is None or len(self._buffer) < size:
+            return None
+        name = bytes(self._buffer[4 : 4 + name_size])
+        payload = bytes(self._buffer[8 + name_size : size])
+        del self._buffer[:size]
+        try:
+            destination = name.removesuffix(b"\0").decode()
+        except UnicodeDecodeError:
+            raise ProtocolError(f"destination {name[:40]!r} is not UTF-8") from None
+        if not destination and payload:
+            raise ProtocolError(f"{len(payload)} bytes of payload without a destination")
+        return WireFrame(destination, payload, terminated=name.endswith(b"\0"))
+
+    def finish(self) -> None:
+        """Tell the decoder that the stream has ended. Raises :class:`ProtocolError` when that was inside a frame."""
+        if self._buffer:
+            raise ProtocolError(f"stream ended inside a frame, {len(self._buffer)} bytes after its start")
+
+    def _length_at(self, offset: int) -> int | None:
+        field = self._buffer[offset : offset + 4]
+        return int.from_bytes(field, "little") if len(field) == 4 else None

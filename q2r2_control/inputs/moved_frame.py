@@ -18,7 +18,6 @@ import pinocchio as pin
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.types import SIDES, Array, HandInputs
 
-_QUATERNION_LENGTHS = (0.5, 2.0)
 _FARTHEST = 1e3  # of a coordinate: no tracking system reaches as far [m]
 
 
@@ -30,26 +29,16 @@ class Move(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where one hand is."""
-
     position: Array  # (3,) [m]
     rotation: Array  # (3, 3)
 
     @classmethod
     def of(cls, pose: HandPose) -> Place | None:
         """None where the pose is none."""
-        quaternion = pose.quaternion
-        length = math.sqrt(float(quaternion @ quaternion))
-        if not (_QUATERNION_LENGTHS[0] <= length <= _QUATERNION_LENGTHS[1]):
+        length = math.sqrt(float(pose.quaternion @ pose.quaternion))
+        if not 0.5 <= length <= 2.0 or not float(np.abs(pose.position).max()) <= _FARTHEST:
             return None
-        if not float(np.abs(pose.position).max()) <= _FARTHEST:
-            return None
-        return cls(pose.position, pin.Quaternion(quaternion / length).toRotationMatrix())
-
-    def move_from(self, other: Place) -> Move:
-        """How it got here from another place."""
-        angle = math.hypot(*pin.log3(other.rotation.T @ self.rotation))
-        return Move(math.dist(self.position, other.position), angle)
+        return cls(pose.position, pin.Quaternion(pose.quaternion / length).toRotationMatrix())
 
 
 class HandPair(NamedTuple):
@@ -71,12 +60,14 @@ class HandPair(NamedTuple):
 def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
     """Whether what a rigid motion keeps is kept: distance, relative rotation, and the direction to the other hand.
 
-    An angle's tolerance moves the other hand, as seen from this one, by that angle times the distance of the hands. So
-    that direction may change by as much; a smaller bound would demand less noise of the rotations than is allowed.
+    An angle's tolerance moves the other hand, as seen from this one, by that angle times the distance of the hands. A
+    smaller bound would demand less noise of the rotations than is allowed.
     """
-    if abs(after.apart - before.apart) > tolerance.distance:
-        return False
-    if math.dist(after.seen, before.seen) > tolerance.distance + tolerance.angle * after.apart:
+    shift = math.dist(after.seen, before.seen)
+    if (
+        abs(after.apart - before.apart) > tolerance.distance
+        or shift > tolerance.distance + tolerance.angle * after.apart
+    ):
         return False
     return 0.5 * (float(np.vdot(before.turn, after.turn)) - 1.0) >= math.cos(tolerance.angle)
 
@@ -89,13 +80,11 @@ _PERIOD = 1.0 / 72.0  # of samples; closer ones were held up on the way [s]
 _STEP_TOLERANCE = Move(0.002, math.radians(0.75))
 # Over a longer gap hands get farther by themselves, from rest with its square: at 20 m/s^2 and 70 rad/s^2 by _STEP [s].
 _STEP_GAP = 0.032
-
 # A frame that is carried along.
 _WINDOW = 1.5  # [s]
 _CARRIED = 0.15  # of both hands [m]
 _NEAR = 0.4 * _CARRIED
 _CARRIED_TOLERANCE = Move(0.001, math.radians(0.5))
-
 _SAME_TIME = 0.01  # the two hands' messages of one time come within this [s]
 _ALIVE = 0.05  # a hand without a pose for longer is not waited for [s]
 _LONGEST_GAP = 0.15  # what a hand did across a longer one is not judged [s]
@@ -105,8 +94,6 @@ _CHORD_SEEN = 0.01  # before a pose that they moved, whoever follows it shall ha
 
 
 class PoseVerdict(Enum):
-    """What becomes of a pose."""
-
     FOLLOW = "as it is"
     WAIT = "not before the other hand's next pose has come"
     DROP = "nobody needs to see it: what it means is told soon"
@@ -139,18 +126,18 @@ class MovedFrame:
             self._chords.pop(hand, None)
 
     def receive(self, hand: str, pose: HandPose, now: float) -> PoseVerdict:
-        """Judge a pose."""
         place = Place.of(pose)
         if self._chords or place is None:
             self._ways[hand] = _Way()
             just_now = now - min(self._chords.values(), default=-math.inf) < _CHORD_SEEN
             return PoseVerdict.DROP if just_now else PoseVerdict.FOLLOW
-        way, other = self._ways[hand], self._ways[_other(hand)]
+        way, other = self._ways[hand], self._ways["right" if hand == "left" else "left"]
         if not way.add(place, now):
             self._pairs.clear()
-        pair = self._pair(way, other, now)
-        if pair is not None:
-            self._judge(pair, now)
+        other.is_new = other.is_new and now - other.stamp <= _SAME_TIME
+        if other.is_new:  # the counterpart of this one
+            way.is_new = other.is_new = False
+            self._judge(HandPair.of(now, *(self._ways[side].place for side in SIDES)), now)
         if self._suspected is not None:
             if now - self._suspected < _CHORD_TIME:
                 return PoseVerdict.DROP
@@ -159,18 +146,6 @@ class MovedFrame:
             return PoseVerdict.FAULT
         waits = way.stands_out and way.is_new and now - other.stamp < _ALIVE
         return PoseVerdict.WAIT if waits else PoseVerdict.FOLLOW
-
-    def _pair(self, way: _Way, other: _Way, now: float) -> HandPair | None:
-        """Both hands, where the one that just came has its counterpart."""
-        if now - other.stamp > _SAME_TIME:
-            other.is_new = False
-        if not other.is_new:
-            return None
-        way.is_new = other.is_new = False
-        places = [self._ways[hand].place for hand in SIDES]
-        assert places[0] is not None
-        assert places[1] is not None
-        return HandPair.of(now, places[0], places[1])
 
     def _judge(self, pair: HandPair, now: float) -> None:
         pairs = self._pairs
@@ -194,8 +169,9 @@ class MovedFrame:
 class _Way:
     """What one hand did of late."""
 
+    place: Place  # after the first one was added
+
     def __init__(self) -> None:
-        self.place: Place | None = None
         self.stamp = -math.inf
         self.is_new = False  # and has no counterpart of the other hand yet
         self.stands_out = False  # among the moves before
@@ -203,16 +179,18 @@ class _Way:
 
     def add(self, place: Place, now: float) -> bool:
         """The newest place; returns whether it goes on from the last one."""
-        last, gap = self.place, now - self.stamp
-        self.place, self.stamp, self.is_new = place, now, True
-        if last is None or gap > _LONGEST_GAP:
+        gap = now - self.stamp
+        goes_on = gap <= _LONGEST_GAP
+        if goes_on:
+            angle = math.hypot(*pin.log3(self.place.rotation.T @ place.rotation))
+            move = Move(math.dist(place.position, self.place.position), angle)
+            self.stands_out = len(self._moves) == _BEFORE and self._is_step(move, gap)
+            self._moves.append(move)
+        else:
             self._moves.clear()
             self.stands_out = False
-            return False
-        move = place.move_from(last)
-        self.stands_out = len(self._moves) == _BEFORE and self._is_step(move, gap)
-        self._moves.append(move)
-        return True
+        self.place, self.stamp, self.is_new = place, now, True
+        return goes_on
 
     def _is_step(self, move: Move, gap: float) -> bool:
         scale, usual = max(gap / _STEP_GAP, 1.0) ** 2, _STANDS_OUT * max(gap / _PERIOD, 1.0)
@@ -224,14 +202,13 @@ class _Way:
 def _carried(pairs: deque[HandPair]) -> bool:
     """Whether the newest of ``pairs`` is far from an earlier one, and all in between differ by rigid motions only."""
     newest = pairs[-1]
-    for index in range(len(pairs) - 2, -1, -1):
-        if not moved_as_one(pairs[index], newest, _CARRIED_TOLERANCE):
+    for pair in list(pairs)[-2::-1]:
+        if not moved_as_one(pair, newest, _CARRIED_TOLERANCE):
             return False
-        hands = ((pairs[index].left, newest.left), (pairs[index].right, newest.right))
-        if all(math.dist(before.position, after.position) > _CARRIED for before, after in hands):
+        ways = (
+            math.dist(pair.left.position, newest.left.position),
+            math.dist(pair.right.position, newest.right.position),
+        )
+        if min(ways) > _CARRIED:
             return True
     return False
-
-
-def _other(hand: str) -> str:
-    return "right" if hand == "left" else "left"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -21,10 +21,7 @@ _ROTATION_NOISE = math.radians(0.03)
 
 
 class SampleTiming(ABC):
-    """How the samples of one hand come about: exact and at once, unless a subclass says otherwise.
-
-    For each of ``times`` ``measured`` is asked first, then ``lateness``.
-    """
+    """How the samples of one hand come about; at each of ``times``, ``measured`` is asked first, then ``lateness``."""
 
     @abstractmethod
     def times(self) -> Iterator[float]:
@@ -79,7 +76,9 @@ class HeadsetSampling(SampleTiming):
         t = 0.0
         while True:
             yield t
-            t += self._interval()
+            drops_out = self._random.random() < self._dropout_probability
+            lost = int(self._random.integers(1, _LONGEST_DROPOUT + 1)) if drops_out else 0
+            t += float(sum(1.0 / self._random.uniform(*_RATES, 1 + lost)))
 
     def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
         tones = np.sin(2.0 * math.pi * self._frequencies * t + self._phases).sum(axis=1)
@@ -92,12 +91,6 @@ class HeadsetSampling(SampleTiming):
         """Short of a sample's period, so that the order is kept."""
         return min(float(self._random.exponential(_RECEIPT_JITTER)), 0.01)
 
-    def _interval(self) -> float:
-        """Time to the next sample that is not lost [s]."""
-        drops_out = self._random.random() < self._dropout_probability
-        lost = int(self._random.integers(1, _LONGEST_DROPOUT + 1)) if drops_out else 0
-        return float(sum(1.0 / self._random.uniform(*_RATES, 1 + lost)))
-
 
 HandPose = Callable[[str, float], pin.SE3]  # hand, time since the first poll [s] -> pose in the input's frame
 HandButtons = Callable[[str, float], HandInputs]  # hand, time since the first poll [s]
@@ -107,10 +100,7 @@ _LONGEST_BACKLOG = 1.0
 
 
 class PlayedInput:
-    """Samples of hands along given ways, from the first poll on. Implements :class:`Input`.
-
-    The samples of each hand come about as its ``samplings`` say, and do not depend on when they are polled.
-    """
+    """Samples of hands along given ways, from the first poll on, whenever it is polled. Implements :class:`Input`."""
 
     controls = QUEST_CONTROLS
 
@@ -124,15 +114,12 @@ class PlayedInput:
 
     @property
     def connected(self) -> bool:
-        """Between ``start`` and ``close``."""
         return self._connected
 
     def start(self) -> None:
-        """Let polls return samples."""
         self._connected = True
 
     def close(self) -> None:
-        """Let polls return nothing any more."""
         self._connected = False
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
@@ -154,36 +141,24 @@ class PlayedInput:
         self._origin += max(backlog - _LONGEST_BACKLOG, 0.0)
         samples = []
         for index, stream in enumerate(self._streams):
-            while self._next[index].due <= now - self._origin:
-                samples.append(self._next[index].received(self._origin))
+            while (due := self._next[index].pose_stamp) <= now - self._origin:
+                stamp = self._origin + due
+                samples.append(replace(self._next[index], pose_stamp=stamp, inputs_stamp=stamp))
                 self._next[index] = next(stream)
         self._due = self._first_due()
         return sorted(samples, key=lambda sample: sample.pose_stamp)
 
     def due(self) -> float:
         """When the next sample comes due, on the clock of the polls [s]; inf where there was no poll yet."""
-        if self._origin is None:
-            return math.inf
-        return self._origin + self._due
+        return math.inf if self._origin is None else self._origin + self._due
 
     def _first_due(self) -> float:
         """When the next sample comes due in play time [s]; inf where there is no hand."""
-        return min((sample.due for sample in self._next), default=math.inf)
+        return min((sample.pose_stamp for sample in self._next), default=math.inf)
 
-    def _samples(self, hand: str, sampling: SampleTiming) -> Iterator[_Played]:
+    def _samples(self, hand: str, sampling: SampleTiming) -> Iterator[HandSample]:
+        """With their receipt in play time as stamps."""
         for t in sampling.times():
             pose = sampling.measured(self._pose(hand, t), t)
-            yield _Played(t + sampling.lateness(), hand, pose, self._inputs(hand, t))
-
-
-@dataclass(frozen=True, slots=True)
-class _Played:
-    due: float  # receipt in play time [s]
-    hand: str
-    pose: pin.SE3
-    inputs: HandInputs
-
-    def received(self, origin: float) -> HandSample:
-        stamp = origin + self.due
-        quaternion = pin.Quaternion(self.pose.rotation).coeffs()
-        return HandSample(self.hand, self.pose.translation.copy(), quaternion, stamp, self.inputs, stamp)
+            due, quaternion = t + sampling.lateness(), pin.Quaternion(pose.rotation).coeffs()
+            yield HandSample(hand, pose.translation.copy(), quaternion, due, self._inputs(hand, t), due)

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.framing import KEEPALIVE, WireFrame, encode_frame
 from q2r2_control.inputs.messages import (
     Dialect,
     HandMessage,
     MessageType,
+    WireFrame,
     decode,
     encode,
+    encode_frame,
     fits,
 )
 from q2r2_control.types import SIDES, HapticFeedback
@@ -27,8 +27,7 @@ MAX_TOPICS = 64  # a client may name; the app names about ten
 MAX_INCOMPLETE = 64  # registrations without topic or type that are answered in one session
 
 
-@dataclass(frozen=True, slots=True)
-class HandTopic:
+class HandTopic(NamedTuple):
     """A topic that the app publishes."""
 
     hand: str
@@ -76,14 +75,14 @@ class _IncompleteRegistrationError(Exception):
 class HeadsetSession:
     """Protocol state of one client: frames in through :meth:`receive`, bytes out through :attr:`outgoing`.
 
-    The server sends first, before the client's dialect is known. It uses ROS2, the one that Quest2ROS2's users
-    set; an app that is set to ROS1 logs an error on its own side and goes on. The dialect is read from the NUL that
-    only ROS2 clients put behind every destination, then each payload has to fit it: no message is read by guessing.
+    The server sends first, in ROS2, before the client's dialect is known; an app that is set to ROS1 logs an error and
+    goes on. The dialect is read from the NUL that only ROS2 clients put behind every destination, then each payload has
+    to fit it: no message is read by guessing.
 
-    Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration with an empty topic or type is a field
-    that the app's user has left empty: as from Unity's own endpoint, the answer is an error for the app's console.
-    An unknown command, a name that no topic can have, or a payload that its topic cannot have shows that the two sides
-    do not speak the same protocol: :class:`ProtocolError`.
+    Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration with an empty topic or type, a field
+    that the app's user has left empty, is answered with an error for the app's console, as by Unity's own endpoint. An
+    unknown command, a name that no topic can have, or a payload that its topic cannot have is a
+    :class:`ProtocolError`: the two sides do not speak the same protocol.
     """
 
     def __init__(self) -> None:
@@ -91,16 +90,21 @@ class HeadsetSession:
         self.published: dict[str, str] = {}  # topic without leading slash -> type, as registered
         self.subscribed: dict[str, str] = {}  # topic without leading slash -> its spelling, which the client listens to
         self.unknown_topics: Counter[str] = Counter()
-        self.outgoing = bytearray()
+        self.outgoing = bytearray(HANDSHAKE)
         self._skip_body = False
         self._incomplete = 0
-        self.outgoing += HANDSHAKE
 
     def receive(self, frame: WireFrame) -> Reception | None:
         """Take one frame; the hand's message if it was one. Raises :class:`ProtocolError`: drop the client."""
-        if frame.is_keepalive:
-            return None
-        self._agree_on_dialect(frame)
+        if not frame.destination and not frame.payload:
+            return None  # a keepalive
+        dialect = Dialect.ROS2 if frame.terminated else Dialect.ROS1
+        if dialect is not (self.dialect or dialect):
+            raise ProtocolError(
+                f"destination {frame.destination!r:.60} ends {'with' if frame.terminated else 'without'} NUL, which "
+                f"is the {dialect} dialect; earlier ones were {self.dialect}"
+            )
+        self.dialect = dialect
         if self._skip_body:
             self._skip_body = False
             return None
@@ -113,11 +117,7 @@ class HeadsetSession:
                     raise ProtocolError(f"more than {MAX_INCOMPLETE} registrations without topic or type") from error
                 self._answer("__error", {"text": str(error)})
             return None
-        return self._data(frame)
-
-    def queue_keepalive(self) -> None:
-        """Tell the client that the server is alive."""
-        self.outgoing += KEEPALIVE
+        return self._data(frame, dialect)
 
     def queue_haptic(self, vibration: HapticFeedback) -> None:
         """Send a vibration, if the client listens; otherwise nothing happens."""
@@ -125,31 +125,20 @@ class HeadsetSession:
         if destination is not None and self.dialect is not None:
             self.outgoing += encode_frame(destination, encode(vibration, self.dialect))
 
-    def _agree_on_dialect(self, frame: WireFrame) -> None:
-        dialect = Dialect.ROS2 if frame.terminated else Dialect.ROS1
-        if self.dialect is None:
-            self.dialect = dialect
-        elif dialect is not self.dialect:
-            raise ProtocolError(
-                f"destination {frame.destination!r:.60} ends {'with' if frame.terminated else 'without'} NUL, which "
-                f"is the {dialect} dialect; earlier ones were {self.dialect}"
-            )
-
-    def _data(self, frame: WireFrame) -> Reception | None:
-        assert self.dialect is not None  # set by _agree_on_dialect
+    def _data(self, frame: WireFrame, dialect: Dialect) -> Reception | None:
         name = _topic_name(frame.destination)
         topic = HAND_TOPICS.get(name)
         if topic is None:
             if name in self.unknown_topics or len(self.unknown_topics) < MAX_TOPICS:
                 self.unknown_topics[name] += 1
             return None
-        if fits(topic.kind, frame.payload, self.dialect.other):
+        if fits(topic.kind, frame.payload, dialect.other):
             raise ProtocolError(
-                f"{name}: {len(frame.payload)} bytes are a message of the {self.dialect.other} dialect, "
-                f"but the destination is written as in {self.dialect}"
+                f"{name}: {len(frame.payload)} bytes are a message of the {dialect.other} dialect, "
+                f"but the destination is written as in {dialect}"
             )
         try:
-            return Reception(name, topic.hand, decode(topic.kind, frame.payload, self.dialect))
+            return Reception(name, topic.hand, decode(topic.kind, frame.payload, dialect))
         except ProtocolError as error:
             raise ProtocolError(f"{name}: {error}") from error
 
@@ -157,28 +146,33 @@ class HeadsetSession:
         command = frame.destination
         parameters = _parameters(command, frame.payload)
         match command:
-            case "__publish":
-                _register(self.published, *_topic_and_type(command, parameters))
-            case "__subscribe":
-                topic, _ = _topic_and_type(command, parameters)
-                _register(self.subscribed, topic, parameters["topic"])
-            case "__remove_publisher":
-                self.published.pop(_topic(command, parameters), None)
-            case "__remove_subscriber":
-                self.subscribed.pop(_topic(command, parameters), None)
+            case "__publish" | "__subscribe" | "__remove_publisher" | "__remove_subscriber":
+                self._register(command, parameters)
             case "__topic_list":
                 types = _TOPIC_TYPES | self.published
                 names = [f"/{name}" for name in types]  # as in the ROS graph
                 self._answer("__topic_list", {"topics": names, "types": list(types.values())})
             case "__ros_service" | "__unity_service" | "__remove_ros_service" | "__remove_unity_service":
                 pass  # there are none
-            case "__request":
+            case "__request" | "__response":
                 self._skip_body = True
-                self._answer("__error", {"text": "__request: q2r2 offers no services"})
-            case "__response":
-                self._skip_body = True  # not requested
+                if command == "__request":
+                    self._answer("__error", {"text": "__request: q2r2 offers no services"})
             case _:
                 raise ProtocolError(f"unknown system command {command!r:.60}")
+
+    def _register(self, command: str, parameters: dict[str, Any]) -> None:
+        """Idempotent: the app may register again at any time."""
+        written = _text(command, parameters, "topic")
+        topic = _topic_name(written)
+        registrations = self.published if "publish" in command else self.subscribed
+        if command.startswith("__remove"):
+            registrations.pop(topic, None)
+            return
+        kind = _text(command, parameters, "message_name", f" of {topic}")
+        registrations[topic] = kind if registrations is self.published else written
+        if len(registrations) > MAX_TOPICS:
+            raise ProtocolError(f"more than {MAX_TOPICS} topics registered")
 
     def _answer(self, command: str, parameters: dict[str, Any]) -> None:
         self.outgoing += encode_frame(command, json.dumps(parameters).encode())
@@ -199,21 +193,12 @@ def _parameters(command: str, payload: bytes) -> dict[str, Any]:
     return parameters
 
 
-def _topic(command: str, parameters: dict[str, Any]) -> str:
-    return _topic_name(_text(command, parameters, "topic"))
-
-
-def _topic_and_type(command: str, parameters: dict[str, Any]) -> tuple[str, str]:
-    topic = _topic(command, parameters)
-    return topic, _text(command, parameters, "message_name", f" of {topic}")
-
-
 def _text(command: str, parameters: dict[str, Any], key: str, whose: str = "") -> str:
-    value = parameters.get(key, "")
-    if value is None or value == "" or (isinstance(value, str) and value.isspace()):
-        raise _IncompleteRegistrationError(f"{command}: {key}{whose} is empty; this registration is left out")
-    if not isinstance(value, str):
+    value = parameters.get(key)
+    if value is not None and not isinstance(value, str):
         raise ProtocolError(f"{command}: {key} is a string, got a {type(value).__name__}")
+    if not value or value.isspace():
+        raise _IncompleteRegistrationError(f"{command}: {key}{whose} is empty; this registration is left out")
     return value
 
 
@@ -225,15 +210,7 @@ def _topic_name(name: str) -> str:
     return bare
 
 
-def _register(registrations: dict[str, str], topic: str, value: str) -> None:
-    """Idempotent: the app may register again at any time."""
-    registrations[topic] = value
-    if len(registrations) > MAX_TOPICS:
-        raise ProtocolError(f"more than {MAX_TOPICS} topics registered")
-
-
-RATE_WINDOW = 1.0  # [s]
-_STAMPS_KEPT = 1000  # more than any headset sends in RATE_WINDOW
+_STAMPS_KEPT = 1000  # more than any headset sends in a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,36 +238,21 @@ class HeadsetStatistics:
     last_disconnect: str | None  # reason
 
 
-class Arrivals:
-    """Counts the messages of one topic. Times are receipt times [s]."""
-
-    def __init__(self) -> None:
-        self._stamps: deque[float] = deque(maxlen=_STAMPS_KEPT)
-        self.count = 0
-
-    def note(self, now: float) -> None:
-        """A message has come."""
-        self._stamps.append(now)
-        self.count += 1
-
-    def rate(self, now: float) -> float:
-        """Messages in the last second [Hz]."""
-        return sum(stamp > now - RATE_WINDOW for stamp in self._stamps) / RATE_WINDOW
-
-    def age(self, now: float) -> float:
-        """Time since the last message [s]; infinite before the first."""
-        return now - self._stamps[-1] if self._stamps else math.inf
-
-
-class TopicRecorder(Arrivals):
-    """Counts the messages of one topic, and keeps the last."""
+class TopicRecorder:
+    """Counts the messages of one topic, and keeps the last. Times are receipt times [s]."""
 
     _last: HandMessage
 
+    def __init__(self) -> None:
+        self._stamps: deque[float] = deque(maxlen=_STAMPS_KEPT)
+        self._count = 0
+
     def record(self, message: HandMessage, now: float) -> None:
-        self.note(now)
+        self._stamps.append(now)
+        self._count += 1
         self._last = message
 
     def snapshot(self, now: float) -> TopicStatistics:
         """The figures at ``now`` [s]; only after the first :meth:`record`."""
-        return TopicStatistics(self.count, self.rate(now), self.age(now), self._last)
+        rate = float(sum(stamp > now - 1.0 for stamp in self._stamps))
+        return TopicStatistics(self._count, rate, now - self._stamps[-1], self._last)

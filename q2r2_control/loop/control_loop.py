@@ -11,9 +11,8 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import Drive, DriveReport
 from q2r2_control.events import Reason
-from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.gripper_limiter import REMEMBERED, STALL, GraspWatch, GripperLimiter
-from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.supervision.joint_watch import ExternalArms, WatchSettings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer

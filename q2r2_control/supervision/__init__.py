@@ -2,5 +2,5 @@
 
 ``supervisor`` decides at every tick which targets the controller gets and whether the arms may move. ``joint_watch``
 judges measured states, ``targets`` and ``target_stream`` who is followed. ``homing`` moves arms without targets.
-``pose_rate_limiter`` limits targets for controllers that have no limits of their own. No ROS and no clock in here.
+``tick_pacer`` judges late ticks, and limits targets for controllers that have no limits. No ROS and no clock in here.
 """

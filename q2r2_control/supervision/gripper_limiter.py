@@ -1,11 +1,10 @@
-"""How far grippers may be opened and closed: as far as the controller has proven their fingers' bodies.
+"""How far grippers may be opened and closed, and which of them hold an object.
 
 The controller counts the fingers of an arm as what they sweep between two openings. That interval has to hold where the
 gripper is and where it may go: what was measured and what was commanded a moment ago, with a tolerance. A gripper is
 commanded to openings in the accepted interval only, opening or closing: fingers that turn reach farther forward as they
-close. Others go on in steps that are halved where the certificate fails and doubled where it holds. A gripper that has
-moved takes up less room: of fingers that slide at no cost, of those that turn as soon as that is proven, and until then
-the wider interval counts, which holds where the gripper is too.
+close. Others go on in steps that are halved where the certificate fails and doubled where it holds. A smaller interval
+counts as soon as it is proven, and until then the wider one, which holds where the gripper is too.
 """
 
 from __future__ import annotations
@@ -19,37 +18,29 @@ from q2r2_control.types import Interval
 # How exactly openings are measured, and how far a finger overshoots, on the way of one finger [m]. Half of it is
 # there always, so that a measurement that trembles does not ask at every tick.
 TOLERANCE = 0.001
-# Least step that is asked for, and least change for which bodies are worked out anew [m].
-_FINEST = 0.0005
-# What was measured or commanded counts for at least this long: the delay of a gripper that is allowed for [s].
-REMEMBERED = 0.05
-# A gripper that is held at its finest step asks again after this time [s].
-_PATIENCE = 0.005
+_FINEST = 0.0005  # least step that is asked for, and least change for which bodies are worked out anew [m]
+REMEMBERED = 0.05  # what was measured or commanded counts for at least this long [s]
+_PATIENCE = 0.005  # after which a gripper that is held at its finest step asks again [s]
 _BELIEVABLE = (-0.2, 1.2)  # measured openings; a finger may go a little beyond its calibrated ends
 
 
 class GripperLimiter:
     """Turns wanted openings into those that may be commanded, for every arm whose opening is measured.
 
-    Others are passed through, and their fingers stay all of their way. Begins as the controller does after
-    :meth:`CartesianController.reset`, with all fingers all of their way, and is made anew with it.
+    Others are passed through, and their fingers stay all of their way. To be made anew whenever the controller is
+    reset, which begins with all fingers all of their way too.
     """
 
     def __init__(self, controller: CartesianController, remembered: float = REMEMBERED) -> None:
         """``remembered``: the delay of a gripper that is allowed for [s]."""
         self._controller = controller
-        arms = controller.robot.arms
-        self._grippers = {
-            name: _Gripper(arm.finger_way, remembered) for name, arm in arms.items() if arm.finger_way > 0.0
-        }
+        ways = {name: arm.finger_way for name, arm in controller.robot.arms.items()}
+        self._grippers = {name: _Gripper(way, remembered) for name, way in ways.items() if way > 0.0}
         self.held: dict[str, tuple[str, str]] = {}  # arm -> pair of bodies that keeps its gripper from going on
         self.changed = False  # whether the controller's openings did, in the last tick
 
     def limit(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> dict[str, float]:
-        """What may be commanded at ``now`` [s], before the controller's step; openings 0 closed .. 1 fully open.
-
-        Where a measured opening is missing, or is no opening, the gripper stays commanded as it was.
-        """
+        """What may be commanded at ``now`` [s], 0 closed .. 1 open; as it was where nothing believable is measured."""
         self.changed = False
         granted = dict(wanted)
         for arm, gripper in self._grippers.items():
@@ -62,10 +53,7 @@ class GripperLimiter:
         return granted
 
     def resume(self, commanded: Mapping[str, float], measured: Mapping[str, float], now: float) -> None:
-        """Begin with grippers that have been ``commanded`` already: their fingers take up no more than they do at once.
-
-        So that arms which came to rest near each other with closed grippers are not too close to go on.
-        """
+        """Begin with grippers that were ``commanded`` already: closed fingers take up no more than they do at once."""
         for arm, gripper in self._grippers.items():
             if arm in commanded and _BELIEVABLE[0] <= measured.get(arm, math.nan) <= _BELIEVABLE[1]:
                 gripper.granted = commanded[arm]
@@ -172,8 +160,7 @@ def _hull(first: Interval, second: Interval) -> Interval:
 
 # How much farther open than asked each finger is that holds something, and that does not any more [m or rad].
 _SQUEEZES, _SLIPPED = 0.002, 0.001
-# A finger that moves by less than this in that time is held up [m or rad], [s]. A gripper may take a while to begin.
-_STILL, STALL = 0.0005, 0.2
+_STILL, STALL = 0.0005, 0.2  # a finger that moves by less than this in that time is held up [m or rad], [s]
 _CLOSED = 0.5  # a gripper that is not measured is taken as closed below this opening
 
 
@@ -193,10 +180,7 @@ class GraspWatch:
                 self._controller.set_holding(arm, True)
 
     def update(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> bool:
-        """Look at wanted and measured openings at ``now`` [s], before the controller's step; whether something changed.
-
-        Openings are 0 closed .. 1 fully open. While a measurement fails, what was known stays.
-        """
+        """Look at openings, 0 closed .. 1 open, at ``now`` [s], before the controller's step; whether one changed."""
         changed = False
         for arm, grip in self._grips.items():
             if arm in wanted:
@@ -216,16 +200,15 @@ class Grip:
         self._seen, self._since = math.nan, -math.inf  # opening, and since when it has been about that [s]
 
     def look(self, wanted: float, measured: float | None, now: float) -> bool:
+        """Whether it holds something, after another ``measured`` opening; None: it has no measurement."""
         if measured is None and math.isnan(self._seen):
             self.holds = wanted < _CLOSED
         elif measured is not None and math.isfinite(measured):
-            self._judge((measured - wanted) * self._stroke, measured * self._stroke, now)
+            squeezed, opening = (measured - wanted) * self._stroke, measured * self._stroke
+            if squeezed <= _SLIPPED:
+                self.holds = False
+            if squeezed <= _SQUEEZES or not abs(opening - self._seen) <= _STILL:
+                self._seen, self._since = opening, now
+            elif now - self._since >= self._stall:
+                self.holds = True
         return self.holds
-
-    def _judge(self, squeezed: float, opening: float, now: float) -> None:
-        if squeezed <= _SLIPPED:
-            self.holds = False
-        if squeezed <= _SQUEEZES or not abs(opening - self._seen) <= _STILL:
-            self._seen, self._since = opening, now
-        elif now - self._since >= self._stall:
-            self.holds = True

@@ -1,16 +1,19 @@
-"""The way home, or another way that all arms are led along instead of following targets, and how it ended."""
+"""The way home, along which all arms are led instead of following targets; and where no run may begin at home."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Mapping
-from itertools import pairwise
+from collections.abc import Callable, Iterator, Mapping
+from itertools import islice, pairwise
 
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.robot import Robot
+from q2r2_control.supervision.target_stream import apart
 from q2r2_control.types import Array, Reference
 
 _SPEED = 0.3  # of the fastest joint [rad/s]
@@ -31,10 +34,9 @@ class JointHoming:
 
     def __init__(self, robot: Robot, kept: Array, goal: Array) -> None:
         """``kept`` (pairs,) [m]: what each monitored pair keeps; ``goal`` (nv,) [rad]."""
-        self._robot, self._kept = robot, kept
-        self._goal = goal
+        self._robot, self._kept, self._goal = robot, kept, goal
         self._needed = kept
-        self._search: Iterator[tuple[Array, ...]] | None = None
+        self._search: Iterator[list[Array] | None] | None = None
         self._points: list[Array] | None = None  # still to be reached, the goal last
         self._at = self._leg = self._goal  # where the joints shall be, and where the leg to the next point began
         self._share = 0.0  # of the leg
@@ -43,10 +45,7 @@ class JointHoming:
         self.outcome: ReasonKind | None = None  # how it ended
 
     def step(self, q: Array, v: Array, dt: float) -> Array | None:
-        """Where the joints shall be (nv,) after another ``dt`` [s], with the reference at ``q`` and ``v`` (nv,).
-
-        None: where they come to rest.
-        """
+        """Where the joints shall be (nv,) in ``dt`` [s], with the reference at ``q``, ``v``; None: where they rest."""
         if self._search is None:
             if float(np.abs(v).max()) > _AT_REST:
                 return None
@@ -55,24 +54,16 @@ class JointHoming:
             self._at = self._leg = q.copy()
             self._search = self._ways(self._at)
         if self._points is None:
-            self._look(self._search)
+            found = (way for way in islice(self._search, _SAMPLES_A_TICK) if way is not None)
+            self._points = next(found, None)
+            if self._points == []:
+                self.outcome = ReasonKind.HOMING_NO_WAY
         elif self._points:
-            self._go(q, dt)
+            self._go(self._points, q, dt)
         return self._at
 
-    def _look(self, search: Iterator[tuple[Array, ...]]) -> None:
-        for _ in range(_SAMPLES_A_TICK):
-            found = next(search, None)
-            if found is None:
-                self.outcome = ReasonKind.HOMING_NO_WAY
-                return
-            if found:
-                self._points = list(found)
-                return
-
-    def _go(self, q: Array, dt: float) -> None:
-        assert self._points
-        goal, last = self._points[0], len(self._points) == 1
+    def _go(self, points: list[Array], q: Array, dt: float) -> None:
+        goal, last = points[0], len(points) == 1
         way = goal - self._leg
         lag = float(np.abs(self._at - q).max())
         rate = min(max((_WAITED - lag) / (_WAITED - _SLOWED), 0.0), 1.0)
@@ -84,25 +75,25 @@ class JointHoming:
         else:
             self._waited += dt
         if self._share == 1.0 and left < (_GOAL_REACHED if last else _POINT_REACHED):
-            self._points.pop(0)
+            points.pop(0)
             self._leg, self._share = goal, 0.0
             self._least_left, self._waited = np.inf, 0.0
             self.outcome = ReasonKind.HOMING_ARRIVED if last else None
         elif self._waited > _LONGEST_WAIT:
             self.outcome = ReasonKind.HOMING_HELD_UP
 
-    def _ways(self, start: Array) -> Iterator[tuple[Array, ...]]:
-        """Samples one way after the other: an empty tuple after each sample, and the way points of one that is free."""
-        goal = self._goal
+    def _ways(self, start: Array) -> Iterator[list[Array] | None]:
+        """Samples one way after the other: None for each sample, the points of a free way, [] after the last."""
         for between in self._candidates(start):
-            points = [start, *between, goal]
-            for a, b in pairwise(points):
-                free = yield from self._sample(a, b)
-                if not free:
+            points = [start, *between, self._goal]
+            for posture in _samples(points):
+                yield None
+                if (self._robot.distance_values(posture) < self._needed).any():
                     break
             else:
-                yield (*between, goal)
+                yield points[1:]
                 return
+        yield []
 
     def _candidates(self, start: Array) -> Iterator[tuple[Array, ...]]:
         """Way points between ``start`` and the goal."""
@@ -118,14 +109,13 @@ class JointHoming:
             point = middle + random.normal(0.0, _SPREAD, len(goal))
             yield (np.clip(point, robot.position_lower + _INSIDE, robot.position_upper - _INSIDE),)
 
-    def _sample(self, a: Array, b: Array) -> Generator[tuple[Array, ...], None, bool]:
-        """Whether every pair has room all the way; the end first, since a bad way point is not worth the way there."""
+
+def _samples(points: list[Array]) -> Iterator[Array]:
+    """Postures along a way; the end of each leg first, since a bad way point is not worth the way there."""
+    for a, b in pairwise(points):
         count = max(int(np.abs(b - a).max() / _SAMPLE), 1)
         for share in (1.0, *(i / count for i in range(1, count))):
-            yield ()
-            if (self._robot.distance_values(a + share * (b - a)) < self._needed).any():
-                return False
-        return True
+            yield a + share * (b - a)
 
 
 _LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # [m/s], [rad/s]
@@ -134,54 +124,40 @@ _PATIENCE = 5.0  # after the targets have arrived [s]
 
 
 class ToolHoming:
-    """Targets on a straight line from where the tools are to where they are at home, all arms at once.
-
-    The QP keeps limits and distances on the way, and the posture's pull brings the elbows home; where it holds the
-    tools up the homing ends there.
-    """
+    """Targets on straight lines home for all tools at once; where the QP holds one up, the homing ends there."""
 
     def __init__(self, home: Mapping[str, pin.SE3], tool_pose: Callable[[str], pin.SE3]) -> None:
         """``tool_pose``: where the controller's reference has an arm's tool."""
         self._home, self._tool_pose = dict(home), tool_pose
         self._start = {arm: tool_pose(arm) for arm in home}
-        self._duration = max(self._needed(arm) for arm in home)
+        ways = [apart(start, home[arm]) for arm, start in self._start.items()]
+        self._duration = max(max(way / _LINEAR_SPEED, turn / _ANGULAR_SPEED, 0.1) for way, turn in ways)
         self._time = 0.0
 
     def targets(self, dt: float) -> dict[str, pin.SE3 | None]:
         """Where the tools have to be after another ``dt`` [s]."""
         self._time += dt
         share = min(self._time / self._duration, 1.0)
-        return {arm: _between(start, self._home[arm], share) for arm, start in self._start.items()}
+        targets: dict[str, pin.SE3 | None] = {}
+        for arm, start in self._start.items():
+            way = self._home[arm].translation - start.translation
+            turn = pin.log3(start.rotation.T @ self._home[arm].rotation)
+            targets[arm] = pin.SE3(start.rotation @ pin.exp3(share * turn), start.translation + share * way)
+        return targets
 
     @property
     def outcome(self) -> ReasonKind | None:
         """How the homing ended, or None while it goes on."""
         if self._time < self._duration:
             return None
-        errors = [self._tool_pose(arm).actInv(home) for arm, home in self._home.items()]
-        ways = [(np.linalg.norm(error.translation), np.linalg.norm(pin.log3(error.rotation))) for error in errors]
-        if all(way <= _ARRIVED and turn <= _TURNED for way, turn in ways):
+        errors = [apart(self._tool_pose(arm), home) for arm, home in self._home.items()]
+        if all(way <= _ARRIVED and turn <= _TURNED for way, turn in errors):
             return ReasonKind.HOMING_ARRIVED
         return ReasonKind.HOMING_HELD_UP if self._time > self._duration + _PATIENCE else None
 
-    def _needed(self, arm: str) -> float:
-        start, home = self._start[arm], self._home[arm]
-        way = float(np.linalg.norm(home.translation - start.translation))
-        turn = float(np.linalg.norm(pin.log3(start.rotation.T @ home.rotation)))
-        return max(way / _LINEAR_SPEED, turn / _ANGULAR_SPEED, 0.1)
-
-
-def _between(start: pin.SE3, home: pin.SE3, share: float) -> pin.SE3:
-    turn = pin.log3(start.rotation.T @ home.rotation)
-    translation = start.translation + share * (home.translation - start.translation)
-    return pin.SE3(start.rotation @ pin.exp3(share * turn), translation)
-
 
 class Homing:
-    """Leads the joints of all arms; with ``tools_only`` the tools, where another controller moves the joints.
-
-    Only the supervisor begins a way, once the arms are active and have no targets any more; anybody may end it.
-    """
+    """Leads the joints of all arms; with ``tools_only`` the tools, where another controller moves the joints."""
 
     def __init__(self, robot: Robot, controller: CartesianController, tools_only: bool) -> None:
         self._robot, self._controller, self._tools_only = robot, controller, tools_only
@@ -191,11 +167,9 @@ class Homing:
 
     @property
     def active(self) -> bool:
-        """Whether the arms are led."""
         return self._way is not None
 
     def begin(self) -> None:
-        """Begin the way home."""
         self.outcome = None
         if self._tools_only:
             self._way = ToolHoming(self._home, self._controller.tool_pose)
@@ -203,10 +177,7 @@ class Homing:
             self._way = JointHoming(self._robot, self._controller.kept_distances, self._robot.home)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """What each tool is asked for after another ``dt`` [s] from the ``last`` reference, None: before the first.
-
-        Where the joints are led, no tool is asked for anything: the controller holds joint positions.
-        """
+        """What each tool is asked for in ``dt`` [s]: nothing where joints are led, from the ``last`` reference."""
         if isinstance(self._way, ToolHoming):
             return self._way.targets(dt)
         if self._way is not None and last is not None:
@@ -230,8 +201,36 @@ class Homing:
         self._way = None
 
     def hold(self) -> Reason | None:
-        """End the way home as :meth:`end` does. Returns why that is not possible: never, so None."""
+        """End the way home, and say so in :attr:`outcome`. Returns why that is not possible: never, so None."""
         if self.active:
             self.end()
             self.outcome = Reason(ReasonKind.HOMING_INTERRUPTED)
         return None
+
+
+def preflight_faults(
+    robot: Robot, settings: ControllerSettings, controller: CartesianController | None
+) -> tuple[str, ...]:
+    """One line for each reason why ``robot`` should not start at home; empty for a cell that may run.
+
+    Looked at are position limits with their margin, every monitored pair against the distance that it keeps, and
+    whether the ``controller`` knows a certified stop at home, where it is left reset; None: it moves nothing here.
+    """
+    lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
+    faults = [
+        f"home: {name} = {q:g}; allowed: {least:g} .. {most:g} rad, position_margin included"
+        for name, q, least, most in zip(robot.joint_names, robot.home, lower, upper, strict=True)
+        if not least <= q <= most
+    ]
+    too_close = too_close_at_home(robot, kept_distances(robot, settings))
+    faults += too_close
+    if controller is not None and not too_close:  # a pair that is too close leaves no certificate, and says more
+        controller.reset(robot.home)
+        report = controller.step({}, controller.settings.max_substep).report  # every arm holds
+        controller.reset(robot.home)
+        if not report.certified:
+            tightest = (
+                f"{' | '.join(report.tightest_pair)}, {1e3 * report.margin:.1f} mm farther apart than it has to be"
+            )
+            faults.append(f"home: the controller knows no certified stop from here; tightest pair: {tightest}")
+    return tuple(faults)

@@ -1,20 +1,24 @@
-"""Whether a measured state can be believed: finite, fresh, without jumps, and near what was commanded.
-
-At every tick, where sums and distances of lists of floats take half of the time of NumPy's.
-"""
+"""What measured joints say: whether they can be believed, and whether arms that others move keep apart."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from operator import sub
 
 import numpy as np
+import pinocchio as pin
 
+from q2r2_control.config.cell import Config
 from q2r2_control.config.control import SupervisionSettings
+from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.types import Array, RobotState
+from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.pairs import pair_names
+from q2r2_control.robot.robot import Robot
+from q2r2_control.supervision.target_stream import StreamSettings, apart
+from q2r2_control.types import Array, Reference, RobotState
 
 # Above what the joints may move between two states: noise, and stamps that a busy machine spreads.
 _JUMP_ALLOWANCE, _JUMP_TIME = 0.05, 0.02  # [rad], [s]
@@ -64,16 +68,11 @@ class JointWatch:
         self._near_at: float | None = None
 
     def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
-        """Judge a state, or what is wrong with it.
-
-        ``passed`` [s] since the state before, by the clock of a plant that has one of its own: a simulated plant makes
-        up for a late tick after it.
-        """
+        """Judge a state, or what is wrong with it, ``passed`` [s] after the last one on a simulated plant's clock."""
         if isinstance(state, Reason):
             self._fail(state)
             return
         q, external = state.q.tolist(), state.q if state.tau_external is None else state.tau_external
-        # The usual case costs one length; the joint is looked for only where there is something to say.
         known = math.isfinite(math.hypot(*q, *state.v.tolist(), *external.tolist()))
         if not known and (fault := self._unusable(state, external)):
             if now - self._stamp > self._settings.unusable_time:
@@ -140,22 +139,15 @@ class JointWatch:
         return -math.inf if self.state is None else self.state.stamp
 
     def _unusable(self, state: RobotState, external: Array) -> Reason | None:
+        kind, bridged = ReasonKind.STATE_NOT_FINITE, 1e3 * self._settings.unusable_time
         for what, values in (("position", state.q), ("velocity", state.v), ("external torque", external)):
-            if not np.isfinite(values).all():
-                worst = int(np.flatnonzero(~np.isfinite(values))[0])
-                return Reason.of(
-                    ReasonKind.STATE_NOT_FINITE,
-                    quantity=what,
-                    joint=self._names[worst],
-                    value=str(values[worst]),
-                    bridged=1e3 * self._settings.unusable_time,
-                )
+            for name, value in zip(self._names, values, strict=True):
+                if not math.isfinite(value):
+                    return Reason.of(kind, quantity=what, joint=name, value=str(value), bridged=bridged)
         return None
 
     def _jump(self, q: list[float], last: list[float], time: float) -> Reason | None:
         """The fault of a joint that moved farther than it can in ``time`` [s], else None."""
-        if _all_within(q, last, _JUMP_ALLOWANCE):
-            return None
         moved = np.abs(np.subtract(q, last))
         reach = self._velocity_limit * (time + _JUMP_TIME) + _JUMP_ALLOWANCE
         if not (moved > reach).any():
@@ -171,9 +163,94 @@ class JointWatch:
 
 
 def _all_within(q: list[float], other: list[float], limit: float) -> bool:
-    """Whether no value is farther from the other than ``limit``; not where one is not a number.
-
-    Most are nearer all together, which is told first.
-    """
+    """Whether no value is farther from the other than ``limit``; not where one is not a number."""
     distance = math.dist(q, other)
     return distance < limit or (math.isfinite(distance) and max(map(abs, map(sub, q, other))) <= limit)
+
+
+_SLOW = 0.01  # a held arm's joints are slower before its tool's pose is taken [rad/s]
+# How fast the reference's elbows follow the measured ones [1/s], [rad/s].
+_FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5}
+
+
+@dataclass(slots=True)
+class ExternalSettings:
+    """What is allowed of arms that another controller moves; may be changed at run time."""
+
+    tolerance: float = 0.01  # measured pairs may be closer by this than they are kept apart [m]
+
+
+def settings_for_external_arms(config: Config) -> Config:
+    """The cell's configuration with elbows that are free to follow."""
+    control = config.control.model_copy(update=_FOLLOW)
+    stiff = config.admittance.model_copy(update={"enabled": False})  # compliance is the other controller's
+    return config.model_copy(update={"control": control, "admittance": stiff})
+
+
+class ExternalArms:
+    """What the controller is asked for, and what is checked, of arms that another controller moves after its reference.
+
+    The reference keeps the arms apart only as far as the arms are where it is. For that reason its elbows follow the
+    measured ones, held tools keep their pose instead of joint positions, and measured pairs may not be closer than the
+    reference's may, less a tolerance for the lag of an arm.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        controller: CartesianController,
+        settings: ExternalSettings,
+        streams: StreamSettings,
+        watch: WatchSettings,
+    ) -> None:
+        self._robot, self._controller, self._settings = robot, controller, settings
+        self._streams, self._watch = streams, watch
+        self._keys = kept_distances(robot, controller.settings).keys
+        self._near_at: dict[str, float] = {}  # when an arm's tool was last seen near [s]
+        self._held: dict[str, pin.SE3] = {}
+
+    def begin(self) -> None:
+        self._held.clear()
+        self._near_at.clear()
+
+    def targets(self, wanted: dict[str, pin.SE3 | None], last: Reference | None) -> dict[str, pin.SE3 | None]:
+        """The same targets with the tool's own pose for each arm that has none and rests in the ``last`` reference."""
+        for arm, pose in wanted.items():
+            if pose is not None:
+                self._held.pop(arm, None)
+            elif arm not in self._held and (last is None or np.abs(last.v[self._robot.arms[arm].joints]).max() < _SLOW):
+                self._held[arm] = self._controller.tool_pose(arm)
+        return {arm: self._held.get(arm, pose) for arm, pose in wanted.items()}
+
+    def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> Reason | None:
+        """A reason where the tool of a ``holding`` arm has been away from its reference's for too long, else None.
+
+        Nothing moves that arm, and it could not be engaged: a stream has to begin where tool and reference both are.
+        """
+        holding = set(holding)
+        for arm in self._robot.arms:
+            tool, led = self._robot.tool_pose(state.q, arm), self._controller.tool_pose(arm)
+            way, turn = apart(tool, led)
+            near = way <= self._streams.engage_distance and turn <= self._streams.engage_angle
+            if near or arm not in holding or arm not in self._near_at:
+                self._near_at[arm] = now
+            elif now - self._near_at[arm] > self._watch.deviation_time:
+                return Reason.of(ReasonKind.LEFT_BEHIND, arm=arm, distance=way, angle=turn)
+        return None
+
+    def too_close(self, state: RobotState) -> Reason | None:
+        """A reason where a measured pair is closer than allowed, else None."""
+        distances, kept = self._robot.distance_values(state.q), self._controller.kept_distances
+        if (distances - kept).min(initial=np.inf) >= -self._settings.tolerance:
+            return None
+        tightest = int(np.argmin(distances - kept))
+        least, tolerance = kept[tightest], self._settings.tolerance
+        return Reason.of(
+            ReasonKind.TOO_CLOSE,
+            pair="|".join(pair_names(self._robot.collision_model)[tightest]),
+            distance=float(distances[tightest]),
+            allowed=float(least - tolerance),
+            key=self._keys[tightest],
+            kept=float(least),
+            tolerance=tolerance,
+        )

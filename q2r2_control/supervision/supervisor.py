@@ -20,9 +20,8 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
-from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.homing import Homing
-from q2r2_control.supervision.joint_watch import JointWatch, WatchSettings
+from q2r2_control.supervision.joint_watch import ExternalArms, JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
 from q2r2_control.types import Reference, RobotState
@@ -36,8 +35,6 @@ Displace = Callable[[dict[str, pin.SE3 | None], RobotState, float], dict[str, pi
 
 
 class Phase(StrEnum):
-    """What the supervisor lets happen."""
-
     INACTIVE = "inactive"  # waits for joint states that are good and at rest
     ACTIVE = "active"
     BRAKING = "braking"
@@ -60,8 +57,7 @@ class Supervisor:
         external: ExternalArms | None = None,
         displace: Displace | None = None,
     ) -> None:
-        self._robot, self._controller, self._external = robot, controller, external
-        self._displace = displace
+        self._robot, self._controller, self._external, self._displace = robot, controller, external, displace
         self._origins = origins or Origins()
         self.targets = TargetStreams(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
@@ -99,7 +95,6 @@ class Supervisor:
         return "following" if self.follows(arm) else "holding"
 
     def follows(self, arm: str) -> bool:
-        """Whether an arm follows its targets."""
         return self.phase is Phase.ACTIVE and self.targets.follows(arm)
 
     def update_state(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
@@ -115,8 +110,7 @@ class Supervisor:
     ) -> Reason | None:
         """A target in the world frame, or None for one that was no pose; returns why it is not followed, or None.
 
-        ``number`` is the one among its publisher's messages, where the middleware tells; ``due``: when the
-        target is to be reached [s], None: at once, and until the next one comes.
+        ``number``: among its publisher's messages, where known; ``due``: when it is to be reached [s], None: at once.
         """
         tools: list[pin.SE3] = []
         if not self.targets.follows_on(arm, now):
@@ -146,8 +140,9 @@ class Supervisor:
             return None
         if self.phase is Phase.ACTIVE and fault is not None:
             self._brake(Reason(ReasonKind.JOINT_STATES, cause=fault))
-        reference = self._step(self._wanted(now, dt), dt)
-        self._last = reference
+        self.events += self.targets.expire(now)
+        targets = self.homing.targets(self._last, dt) if self.homing.active else self.targets.at(now)
+        self._last = reference = self._step(targets, dt)
         if self.phase is Phase.ACTIVE:
             self._compare(reference, now)
             if outcome := self.homing.check(reference):
@@ -164,9 +159,7 @@ class Supervisor:
             targets = self._displace(targets, state, dt)
         if self._external is None:
             return self._controller.step(targets, dt)
-        reference = self._controller.step(self._external.targets(targets), dt, state.q)
-        self._external.note(reference)
-        return reference
+        return self._controller.step(self._external.targets(targets, self._last), dt, state.q)
 
     def _compare(self, reference: Reference, now: float) -> None:
         """Whether the arms are where the reference is. Those that another controller moves may have none that does."""
@@ -177,7 +170,7 @@ class Supervisor:
         elif too_close := self._external.too_close(state):
             self.stop(too_close)
         else:
-            holding = [arm for arm in self.targets.arms if not self.targets.follows(arm)]
+            holding = [arm for arm in self._robot.arms if not self.targets.follows(arm)]
             if behind := away or self._external.left_behind(state, holding, now):
                 self.start_over(behind, now)
 
@@ -189,8 +182,8 @@ class Supervisor:
     def stalled(self, duration: float, now: float) -> None:
         """The loop stood still for ``duration`` [s], and something else may have moved the arms meanwhile.
 
-        They have come to rest by themselves, so there is nothing to brake, and going on from the reference could be a
-        jump. They are activated anew where they rest; targets that waited are no new stream.
+        They rest by themselves, so there is nothing to brake, and going on from the reference could be a jump. They are
+        activated anew where they rest; targets that waited are no new stream.
         """
         if self.phase not in (Phase.ACTIVE, Phase.BRAKING):
             return
@@ -208,7 +201,7 @@ class Supervisor:
         return bool(((np.abs(state.q - self._last.q) > _OFF_REFERENCE) & (np.abs(state.v) < _STILL)).any())
 
     def let_go(self, fault: Reason, now: float) -> None:
-        """Nothing takes the commands, or something else than before, and the reference may have gone on meanwhile.
+        """Nothing takes an active arm's commands, or something else than before.
 
         Then nothing more is commanded, not even the way to rest, which would be a jump to the new receiver.
         """
@@ -278,7 +271,3 @@ class Supervisor:
     def _forget_targets(self) -> None:
         self.homing.end()
         self.targets.drop()
-
-    def _wanted(self, now: float, dt: float) -> dict[str, pin.SE3 | None]:
-        self.events += self.targets.expire(now)
-        return self.homing.targets(self._last, dt) if self.homing.active else self.targets.at(now)

@@ -1,10 +1,9 @@
 """Which targets an arm may follow: only those of a stream that began where the arm was.
 
-An arm follows a stream from its first target on, if that lies within ``engage_distance`` and ``engage_angle`` of the
-tool, as it does when an operator engages. A stream that begins elsewhere comes from a sender that does not know that
-the arm was stopped meanwhile. It is refused as a whole, even where it later passes the tool. A new stream begins with
-the first target ever, after a silence of ``timeout``, after a reset, and where refused targets jump to the tool: that
-is an operator who engages again while the targets never stop.
+An arm follows a stream whose first target lies within ``engage_distance`` and ``engage_angle`` of the tool, as when an
+operator engages. One that begins elsewhere is of a sender that does not know that the arm was stopped meanwhile. It is
+refused as a whole, even where it later passes the tool. A stream begins with the first target ever, after a silence of
+``timeout``, after a reset, and where refused targets jump to the tool: the operator engages again while targets go on.
 """
 
 from __future__ import annotations
@@ -17,15 +16,7 @@ import pinocchio as pin
 
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.quaternions import (
-    Vector,
-    floats_of,
-    inverse,
-    product,
-    rotation_of,
-    rotation_vector,
-    se3_of,
-)
+from q2r2_control.quaternions import Vector, floats_of, inverse, product, rotation_of, rotation_vector, se3_of
 from q2r2_control.types import Pose
 
 # A jump that no hand makes between two messages: a new stream begins [m], [rad].
@@ -73,15 +64,11 @@ class TargetStream:
 
     def expire(self, now: float) -> bool:
         """Whether the stream that was followed has just run dry."""
-        if self._last is None or self._is_recent(now):
+        if self._last is None or now - self.stamp <= self._settings.timeout:
             return False
         was_following = self.following
         self.reset()
         return was_following
-
-    def _is_recent(self, now: float) -> bool:
-        """Whether the last target came within the timeout."""
-        return now - self.stamp <= self._settings.timeout
 
     def offer(self, pose: pin.SE3, tools: Sequence[pin.SE3], now: float) -> Reason | None:
         """Offer a target; returns why it is not followed, or None.
@@ -89,18 +76,18 @@ class TargetStream:
         ``tools`` are the poses that count as the tool's: the reference's, and the measured one where it is known. An
         arm that was pushed away from its reference is engaged where it is. An arm that follows a stream needs none.
         """
-        if self.following and self._is_recent(now):
-            self.pose, self._last, self.stamp = pose, pose, now
-            return None
         self.expire(now)
         last, self._last, self.stamp = self._last, pose, now
-        begins = _begins(pose, last)
-        offsets = [apart(pose, tool) for tool in tools]
+        if self.following:
+            self.pose = pose
+            return None
+        way, turn = (math.inf, math.inf) if last is None else apart(pose, last)
+        begins = way >= _JUMP or turn >= _TURN
         # Position and rotation may each be near another one of the poses: an operator's first target has the
         # measured position and the commanded rotation.
-        distance, angle = min(way for way, _ in offsets), min(turn for _, turn in offsets)
-        near = distance <= self._settings.engage_distance and angle <= self._settings.engage_angle
-        if begins and near:
+        ways, turns = zip(*(apart(pose, tool) for tool in tools), strict=True)
+        distance, angle = min(ways), min(turns)
+        if begins and distance <= self._settings.engage_distance and angle <= self._settings.engage_angle:
             self.pose = pose
             return None
         return Reason.of(
@@ -110,13 +97,6 @@ class TargetStream:
             engage_distance=self._settings.engage_distance,
             engage_angle=self._settings.engage_angle,
         )
-
-
-def _begins(pose: pin.SE3, last: pin.SE3 | None) -> bool:
-    if last is None:
-        return True
-    distance, angle = apart(pose, last)
-    return distance >= _JUMP or angle >= _TURN
 
 
 def apart(a: pin.SE3, b: pin.SE3) -> tuple[float, float]:
@@ -145,7 +125,7 @@ class TargetExtrapolator:
         self._pose: pin.SE3 | None = None
         self._due = -math.inf
         self._gap = 0.0
-        self._at: Pose | None = None  # of the pose, where it is due at a known time; floats, since NumPy takes longer
+        self._at: Pose | None = None  # of the pose, where it is due at a known time
         self._twist: tuple[Vector, Vector] | None = None  # linear, and angular in the target's frame [m/s], [rad/s]
         self._even = False
 

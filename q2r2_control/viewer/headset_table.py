@@ -12,8 +12,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from q2r2_control.inputs.addresses import written
 from q2r2_control.inputs.headset_check import HeadsetCheck
+from q2r2_control.inputs.listener import written
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist
 from q2r2_control.inputs.session import TopicStatistics
 

@@ -12,8 +12,7 @@ from q2r2_control.config.cell import Config, load_config
 from q2r2_control.demo.assembly_tasks import TASKS, TaskWatch, tasks_named
 from q2r2_control.demo.part_judges import TouchWatch
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.inputs.trajectories import trajectory_named
+from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot

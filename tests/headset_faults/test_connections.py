@@ -19,12 +19,13 @@ AWAY = pin.SE3(pin.exp3(np.array([0.2, 1.0, 0.3])), np.array([0.2, -0.1, 0.3]))
 A_TICK = 0.002  # [s]
 
 
-def displace(op: Operator) -> None:
-    """The hands go elsewhere while nobody follows them."""
+def go_elsewhere(op: Operator) -> Iterator[float]:
+    """The hands move while nobody follows them."""
     op.hands = {hand: place * AWAY for hand, place in op.hands.items()}
+    yield 0.4
 
 
-def engaged_anew(op: Operator) -> Iterator[float]:
+def engage_anew(op: Operator) -> Iterator[float]:
     yield 0.6  # in which nothing may move
     yield from op.press(*SIDES)
     yield from op.move((0.0, 0.0, 0.05), seconds=0.3)
@@ -35,16 +36,19 @@ def assert_engaged_twice(run: InStepRun) -> None:
     assert run.states == {"engaged"}
 
 
-@pytest.mark.parametrize("end", [FakeHeadset.reset, FakeHeadset.close], ids=["by a reset", "by a close"])
+def break_the_protocol(headset: FakeHeadset) -> None:
+    headset.send(b"\xff" * 64)
+
+
+@pytest.mark.parametrize("end", [FakeHeadset.reset, FakeHeadset.close, break_the_protocol])
 def test_a_connection_that_ends_in_mid_motion_pauses_both_arms(end: Callable[[FakeHeadset], None]) -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield from op.move((0.05, 0.05, 0.0), seconds=0.3)
         op.lose(end)
-        displace(op)
-        yield 0.3
+        yield from go_elsewhere(op)
         op.connect()
-        yield from engaged_anew(op)
+        yield from engage_anew(op)
 
     run = InStepRun(script)
     assert run.reasons("lost") == ["connection_lost"] * 2
@@ -55,20 +59,16 @@ def test_a_connection_that_ends_in_mid_motion_pauses_both_arms(end: Callable[[Fa
 def test_a_headset_that_sends_no_poses_in_mid_motion_pauses_both_arms_in_time(alive: bool) -> None:
     stopped = []
 
-    def nothing(hand: str, position: Array, quaternion: Array) -> bytes:
-        return KEEPALIVE
-
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield from op.move((0.05, 0.05, 0.0), seconds=0.3)
         stopped.append(op.now)
         if alive:
-            op.send_pose = nothing
+            op.send_pose = lambda hand, position, quaternion: KEEPALIVE
         op.silent = not alive
-        displace(op)
-        yield 0.4
+        yield from go_elsewhere(op)
         op.silent, op.send_pose = False, op.pose
-        yield from engaged_anew(op)
+        yield from engage_anew(op)
 
     run = InStepRun(script)
     assert "pose_silent" in run.reasons("lost")

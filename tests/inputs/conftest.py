@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from q2r2_control.inputs.headset import HeadsetServer
-from tests.support.headset_server import HandClock
+from tests.support.headset_server import HandClock, running
 
 
 @pytest.fixture
@@ -18,7 +18,5 @@ def clock() -> HandClock:
 @pytest.fixture
 def server(clock: HandClock) -> Iterator[HeadsetServer]:
     """A running server whose time stands still unless the test moves it, so that no slow machine makes a timeout."""
-    running = HeadsetServer(port=0, clock=clock)
-    running.start()
-    yield running
-    running.close()
+    with running(HeadsetServer(port=0, clock=clock)) as server:
+        yield server

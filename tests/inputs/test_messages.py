@@ -1,4 +1,4 @@
-"""Messages are read from bytes written by hand, in both dialects, and nothing is read that only resembles one."""
+"""Frames and messages are read from bytes written by hand, and nothing is read that only resembles one."""
 
 from __future__ import annotations
 
@@ -11,12 +11,17 @@ import pytest
 
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.messages import (
+    KEEPALIVE,
+    MAX_FRAME_BYTES,
     Dialect,
+    FrameDecoder,
     HandPose,
     HandTwist,
     MessageType,
+    WireFrame,
     decode,
     encode,
+    encode_frame,
     fits,
 )
 from q2r2_control.types import HandInputs, HapticFeedback
@@ -70,15 +75,9 @@ def test_messages_are_read_as_sent_with_their_stamp_and_w_of_minus_one(dialect: 
     )
 
 
-@pytest.mark.parametrize(
-    ("dialect", "expected"),
-    [
-        pytest.param(ROS1, HALF_F + ONE_F, id="ROS1, 8 bytes"),
-        pytest.param(ROS2, CDR + HALF_F + ONE_F, id="ROS2, 12 bytes"),
-    ],
-)
-def test_haptics_are_packed_as_two_floats_and_not_as_doubles(dialect: Dialect, expected: bytes) -> None:
-    assert encode(HapticFeedback("left", frequency=0.5, amplitude=1.0), dialect) == expected
+def test_haptics_are_packed_as_two_floats_and_not_as_doubles() -> None:
+    vibration = HapticFeedback("left", frequency=0.5, amplitude=1.0)
+    assert [encode(vibration, dialect) for dialect in (ROS1, ROS2)] == [HALF_F + ONE_F, CDR + HALF_F + ONE_F]
 
 
 @every_dialect
@@ -92,37 +91,24 @@ def test_a_frame_id_shifts_the_pose_and_is_kept(dialect: Dialect, name: str) -> 
     assert pose.quaternion.tolist() == [0.0, 0.0, 0.0, -1.0]
 
 
-@every_dialect
-@every_kind
-def test_no_payload_fits_both_dialects(kind: MessageType, dialect: Dialect) -> None:
-    assert fits(kind, PAYLOADS[kind][dialect], dialect)
-    assert not fits(kind, PAYLOADS[kind][dialect], dialect.other)
-    with pytest.raises(ProtocolError):
-        decode(kind, PAYLOADS[kind][dialect], dialect.other)
-
-
-def test_poses_of_equal_size_in_both_dialects_are_told_apart_by_the_nul_of_frame_id() -> None:
-    first, second = pose_with_frame(ROS1, b"room"), pose_with_frame(ROS2, b"map\0")
-    assert len(first) == len(second)
-    assert (fits(MessageType.POSE, first, ROS1), fits(MessageType.POSE, first, ROS2)) == (True, False)
-    assert (fits(MessageType.POSE, second, ROS1), fits(MessageType.POSE, second, ROS2)) == (False, True)
+def test_no_payload_fits_both_dialects_and_poses_of_equal_size_differ_by_the_nul_of_frame_id() -> None:
+    equal = {ROS1: pose_with_frame(ROS1, b"room"), ROS2: pose_with_frame(ROS2, b"map\0")}
+    assert len(equal[ROS1]) == len(equal[ROS2])
+    for kind, payloads in (*PAYLOADS.items(), (MessageType.POSE, equal)):
+        for dialect, payload in payloads.items():
+            assert fits(kind, payload, dialect)
+            assert not fits(kind, payload, dialect.other)
+            with pytest.raises(ProtocolError):
+                decode(kind, payload, dialect.other)
 
 
 @every_dialect
 @every_kind
-def test_a_short_payload_is_refused_at_every_length(kind: MessageType, dialect: Dialect) -> None:
+def test_a_payload_of_any_other_length_is_refused(kind: MessageType, dialect: Dialect) -> None:
     payload = PAYLOADS[kind][dialect]
-    for length in range(len(payload)):
-        with pytest.raises(ProtocolError):
-            decode(kind, payload[:length], dialect)
-
-
-@every_dialect
-@every_kind
-@pytest.mark.parametrize("spare", [1, 8])
-def test_spare_bytes_behind_a_message_are_refused(kind: MessageType, dialect: Dialect, spare: int) -> None:
-    with pytest.raises(ProtocolError, match="bytes"):
-        decode(kind, PAYLOADS[kind][dialect] + bytes(spare), dialect)
+    for wrong in (*(payload[:length] for length in range(len(payload))), payload + b"\0", payload + bytes(8)):
+        with pytest.raises(ProtocolError, match="bytes"):
+            decode(kind, wrong, dialect)
 
 
 @every_kind
@@ -142,17 +128,11 @@ def test_a_button_that_is_neither_0_nor_1_is_refused(dialect: Dialect, button: i
 
 
 @every_dialect
-@pytest.mark.parametrize("length", [9, 0xFFFFFFFF])
-def test_a_string_length_that_lies_is_refused(dialect: Dialect, length: int) -> None:
-    payload = POSES[dialect][:12] + struct.pack("<I", length) + POSES[dialect][16:]
-    with pytest.raises(ProtocolError):
-        decode(MessageType.POSE, payload, dialect)
-
-
-@every_dialect
-def test_a_frame_id_that_is_not_utf8_is_refused(dialect: Dialect) -> None:
-    with pytest.raises(ProtocolError):
-        decode(MessageType.POSE, pose_with_frame(dialect, b"\xff\xfe" + (b"\0" if dialect is ROS2 else b"")), dialect)
+def test_a_frame_id_whose_length_lies_or_that_is_not_utf8_is_refused(dialect: Dialect) -> None:
+    lies = [POSES[dialect][:12] + struct.pack("<I", length) + POSES[dialect][16:] for length in (9, 0xFFFFFFFF)]
+    for payload in (*lies, pose_with_frame(dialect, b"\xff\xfe" + (b"\0" if dialect is ROS2 else b""))):
+        with pytest.raises(ProtocolError):
+            decode(MessageType.POSE, payload, dialect)
 
 
 @every_dialect
@@ -181,3 +161,68 @@ def test_random_and_mutated_bytes_raise_nothing_but_protocol_errors() -> None:
         except ProtocolError:
             refused += 1
     assert 1800 < refused < 2400
+
+
+# Written by hand from the protocol: length 4, "/abc", length 3, "xyz".
+ABC = b"\x04\x00\x00\x00/abc\x03\x00\x00\x00xyz"
+ABC_NUL = b"\x05\x00\x00\x00/abc\x00\x03\x00\x00\x00xyz"
+
+
+def frames(*chunks: bytes) -> list[WireFrame]:
+    decoder = FrameDecoder()
+    found = []
+    for chunk in chunks:
+        decoder.feed(chunk)
+        while (frame := decoder.next_frame()) is not None:
+            found.append(frame)
+    decoder.finish()
+    return found
+
+
+def test_a_frame_is_read_and_written_as_by_hand_and_only_one_nul_is_taken_off() -> None:
+    assert encode_frame("/abc", b"xyz") == ABC
+    assert frames(ABC) == [WireFrame("/abc", b"xyz", terminated=False)]
+    assert frames(KEEPALIVE) == [WireFrame("", b"", terminated=False)]
+    assert frames(b"\x05\x00\x00\x00abc\x00\x00\x00\x00\x00\x00") == [WireFrame("abc\0", b"", terminated=True)]
+
+
+def test_a_stream_split_at_any_byte_gives_the_same_frames() -> None:
+    stream = ABC_NUL + KEEPALIVE + ABC
+    whole = frames(stream)
+    assert [frame.terminated for frame in whole] == [True, False, False]
+    assert frames(*(bytes([byte]) for byte in stream)) == whole
+    for split in range(1, len(stream)):
+        assert frames(stream[:split], stream[split:]) == whole
+
+
+def test_a_frame_of_exactly_one_mebibyte_is_allowed() -> None:
+    (frame,) = frames(encode_frame("big", bytes(MAX_FRAME_BYTES - 8 - 3)))
+    assert len(frame.payload) == MAX_FRAME_BYTES - 11
+
+
+TOO_LONG = "bytes announced, at most 1048576 are allowed"
+
+
+@pytest.mark.parametrize(
+    ("stream", "reason"),
+    [
+        (ABC[:1], "ended inside a frame, 1 bytes"),
+        (ABC[:-1], f"ended inside a frame, {len(ABC) - 1} bytes"),
+        pytest.param(struct.pack("<I", MAX_FRAME_BYTES - 7), TOO_LONG, id="destination without room for lengths"),
+        pytest.param(struct.pack("<I3sI", 3, b"big", MAX_FRAME_BYTES - 10), TOO_LONG, id="payload one byte too long"),
+        pytest.param(b"GET / HTTP/1.1\r\n\r\n", TOO_LONG, id="another protocol"),
+        (b"\x02\x00\x00\x00\xff\xfe\x00\x00\x00\x00", "not UTF-8"),
+        (b"\x00\x00\x00\x00\x01\x00\x00\x00x", "without a destination"),
+    ],
+)
+def test_what_cannot_be_a_frame_is_refused_with_its_reason(stream: bytes, reason: str) -> None:
+    with pytest.raises(ProtocolError, match=reason):
+        frames(stream)
+
+
+def test_frames_before_a_fault_are_not_lost() -> None:
+    decoder = FrameDecoder()
+    decoder.feed(ABC + b"\xff\xff\xff\xff")
+    assert decoder.next_frame() == WireFrame("/abc", b"xyz", terminated=False)
+    with pytest.raises(ProtocolError):
+        decoder.next_frame()

@@ -9,10 +9,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from q2r2_control import Robot, load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.assembly import WORKS
-from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.inputs.trajectories import TRAJECTORIES
+from q2r2_control.inputs.assembly import HOME, WORKS, HandWork, WayPoints, minimum_jerk
+from q2r2_control.inputs.scripted import TRAJECTORIES, ScriptedInput, trajectory_named
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 EVERY = pytest.mark.parametrize("trajectory", list(TRAJECTORIES))
@@ -23,10 +23,6 @@ def play(script: ScriptedInput, duration: float, dt: float = 0.01, start: float 
     return [sample for tick in range(round(duration / dt)) for sample in script.poll(start + tick * dt)]
 
 
-def of(hand: str, samples: list[HandSample]) -> list[HandSample]:
-    return [sample for sample in samples if sample.hand == hand]
-
-
 def flat(samples: list[HandSample]) -> list[tuple[object, ...]]:
     return [(s.hand, s.pose_stamp, s.inputs, *s.position.tolist(), *s.quaternion.tolist()) for s in samples]
 
@@ -34,10 +30,7 @@ def flat(samples: list[HandSample]) -> list[tuple[object, ...]]:
 @EVERY
 @pytest.mark.parametrize("human", [False, True], ids=["clean", "human"])
 def test_the_same_seed_gives_the_same_samples_however_they_are_polled(trajectory: str, human: bool) -> None:
-    def script() -> ScriptedInput:
-        return ScriptedInput(trajectory, human=human, seed=3)
-
-    often, seldom = play(script(), 6.0, dt=0.001), play(script(), 6.0, dt=0.1)
+    often, seldom = (play(ScriptedInput(trajectory, human=human, seed=3), 6.0, dt) for dt in (0.001, 0.1))
     assert len(seldom) > 500
     assert flat(often)[: len(seldom)] == flat(seldom)
 
@@ -46,8 +39,7 @@ def test_stamps_are_on_the_callers_clock_and_never_in_its_future() -> None:
     script = ScriptedInput("circle", human=True)
     script.start()
     last = dict.fromkeys(SIDES, -math.inf)
-    for tick in range(1000):
-        now = 5000.0 + tick * 0.01
+    for now in np.arange(5000.0, 5010.0, 0.01).tolist():
         for sample in script.poll(now):
             assert last[sample.hand] < sample.pose_stamp <= now
             assert sample.inputs_stamp == sample.pose_stamp
@@ -57,96 +49,119 @@ def test_stamps_are_on_the_callers_clock_and_never_in_its_future() -> None:
 @EVERY
 @pytest.mark.parametrize("hand", SIDES)
 def test_hands_move_smoothly_calmly_and_within_reach(trajectory: str, hand: str) -> None:
-    script = ScriptedInput(trajectory)
-    dt = 0.005
+    script, dt = ScriptedInput(trajectory), 0.005
     poses = [script.hand_pose(hand, tick * dt) for tick in range(4200)]
-    positions = np.array([pose.translation for pose in poses])
-    way = positions - positions[0]
-    lowest = -0.164 if trajectory in WORKS else 0.0
-    assert way[:, 2].min() > lowest - 1e-9
+    way = np.array([pose.translation - poses[0].translation for pose in poses])
+    assert way[:, 2].min() > (-0.164 if trajectory in WORKS else 0.0) - 1e-9
     assert np.abs(way).max() <= 0.25 + 1e-9
-    velocity = np.diff(positions, axis=0) / dt
+    velocity = np.diff(way, axis=0) / dt
     assert np.linalg.norm(velocity, axis=1).max() < 0.5
     assert np.abs(np.diff(velocity, axis=0) / dt).max() < 1.5
     turns = [pin.log3(b.rotation @ a.rotation.T) / dt for a, b in itertools.pairwise(poses)]
     assert np.abs(turns).max() < 1.5
     assert np.abs(np.diff(turns, axis=0) / dt).max() < 5.0
+    for t in np.arange(0.0, 12.0, 0.05).tolist():
+        before, after = script.hand_pose(hand, t), script.hand_pose(hand, t + 0.01)
+        twist = script.hand_twist(hand, t + 0.005)
+        np.testing.assert_allclose(before.translation + 0.01 * twist.linear, after.translation, atol=2e-6)
+        np.testing.assert_allclose(pin.exp3(0.01 * twist.angular) @ before.rotation, after.rotation, atol=2e-5)
 
 
 @EVERY
 def test_the_hands_are_still_from_the_first_press_until_the_arm_is_engaged(trajectory: str) -> None:
-    script = ScriptedInput(trajectory)
-    samples = [s for s in play(script, 2.0) if s.pose_stamp < 1.1]
+    samples = [s for s in play(ScriptedInput(trajectory), 2.0) if s.pose_stamp < 1.1]
     assert any(s.inputs.button_lower for s in samples)
     assert not samples[0].inputs.button_lower
     assert not samples[-1].inputs.button_lower
-    assert np.ptp([s.position for s in of("left", samples)], axis=0).max() < 1e-12
+    assert np.ptp([s.position for s in samples if s.hand == "left"], axis=0).max() < 1e-12
 
 
 def test_the_right_hand_mirrors_the_left() -> None:
-    script = ScriptedInput("rotate")
-    reflection = np.diag([1.0, -1.0, 1.0])
+    script, reflection = ScriptedInput("rotate"), np.diag([1.0, -1.0, 1.0])
     for t in (0.0, 2.0, 5.0, 9.0, 13.0):
-        left = script.hand_pose("left", 0.0).rotation.T @ script.hand_pose("left", t).rotation
-        right = script.hand_pose("right", 0.0).rotation.T @ script.hand_pose("right", t).rotation
+        left, right = (script.hand_pose(hand, 0.0).rotation.T @ script.hand_pose(hand, t).rotation for hand in SIDES)
         np.testing.assert_allclose(reflection @ left @ reflection, right, atol=1e-12)
 
 
-@pytest.mark.parametrize("trajectory", TRAJECTORIES)
-@pytest.mark.parametrize("hand", SIDES)
-def test_the_twist_leads_from_each_pose_to_the_next(trajectory: str, hand: str) -> None:
-    script = ScriptedInput(trajectory)
-    dt = 0.01
-    for t in np.arange(0.0, 12.0, 0.05).tolist():
-        before, after = script.hand_pose(hand, t), script.hand_pose(hand, t + dt)
-        twist = script.hand_twist(hand, t + dt / 2.0)
-        np.testing.assert_allclose(before.translation + dt * twist.linear, after.translation, atol=2e-6)
-        turned = pin.exp3(dt * twist.angular) @ before.rotation
-        np.testing.assert_allclose(turned, after.rotation, atol=2e-5)
-
-
-def test_nothing_comes_before_start_nor_after_close_and_haptics_are_harmless() -> None:
-    script = ScriptedInput("circle")
+def test_nothing_comes_before_start_nor_after_close_and_it_waits_while_nobody_polls() -> None:
+    script = ScriptedInput("circle", hands=("left",))
     assert (script.connected, script.poll(0.0)) == (False, [])
     script.start()
     assert script.connected
     assert script.poll(0.0)
-    script.send_haptic(HapticFeedback("left", 0.5, 0.5))
-    script.close()
-    script.close()
-    assert (script.connected, script.poll(1.0)) == (False, [])
-
-
-@pytest.mark.parametrize("now", [math.nan, math.inf, -math.inf], ids=["nan", "infinite", "minus infinite"])
-def test_a_clock_that_is_not_finite_gives_nothing(now: float) -> None:
-    script = ScriptedInput("circle")
-    script.start()
-    script.poll(0.0)
-    assert script.poll(now) == []
-
-
-def test_the_script_waits_while_nobody_polls() -> None:
-    script = ScriptedInput("circle", hands=("left",))
-    script.start()
-    script.poll(0.0)
+    assert [script.poll(now) for now in (math.nan, math.inf, -math.inf)] == [[], [], []]
     late = script.poll(1e9)
     assert 70 < len(late) < 80
     assert late[-1].pose_stamp == pytest.approx(1e9, abs=0.02)
+    script.send_haptic(HapticFeedback("left", 0.5, 0.5))
+    script.close()
+    script.close()
+    assert (script.connected, script.poll(2e9)) == (False, [])
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"trajectory": "spiral"}, "allowed are circle"),
-        ({"trajectory": "circle", "hands": ("middle",)}, "allowed are left, right"),
-        ({"trajectory": "circle", "rate_hz": 0.0}, "rate_hz = 0"),
-        ({"trajectory": "circle", "frequency_hz": math.nan}, "frequency_hz = nan"),
+        *(
+            ({"trajectory": name}, r"allowed are circle, .*stack, and meet, grasp, handover, stack joined by \+$")
+            for name in ("spiral", "handover+", "circle+stack", "")
+        ),
+        ({"hands": ("middle",)}, "allowed are left, right"),
+        ({"rate_hz": 0.0}, "rate_hz = 0"),
+        ({"frequency_hz": math.nan}, "frequency_hz = nan"),
+        ({"jitter": 0.01}, r"jitter = 0\.01: allowed is 0 \.\. 0\.00667"),
     ],
-    ids=["unknown trajectory", "unknown hand", "no rate", "frequency not a number"],
 )
-def test_a_wrong_setting_is_refused_in_one_line_that_says_what_is_allowed(
-    arguments: dict[str, object], message: str
-) -> None:
+def test_a_wrong_setting_is_refused_with_what_is_allowed(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        ScriptedInput(**arguments)  # type: ignore[arg-type]
+        ScriptedInput(**{"trajectory": "circle", **arguments})  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
+
+
+def test_way_points_begin_where_the_shipped_cell_has_its_tools() -> None:
+    robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+    for arm, home in HOME.items():
+        np.testing.assert_allclose(robot.tool_pose(robot.home, arm).translation, home, atol=1e-4)
+
+
+@pytest.mark.parametrize("work", WORKS.values(), ids=WORKS)
+def test_every_work_has_rising_times_and_ends_at_home_with_open_grippers(work: HandWork) -> None:
+    for hand, points in work.tools.items():
+        times = [point[0] for point in points]
+        assert times == sorted(set(times))
+        assert times[0] > 0.0
+        assert times[-1] <= work.duration
+        assert points[-1][1:] == (*HOME[hand], 0.0, 0.0)
+        assert len(work.presses[hand]) % 2 == 0
+
+
+def test_works_in_sequence_do_what_each_of_them_does_one_after_the_other() -> None:
+    both, first, second = (trajectory_named(name) for name in ("handover+stack", "handover", "stack"))
+    assert second.duration is not None
+    shift = WORKS["handover"].duration
+    assert both.duration == pytest.approx(second.duration + shift)
+    for hand in SIDES:
+        for t in np.linspace(0.0, shift, 40):
+            np.testing.assert_allclose(both.displacement(hand, t, 1.0), first.displacement(hand, t, 1.0), atol=1e-12)
+        for t in np.linspace(2.0, second.duration, 40):
+            expected = second.displacement(hand, t, 1.0)
+            np.testing.assert_allclose(both.displacement(hand, t + shift, 1.0), expected, atol=1e-9)
+        presses = first.upper_presses[hand] + tuple(t + shift for t in second.upper_presses[hand])
+        assert both.upper_presses[hand] == pytest.approx(presses)
+
+
+def test_the_hand_is_where_its_way_points_say_and_rests_at_each() -> None:
+    way = WayPoints([(1.0, 0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 0.1, 0.0, 0.2, 0.0, 0.0), (4.0, 0.1, -0.3, 0.2, 0.4, 1.2)])
+    for t, place, tilt, turn in (
+        (0.0, (0.0, 0.0, 0.0), 0.0, 0.0),
+        (1.5, (0.05, 0.0, 0.1), 0.0, 0.0),
+        (2.0, (0.1, 0.0, 0.2), 0.0, 0.0),
+        (9.0, (0.1, -0.3, 0.2), 0.4, 1.2),
+    ):
+        where, rotation = way.at(t)
+        np.testing.assert_allclose(where, place, atol=1e-12)
+        tilted = pin.rpy.rpyToMatrix(tilt, 0.0, 0.0) @ pin.rpy.rpyToMatrix(0.0, 0.0, turn)
+        np.testing.assert_allclose(pin.exp3(rotation), tilted, atol=1e-12)
+    for t in (1.0, 2.0, 4.0):
+        assert np.linalg.norm(way.at(t + 1e-4)[0] - way.at(t - 1e-4)[0]) / 2e-4 < 1e-5
+    assert [minimum_jerk(fraction) for fraction in (-1.0, 0.0, 0.5, 1.0, 2.0)] == [0.0, 0.0, 0.5, 1.0, 1.0]

@@ -9,6 +9,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.control import SupervisionSettings
 from q2r2_control.supervision.joint_watch import watch_settings
 
+CONFIG = "config/dual_iiwa7.yaml"
 # A state that is not finite is a fault at once.
 STRICT = watch_settings(SupervisionSettings(unusable_time=0.0), yields=False)
 
@@ -20,9 +21,9 @@ def unhurried(config: Config) -> ControllerSettings:
 
 @pytest.fixture(scope="module")
 def robot() -> Robot:
-    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+    return Robot.from_config(load_config(CONFIG))
 
 
 @pytest.fixture(scope="module")
 def controller(robot: Robot) -> CartesianController:
-    return CartesianController(robot, unhurried(load_config("config/dual_iiwa7.yaml")))
+    return CartesianController(robot, unhurried(load_config(CONFIG)))

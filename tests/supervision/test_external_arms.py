@@ -13,14 +13,13 @@ from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.cell import Config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.events import ReasonKind
-from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
+from q2r2_control.supervision.joint_watch import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
-from tests.supervision.conftest import STRICT, unhurried
+from tests.supervision.conftest import CONFIG, STRICT, unhurried
 from tests.support.reasons import kinds
 
-CONFIG = "config/dual_iiwa7.yaml"
 DT = 0.005  # [s]
 SPEED = 0.3  # of the elbow's swing, in the norm of the joints' velocities [rad/s]
 POST, RADIUS = 2.6, 0.04  # where a post is on the elbow's way, and its own radius [rad], [m]
@@ -44,11 +43,6 @@ def swing(robot: Robot, angle: float) -> list[Array]:
 
 
 @pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config(CONFIG))
-
-
-@pytest.fixture(scope="module")
 def config(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Config:
     """The cell with a post that the left elbow meets on its way, but not the reference's elbow."""
     data = robot.model.createData()
@@ -67,10 +61,9 @@ class World:
     def __init__(self, config: Config) -> None:
         self.robot = Robot.from_config(config)
         self.controller = CartesianController(self.robot, unhurried(config))
-        streams, watch = StreamSettings(), STRICT
-        settings = ExternalSettings(tolerance=TOLERANCE)
-        external = ExternalArms(self.robot, self.controller, settings, streams, watch)
-        self.supervisor = Supervisor(self.robot, self.controller, streams, watch, external=external)
+        streams, settings = StreamSettings(), ExternalSettings(tolerance=TOLERANCE)
+        external = ExternalArms(self.robot, self.controller, settings, streams, STRICT)
+        self.supervisor = Supervisor(self.robot, self.controller, streams, STRICT, external=external)
         self.now = 0.0
 
     def show(self, postures: list[Array]) -> Reference | None:
@@ -92,20 +85,16 @@ def world(config: Config) -> World:
     return made
 
 
-def test_elbows_may_swing_while_the_tools_stay(world: World) -> None:
-    postures = swing(world.robot, 0.7)
+def test_elbows_may_swing_while_the_tools_stay_but_not_too_close_to_what_is_near(world: World) -> None:
+    postures, far = swing(world.robot, 1.5), round(0.7 / (SPEED * DT))
     home = world.controller.tool_pose("left").translation
-    world.show(postures + postures[-1:] * round(1.0 / DT))  # longer than a deviation may last
-    assert np.abs(postures[-1] - world.robot.home).max() > 0.5
+    world.show(postures[:far] + postures[far : far + 1] * round(1.0 / DT))  # longer than a deviation may last
+    assert np.abs(postures[far] - world.robot.home).max() > 0.5
     assert world.supervisor.phase is Phase.ACTIVE
     assert world.supervisor.events == []
     assert np.linalg.norm(world.controller.tool_pose("left").translation - home) < 1e-3
-
-
-def test_measured_arms_that_come_too_close_stop_the_reference_and_are_named(world: World) -> None:
-    postures = swing(world.robot, 1.5)
-    world.show(postures + postures[-1:] * round(0.5 / DT))
-    assert world.supervisor.phase is Phase.STOPPED
+    world.show(postures[far:] + postures[-1:] * round(0.5 / DT))
+    assert world.supervisor.arm_state("left") == "stopped"
     (event,) = world.supervisor.events
     assert event.kind is ReasonKind.TOO_CLOSE
     assert event.detail["pair"].startswith("left_link_")
@@ -135,14 +124,12 @@ def test_the_way_home_leads_the_tools_until_they_are_there_and_takes_no_targets(
     world.show([q] * 50)
     world.supervisor.events.clear()
     assert world.supervisor.go_home() is None
-    for _ in range(round(6.0 / DT)):
+    while world.supervisor.homing.active:
+        assert world.supervisor.update_target("left", world.controller.tool_pose("left"), world.now) is not None
         reference = world.show([q])
         assert reference is not None
+        assert world.now < 6.0
         q = reference.q  # the other controller follows at once
-        if not world.supervisor.homing.active:
-            break
-        refusal = world.supervisor.update_target("left", world.controller.tool_pose("left"), world.now)
-        assert refusal is not None
     assert list(map(kinds, world.supervisor.events)) == ["homing_outcome: homing_arrived"]
     assert kinds(world.supervisor.homing.outcome) == "homing_arrived"
     for arm in world.robot.arms:

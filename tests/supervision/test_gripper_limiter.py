@@ -1,20 +1,23 @@
-"""A gripper goes no farther than the controller has proven, and the controller always knows where it may be."""
+"""A gripper goes no farther than the controller has proven, which knows where it may be and when it holds something."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from unittest.mock import patch
 
+import numpy as np
 import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.plants.base import GripperMotion
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.supervision.gripper_limiter import TOLERANCE, GripperLimiter
+from q2r2_control.supervision.gripper_limiter import TOLERANCE, GraspWatch, Grip, GripperLimiter
 from q2r2_control.types import ALL_OF_THE_WAY
-from tests.support.object_cell import ABOVE, BESIDE, CELL, SETTINGS
+from tests.supervision.conftest import unhurried
+from tests.support.object_cell import ABOVE, BESIDE, BLOCK, CELL, SETTINGS, cell
 from tests.support.turning_hand import RealHands, above_table, turning_cell
 
 DT = 0.002
@@ -56,97 +59,73 @@ class Cell:
         assert self.granted["right"] == 1.0
 
 
-def test_a_gripper_that_has_closed_takes_up_less_room_and_at_rest_nothing_is_worked_out(
-    controller: CartesianController,
-) -> None:
-    cell = Cell(controller)
-    cell.run(0.0, 0.5)
-    assert cell.granted["left"] == cell.motion.openings["left"] == 0.0
-    assert controller.openings["left"][0] == 0.0
-    assert controller.openings["left"][1] == pytest.approx(TOLERANCE / STROKE)
-    asked = cell.asked
-    cell.run(0.0, 0.2)
-    assert cell.asked == asked < 12
+@pytest.fixture
+def gripper(controller: CartesianController) -> Cell:
+    return Cell(controller)
 
 
-def test_beside_a_block_it_opens_as_far_as_is_proven_and_by_itself_to_the_end_where_there_is_room(
-    controller: CartesianController,
-) -> None:
-    cell = Cell(controller)
-    cell.run(0.0, 1.6, BESIDE)
-    assert not cell.limiter.held
-    cell.run(1.0, 0.4, BESIDE)
-    assert 0.35 < cell.granted["left"] < 0.5
-    assert cell.motion.openings["left"] == pytest.approx(cell.granted["left"])
-    assert "block_0" in cell.limiter.held["left"]
-    cell.run(1.0, 1.0, ABOVE)
-    assert cell.granted["left"] == cell.motion.openings["left"] == 1.0
-    assert not cell.limiter.held
+def test_a_closed_gripper_takes_up_less_room_and_asks_nothing_at_rest(gripper: Cell) -> None:
+    gripper.run(0.0, 0.5)
+    assert gripper.granted["left"] == gripper.motion.openings["left"] == 0.0
+    assert gripper.controller.openings["left"][0] == 0.0
+    assert gripper.controller.openings["left"][1] == pytest.approx(TOLERANCE / STROKE)
+    asked = gripper.asked
+    gripper.run(0.0, 0.2)
+    assert gripper.asked == asked < 12
 
 
-def test_one_that_is_held_asks_once_in_five_milliseconds_and_closes_at_once(
-    controller: CartesianController, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cell = Cell(controller)
-    cell.run(0.0, 1.6, BESIDE)
-    cell.run(1.0, 0.3, BESIDE)
-    calls = 0
-    real = controller.set_opening
-
-    def counted(arm: str, least: float, greatest: float) -> tuple[str, str] | None:
-        nonlocal calls
-        calls += arm == "left"
-        return real(arm, least, greatest)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(controller, "set_opening", counted)
-        cell.run(1.0, 0.1, BESIDE)
-    assert 10 <= calls <= 0.1 / 0.005 + 1
-    cell.run(0.0, DT, BESIDE)
-    assert cell.granted["left"] == 0.0
-    assert not cell.limiter.held
+def test_it_opens_as_far_as_is_proven_asking_once_in_5_ms_and_to_the_end_where_there_is_room(gripper: Cell) -> None:
+    gripper.run(0.0, 1.6, BESIDE)
+    assert not gripper.limiter.held
+    gripper.run(1.0, 0.4, BESIDE)
+    assert 0.35 < gripper.granted["left"] < 0.5
+    assert gripper.motion.openings["left"] == pytest.approx(gripper.granted["left"])
+    assert "block_0" in gripper.limiter.held["left"]
+    with patch.object(gripper.controller, "set_opening", wraps=gripper.controller.set_opening) as asked:
+        gripper.run(1.0, 0.1, BESIDE)
+    assert 10 <= asked.call_count <= 0.1 / 0.005 + 1
+    gripper.run(0.0, DT, BESIDE)
+    assert gripper.granted["left"] == 0.0
+    assert not gripper.limiter.held
+    gripper.run(1.0, 0.4, BESIDE)
+    gripper.run(1.0, 1.0, ABOVE)
+    assert gripper.granted["left"] == gripper.motion.openings["left"] == 1.0
+    assert not gripper.limiter.held
 
 
-def test_what_is_not_measured_is_passed_through_and_its_fingers_stay_all_of_their_way(
-    controller: CartesianController,
-) -> None:
-    cell = Cell(controller)
+def test_what_is_not_measured_is_passed_through_with_its_fingers_all_way(gripper: Cell) -> None:
     for wanted in (1.0, 0.0, 0.5):
-        cell.tick(wanted, {})
-        assert cell.granted == {"left": wanted, "right": 1.0}
-    assert controller.openings == dict.fromkeys(("left", "right"), ALL_OF_THE_WAY)
+        gripper.tick(wanted, {})
+        assert gripper.granted == {"left": wanted, "right": 1.0}
+    assert gripper.controller.openings == dict.fromkeys(("left", "right"), ALL_OF_THE_WAY)
 
 
 @pytest.mark.parametrize("measured", [{}, {"left": math.nan}, {"left": 7.0}], ids=["none", "no number", "absurd"])
 def test_without_a_measurement_that_can_be_believed_a_gripper_stays_commanded_as_it_was(
-    controller: CartesianController, measured: dict[str, float]
+    gripper: Cell, measured: dict[str, float]
 ) -> None:
-    cell = Cell(controller)
-    cell.run(0.0, 0.5)
-    openings = controller.openings
+    gripper.run(0.0, 0.5)
+    openings = gripper.controller.openings
     for _ in range(100):
-        cell.tick(1.0, measured)
-        assert cell.granted["left"] == 0.0
-    assert controller.openings == openings
+        gripper.tick(1.0, measured)
+        assert gripper.granted["left"] == 0.0
+    assert gripper.controller.openings == openings
 
 
-def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(controller: CartesianController) -> None:
-    cell = Cell(controller)
-    cell.run(0.0, 1.6, BESIDE)
-    openings = controller.openings["left"]
+def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(gripper: Cell) -> None:
+    gripper.run(0.0, 1.6, BESIDE)
+    openings = gripper.controller.openings["left"]
     for _ in range(20):
-        cell.tick(0.0, {"left": 0.9, "right": 1.0})
-    assert "block_0" in cell.limiter.held["left"]
-    assert controller.openings["left"] == openings
-    cell.run(0.4, 0.2, BESIDE)
+        gripper.tick(0.0, {"left": 0.9, "right": 1.0})
+    assert "block_0" in gripper.limiter.held["left"]
+    assert gripper.controller.openings["left"] == openings
+    gripper.run(0.4, 0.2, BESIDE)
     for wanted in (0.4, 0.1, 0.0):
-        cell.tick(wanted, {"left": 0.9, "right": 1.0})
-        assert cell.granted["left"] == wanted
+        gripper.tick(wanted, {"left": 0.9, "right": 1.0})
+        assert gripper.granted["left"] == wanted
 
 
-def test_one_that_was_commanded_before_takes_up_what_it_does_from_the_first_step_on(
-    controller: CartesianController,
-) -> None:
+def test_one_that_was_commanded_before_takes_up_what_it_does_at_once(controller: CartesianController) -> None:
     controller.reset(controller.robot.home)
     limiter = GripperLimiter(controller)
     limiter.resume({"left": 0.0, "right": 0.3}, {"left": 0.2, "right": math.nan}, 1.0)
@@ -157,9 +136,7 @@ def test_one_that_was_commanded_before_takes_up_what_it_does_from_the_first_step
     assert controller.openings["left"][1] < 0.3
 
 
-def test_an_opening_counts_for_as_long_as_the_gripper_may_take_to_do_what_it_is_commanded_to(
-    controller: CartesianController,
-) -> None:
+def test_an_opening_counts_for_as_long_as_the_gripper_may_take(controller: CartesianController) -> None:
     least = {}
     for remembered in (0.05, 0.3):
         controller.reset(controller.robot.home)
@@ -206,16 +183,96 @@ def test_fingers_that_turn_wait_above_the_table_with_closing_and_go_on_by_themse
     assert controller.tool_pose("left").translation[2] > above_table(0.006).translation[2] + 0.005
 
 
-def test_one_whose_bodies_may_not_get_smaller_yet_is_not_held(
-    controller: CartesianController, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cell = Cell(controller)
-    cell.run(0.0, 0.05)
-    with monkeypatch.context() as patch:
-        patch.setattr(controller, "set_opening", lambda *_: ("finger", "table"))
-        cell.run(0.0, 0.4)
-        assert not cell.limiter.held
-    assert cell.motion.openings["left"] == cell.granted["left"] == 0.0
+def test_one_whose_bodies_may_not_get_smaller_yet_is_not_held(gripper: Cell) -> None:
+    controller = gripper.controller
+    gripper.run(0.0, 0.05)
+    with patch.object(controller, "set_opening", return_value=("finger", "table")):
+        gripper.run(0.0, 0.4)
+        assert not gripper.limiter.held
+    assert gripper.motion.openings["left"] == gripper.granted["left"] == 0.0
     assert controller.openings["left"][1] == 1.0
-    cell.run(0.0, 0.2)
+    gripper.run(0.0, 0.2)
     assert controller.openings["left"][1] < 0.1
+
+
+BLOCK_CELL, TICK = cell(BLOCK), 0.004
+
+
+@pytest.fixture(scope="module")
+def holder() -> CartesianController:
+    return CartesianController(Robot.from_config(BLOCK_CELL), unhurried(BLOCK_CELL))
+
+
+class Hand:
+    """A left gripper that closes at its speed, but no farther than to what is between its fingers."""
+
+    def __init__(self, holder: CartesianController) -> None:
+        self.holder, self.watch = holder, GraspWatch(holder)
+        self.opening, self.now, self.changes = 1.0, 0.0, 0
+
+    def run(self, wanted: float, seconds: float, least: float = 0.0, measured: float | None = None) -> bool:
+        for _ in range(round(seconds / TICK)):
+            self.now += TICK
+            self.opening += min(max(max(wanted, least) - self.opening, -4.0 * TICK), 4.0 * TICK)
+            seen = {"left": self.opening if measured is None else measured, "right": 1.0}
+            self.changes += self.watch.update({"left": wanted, "right": 0.0}, seen, self.now)
+        return self.holder.holding["left"]
+
+
+@pytest.fixture
+def hand(holder: CartesianController) -> Hand:
+    holder.reset(holder.robot.home)
+    return Hand(holder)
+
+
+def test_closed_on_a_block_it_holds_once_its_fingers_stand_still_until_the_block_slips_out(hand: Hand) -> None:
+    assert not hand.run(0.0, 0.2, least=0.8)
+    assert hand.run(0.0, 0.2, least=0.8)
+    assert hand.run(0.0, 1.0, least=0.8)
+    assert hand.changes == 1
+    assert not hand.run(0.0, 0.5)
+
+
+@pytest.mark.parametrize("least", [0.0, 0.06], ids=["nothing", "1.5 mm"])
+def test_a_gripper_that_closes_fully_or_nearly_holds_nothing(hand: Hand, least: float) -> None:
+    assert not hand.run(0.0, 1.5, least=least)
+
+
+def test_one_that_closes_slowly_holds_nothing_on_the_way(hand: Hand) -> None:
+    for step in range(100):
+        assert not hand.run(0.0, TICK, least=1.0 - 0.01 * step)
+
+
+def test_while_nothing_is_measured_what_was_known_stays(hand: Hand) -> None:
+    assert not hand.run(0.0, 0.5, measured=math.nan)
+    hand.run(0.0, 0.5, least=0.8)
+    assert hand.run(0.0, 0.5, measured=math.nan)
+    assert hand.run(1.0, 0.5, measured=math.nan)
+
+
+def test_where_no_opening_is_measured_a_closed_gripper_holds() -> None:
+    """A gripper of which the cell has no joints."""
+    data = BLOCK_CELL.model_dump()
+    data["arms"]["left"]["gripper"]["joints"] = ()
+    bare = type(BLOCK_CELL).model_validate(data)
+    controller, held = CartesianController(Robot.from_config(bare), unhurried(bare)), []
+    watch = GraspWatch(controller)
+    for wanted in (1.0, 0.0, 0.0, 1.0):
+        watch.update({"left": wanted, "right": wanted}, {}, 0.0)
+        held.append(controller.holding["left"])
+    assert held == [False, True, True, False]
+
+
+def test_a_gripper_that_may_begin_late_is_given_that_time() -> None:
+    for stall in (0.2, 0.5):
+        grip = Grip(0.025, stall)
+        held = [at for at in np.arange(0.0, 1.0, 0.01) if grip.look(0.0, 1.0, float(at))]
+        assert stall <= held[0] < stall + 0.03
+
+
+def test_a_controller_that_was_reset_is_told_at_once_of_what_is_held(hand: Hand) -> None:
+    assert hand.run(0.0, 0.5, least=0.8)
+    hand.holder.reset(hand.holder.robot.home)
+    assert not hand.holder.holding["left"]
+    hand.watch.tell_again()
+    assert hand.holder.holding["left"]

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from itertools import chain, repeat
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
-from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.supervision.homing import JointHoming
+from q2r2_control.supervision.homing import JointHoming, preflight_faults
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
 from q2r2_control.verification.contract import Contract
-from tests.supervision.conftest import STRICT
+from tests.supervision.conftest import CONFIG, STRICT
 from tests.support.reasons import kinds
 
-CONFIG = "config/dual_iiwa7.yaml"
 DT = 0.004  # [s]
 POSTURES, REACHED = 50, 48
 LONGEST = 60.0  # [s]
@@ -74,9 +78,7 @@ def postures(robot: Robot, controller: CartesianController, count: int, seed: in
 
 
 @pytest.mark.slow
-def test_from_fifty_random_postures_all_joints_come_home_from_all_but_two_at_most(
-    robot: Robot, controller: CartesianController
-) -> None:
+def test_from_48_of_50_random_postures_all_joints_come_home(robot: Robot, controller: CartesianController) -> None:
     ends = []
     for q in postures(robot, controller, POSTURES, seed=0):
         world = World(robot, controller, q)
@@ -92,9 +94,7 @@ def test_the_contract_holds_at_every_tick_of_the_way(robot: Robot, controller: C
         World(robot, controller, q, checked=True).go_home()
 
 
-def test_a_motion_is_braked_before_the_way_home_begins_and_the_arms_stay_there(
-    robot: Robot, controller: CartesianController
-) -> None:
+def test_a_motion_is_braked_before_the_way_home_begins(robot: Robot, controller: CartesianController) -> None:
     world = World(robot, controller, robot.home, checked=True)
     tool = controller.tool_pose("left")
     for step in range(100):
@@ -109,9 +109,11 @@ def test_a_motion_is_braked_before_the_way_home_begins_and_the_arms_stay_there(
     assert np.abs(world.state.v).max() < 1e-3
 
 
-@pytest.mark.parametrize("how", ["pause", "stop", "reset"])
+@pytest.mark.parametrize(
+    ("how", "arguments"), [("pause", (True,)), ("stop", (Reason(ReasonKind.STOP_SERVICE),)), ("reset", ())]
+)
 def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
-    robot: Robot, controller: CartesianController, how: str
+    robot: Robot, controller: CartesianController, how: str, arguments: tuple[object, ...]
 ) -> None:
     (q,) = postures(robot, controller, 1, seed=6)
     world = World(robot, controller, q, checked=True)
@@ -119,12 +121,7 @@ def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
     world.run(3.0)
     at = world.state.q
     assert np.abs(world.state.v).max() > 0.1
-    if how == "pause":
-        world.supervisor.pause(True)
-    elif how == "stop":
-        world.supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
-    else:
-        world.supervisor.reset()
+    getattr(world.supervisor, how)(*arguments)
     for _ in range(round(1.5 / DT)):
         if how == "stop" and np.abs(world.state.v).max() < 1e-4:
             break
@@ -135,28 +132,16 @@ def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
 
 
 def test_while_no_way_is_known_the_arms_stand_still_and_a_tick_looks_at_two_samples_at_most(robot: Robot) -> None:
-    class Counting:
-        """The robot, with what is asked of its distances counted."""
-
-        def __init__(self) -> None:
-            self.asked = 0
-            self.arms = robot.arms
-            self.position_lower, self.position_upper = robot.position_lower, robot.position_upper
-
-        def distance_values(self, q: Array) -> Array:
-            self.asked += 1
-            return np.ones(3) if self.asked == 1 else np.zeros(3)  # only the start is free
-
-    counting = Counting()
-    homing = JointHoming(counting, np.full(3, 0.02), robot.home)  # type: ignore[arg-type]
-    q = robot.home + 0.5
-    ticks = 0
+    distances = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))  # only the start is free
+    bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
+    searched: Any = SimpleNamespace(arms=robot.arms, distance_values=distances, **bounds)
+    homing, q, ticks = JointHoming(searched, np.full(3, 0.02), robot.home), robot.home + 0.5, 0
     while homing.outcome is None:
-        before = counting.asked
+        before = distances.call_count
         at = homing.step(q, np.zeros_like(q), DT)
         assert at is not None
         assert np.array_equal(at, q)
-        assert counting.asked - before <= 3  # with the room where the way begins, once
+        assert distances.call_count - before <= 3  # with the room where the way begins, once
         ticks += 1
     assert homing.outcome is ReasonKind.HOMING_NO_WAY
     assert ticks > 100
@@ -176,3 +161,35 @@ def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) 
             break
     assert homing.outcome is ReasonKind.HOMING_HELD_UP
     assert 0.05 < farthest < 0.13  # or it would set off fast when it is free again
+
+
+SETTINGS = ControllerSettings()
+
+
+def test_a_home_outside_a_limit_is_named_with_what_is_allowed(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    home = robot.home.copy()
+    home[1] = 2.09
+    monkeypatch.setattr(robot, "home", home)
+    (fault,) = [line for line in preflight_faults(robot, SETTINGS, None) if "left_A2" in line]
+    assert fault == "home: left_A2 = 2.09; allowed: -2.0844 .. 2.0844 rad, position_margin included"
+
+
+def test_every_pair_closer_than_min_distance_is_named_once_and_nearest_first(robot: Robot) -> None:
+    nearest = sorted(pair.distance for pair in robot.distances(robot.home))
+    between = ControllerSettings(min_distance=float(np.mean(nearest[1:3])))
+    faults = preflight_faults(robot, between, CartesianController(robot, between))
+    assert len(faults) == 2
+    assert f"are {1e3 * nearest[0]:.1f} mm apart" in faults[0]
+    assert f"are {1e3 * nearest[1]:.1f} mm apart" in faults[1]
+    assert "allowed: at least min_distance" in faults[0]
+
+
+def test_a_home_without_a_certified_stop_is_a_fault(robot: Robot, controller: CartesianController) -> None:
+    nearest = min(pair.distance for pair in robot.distances(robot.home))
+    asking_for_more = CartesianController(robot, ControllerSettings(min_distance=nearest + 0.01))
+    (fault,) = preflight_faults(robot, SETTINGS, asking_for_more)
+    assert "no certified stop" in fault
+    controller.reset(robot.home + 0.05)
+    assert preflight_faults(robot, SETTINGS, controller) == ()
+
+    np.testing.assert_allclose(controller.step({}, 1e-3).q, robot.home, atol=1e-12)

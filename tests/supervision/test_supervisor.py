@@ -8,7 +8,7 @@ import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.supervision.supervisor import Phase, Supervisor
+from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings, TargetStream
 from q2r2_control.types import Array, RobotState
 from tests.supervision.conftest import STRICT
@@ -23,16 +23,32 @@ class World:
 
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
         self.streams = StreamSettings()
-        self.supervisor = Supervisor(robot, controller, self.streams, STRICT)
+        self.supervisor, self.tool = Supervisor(robot, controller, self.streams, STRICT), controller.tool_pose
         self.q, self.now, self.blocked = robot.home.copy(), 0.0, False
         self.v, self.lag = np.zeros_like(self.q), DT  # [s]
         self.commanded: list[Array | None] = []
 
-    def is_in(self, phase: Phase) -> bool:
-        return self.supervisor.phase is phase
+    @property
+    def states(self) -> list[str]:
+        """What the left arm and the right one do."""
+        return [self.supervisor.arm_state(arm) for arm in ("left", "right")]
 
-    def faults(self) -> bool:
-        return self.supervisor.fault is not None
+    def engage(self, by: float = 0.0, seconds: float = 0.3) -> pin.SE3:
+        """The left arm follows, and goes up ``by`` so much [m]; returns where it begins."""
+        self.run(0.2)
+        tool = self.tool("left")
+        self.run(0.02, tool)
+        self.run(seconds, raised(tool, by))
+        assert self.states == ["following", "holding"]
+        return tool
+
+    def engage_both(self) -> tuple[pin.SE3, pin.SE3]:
+        """Both arms follow; returns where their targets begin."""
+        self.run(0.2)
+        left, right = self.tool("left"), self.tool("right")
+        self.run(0.1, left, right=right)
+        assert self.states == ["following"] * 2
+        return left, right
 
     def run(
         self, seconds: float, target: pin.SE3 | None = None, sees: bool = True, right: pin.SE3 | None = None
@@ -68,141 +84,104 @@ def test_nothing_is_commanded_before_joint_states_are_good_and_at_rest(world: Wo
     for step in range(50):  # pushed by somebody
         world.q = robot.home + 0.005 * step
         world.run(0.008)
-    assert world.is_in(Phase.INACTIVE)
+    assert world.states == ["inactive"] * 2
     world.run(0.2)
-    assert world.is_in(Phase.ACTIVE)
+    assert world.states == ["holding"] * 2
     first = next(q for q in world.commanded if q is not None)
     assert np.allclose(first, world.q, atol=1e-9)
 
 
-def engage_both(world: World, controller: CartesianController) -> tuple[pin.SE3, pin.SE3]:
-    """Both arms follow; returns where their targets begin."""
-    world.run(0.2)
-    left, right = controller.tool_pose("left"), controller.tool_pose("right")
-    world.run(0.1, left, right=right)
-    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["following", "following"]
-    return left, right
-
-
-def test_where_the_targets_of_one_linked_arm_cease_both_hold_until_a_stream_of_each_begins_anew(
-    world: World, controller: CartesianController
-) -> None:
-    _, right = engage_both(world, controller)
+def test_where_targets_of_one_linked_arm_cease_both_hold_until_a_stream_of_each_begins_anew(world: World) -> None:
+    _, right = world.engage_both()
     world.run(0.3, right=raised(right, 0.01))
     assert not world.supervisor.follows("right")
     assert [reason.root.kind for reason in world.supervisor.targets.ended.values()] == ["targets_ceased"] * 2
-    rest = controller.tool_pose("right")
+    rest = world.tool("right")
     world.run(1.0, right=raised(right, 0.02))  # the stream that goes on
-    assert np.allclose(controller.tool_pose("right").translation, rest.translation, atol=1e-6)
+    assert np.allclose(world.tool("right").translation, rest.translation, atol=1e-6)
     world.run(0.2)
-    world.run(0.1, controller.tool_pose("left"), right=controller.tool_pose("right"))
-    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["following", "following"]
+    world.run(0.1, world.tool("left"), right=world.tool("right"))
+    assert world.states == ["following"] * 2
     assert world.supervisor.targets.ended == {}
 
 
-def test_a_target_that_comes_just_after_the_timeout_does_not_hide_that_targets_ceased(
-    world: World, controller: CartesianController
-) -> None:
-    left, right = engage_both(world, controller)
+def test_a_target_that_comes_just_after_the_timeout_does_not_hide_that_targets_ceased(world: World) -> None:
+    left, right = world.engage_both()
     for _ in range(3):
         world.now += 0.07
         world.supervisor.update_target("right", right, world.now)
     world.supervisor.update_target("left", left, world.now)
-    assert [world.supervisor.follows(arm) for arm in ("left", "right")] == [True, False]
+    assert world.states == ["following", "holding"]
 
 
-def test_two_publishers_of_one_linked_arm_hold_both(world: World, controller: CartesianController) -> None:
-    left, _ = engage_both(world, controller)
+def test_two_publishers_of_one_linked_arm_hold_both(world: World) -> None:
+    left, _ = world.engage_both()
     for number in (100, 5):
         world.supervisor.update_target("left", left, world.now, number)
-    assert [world.supervisor.follows(arm) for arm in ("left", "right")] == [False, False]
+    assert world.states == ["holding"] * 2
 
 
-def test_a_stream_that_its_sender_ends_stops_its_own_arm_only(world: World, controller: CartesianController) -> None:
-    _, right = engage_both(world, controller)
-    world.supervisor.targets.release("left")
+@pytest.mark.parametrize("linked", [True, False], ids=["that its sender ends", "of an arm that is not linked"])
+def test_a_stream_stops_its_own_arm_only(world: World, linked: bool) -> None:
+    world.streams.linked = linked
+    _, right = world.engage_both()
+    if linked:
+        world.supervisor.targets.release("left")
     world.run(0.5, right=right)
-    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
+    assert world.states == ["holding", "following"]
 
 
-def test_arms_that_are_not_linked_end_their_streams_alone(world: World, controller: CartesianController) -> None:
-    world.streams.linked = False
-    _, right = engage_both(world, controller)
-    world.run(0.5, right=right)
-    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
-
-
-def test_a_loop_that_stood_still_commands_nothing_of_the_past_and_follows_no_target_that_waited(
-    world: World, controller: CartesianController
-) -> None:
-    world.run(0.2)
-    tool = controller.tool_pose("left")
-    world.run(0.02, tool)
-    world.run(0.3, raised(tool, 0.1))
-    assert world.supervisor.arm_state("left") == "following"
+def test_a_loop_that_stood_still_commands_nothing_and_follows_no_target_that_waited(world: World) -> None:
+    world.engage(by=0.1)
     rest, before = world.q, len(world.commanded)  # where the robot has come to rest by itself, as far as it is known
-    waited = controller.tool_pose("left")
+    waited = world.tool("left")
     world.now += 1.0
     world.supervisor.stalled(1.0, world.now)
     assert world.supervisor.fault == Reason.of(ReasonKind.LOOP_STALLED, duration=1.0)
     world.run(0.05, raised(waited, 0.01))
     assert world.commanded[before:] == [None] * (len(world.commanded) - before)
     world.run(1.0, raised(waited, 0.01))
-    assert world.is_in(Phase.ACTIVE)
-    assert world.supervisor.arm_state("left") == "holding"
+    assert world.states == ["holding"] * 2
     assert np.allclose(world.q, rest, atol=1e-9)
 
 
-def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(
-    world: World, controller: CartesianController
-) -> None:
-    world.run(0.2)
-    tool = controller.tool_pose("left")
-    world.run(0.02, tool)
-    world.run(0.3, raised(tool, 0.1))
-    before = world.q
+def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(world: World) -> None:
+    tool, before = world.engage(by=0.1), world.q
     world.run(0.6, raised(tool, 0.1), sees=False)
-    assert world.is_in(Phase.INACTIVE)
-    assert world.faults()
+    assert world.states == ["inactive"] * 2
+    assert kinds(world.supervisor.fault) == "states_silent"
     assert np.abs(world.q - before).max() < 0.3
     rest = world.q
     world.run(1.0, raised(tool, 0.1))
-    assert world.is_in(Phase.ACTIVE)
-    assert not world.faults()
+    assert world.states == ["holding"] * 2
+    assert world.supervisor.fault is None
     assert np.allclose(world.q, rest, atol=1e-9)
     assert [kinds(event) for event in world.supervisor.events].count("joint_states: states_silent") == 1
     assert kinds(world.supervisor.events[1]) == "joint_states: states_silent"
 
 
-def test_arms_that_do_not_follow_their_reference_are_stopped_until_a_reset(
-    world: World, controller: CartesianController
-) -> None:
-    world.run(0.2)
-    tool = controller.tool_pose("left")
-    world.run(0.02, tool)
+def test_arms_that_do_not_follow_their_reference_are_stopped_until_a_reset(world: World) -> None:
+    tool = world.engage()
     world.blocked = True
     world.run(2.0, raised(tool, 0.2))
-    assert world.is_in(Phase.STOPPED)
+    assert world.states == ["stopped"] * 2
     assert kinds(world.supervisor.fault) == "off_reference"
     world.run(1.0)
-    assert world.is_in(Phase.STOPPED)
+    assert world.states == ["stopped"] * 2
     assert world.supervisor.reset() is None
     world.blocked = False
     rest = world.q
     world.run(0.3, raised(tool, 0.2))
-    assert world.is_in(Phase.ACTIVE)
+    assert world.states == ["holding"] * 2
     assert np.allclose(world.q, rest, atol=1e-9)
 
 
-def test_homing_ends_at_home_and_takes_no_targets(world: World, robot: Robot, controller: CartesianController) -> None:
-    world.run(0.2)
-    tool = controller.tool_pose("left")
-    world.run(0.02, tool)
-    world.run(1.0, raised(tool, 0.1))
+def test_homing_ends_at_home_and_takes_no_targets(world: World) -> None:
+    tool = world.engage(by=0.1, seconds=1.0)
     assert world.supervisor.go_home() is None
     world.run(4.0, raised(tool, 0.1))
     assert "homing_outcome: homing_arrived" in map(kinds, world.supervisor.events)
-    assert np.linalg.norm(controller.tool_pose("left").translation - tool.translation) < 3e-3
+    assert np.linalg.norm(world.tool("left").translation - tool.translation) < 3e-3
     assert world.supervisor.arm_state("left") == "holding"
 
 
@@ -210,35 +189,25 @@ def test_a_stream_that_was_followed_goes_on_anywhere_and_after_a_silence_only_fr
     stream = TargetStream(StreamSettings())
     assert stream.offer(TOOL, [TOOL], 0.0) is None
     assert stream.offer(raised(TOOL, 0.2), [], 0.1) is None
-    assert stream.pose is not None
-    assert stream.pose.translation[2] == TOOL.translation[2] + 0.2
+    assert stream.pose == raised(TOOL, 0.2)
     refusal = stream.offer(raised(TOOL, 0.2), [TOOL], 0.5)
-    assert kinds(refusal) == "stream_away"
     assert refusal is not None
-    assert refusal.detail["distance"] == pytest.approx(0.2)
+    assert (refusal.kind, refusal.detail["distance"]) == (ReasonKind.STREAM_AWAY, pytest.approx(0.2))
     assert not stream.following
 
 
-def test_targets_are_followed_no_longer_than_nothing_forbids_it(world: World, controller: CartesianController) -> None:
-    world.run(0.5)
-    tool = controller.tool_pose("left")
-    world.run(0.1, tool)
-    assert world.supervisor.follows("left")
+def test_targets_are_followed_no_longer_than_nothing_forbids_it(world: World) -> None:
+    tool = world.engage()
     world.supervisor.paused = True
-    refusal = world.supervisor.update_target("left", tool, world.now)
-    assert kinds(refusal) == "controller_paused"
+    assert kinds(world.supervisor.update_target("left", tool, world.now)) == "controller_paused"
     assert not world.supervisor.follows("left")
 
 
-def test_a_stream_that_begins_elsewhere_is_refused_even_where_it_comes_by() -> None:
-    stream = TargetStream(StreamSettings())
+def test_targets_that_begin_elsewhere_are_followed_once_they_jump_to_the_tool_or_after_a_silence() -> None:
+    passing, jumping, silent = (TargetStream(StreamSettings()) for _ in range(3))
     for step in range(100):
-        assert stream.offer(raised(TOOL, 0.5 - 0.01 * step), [TOOL], 0.01 * step) is not None
-    assert stream.pose is None
-
-
-def test_targets_that_were_refused_are_followed_once_they_jump_to_the_tool_or_begin_there_after_a_silence() -> None:
-    jumping, silent = TargetStream(StreamSettings()), TargetStream(StreamSettings())
+        assert passing.offer(raised(TOOL, 0.5 - 0.01 * step), [TOOL], 0.01 * step) is not None
+    assert passing.pose is None
     for stream in (jumping, silent):
         assert stream.offer(raised(TOOL, 0.2), [TOOL], 0.0) is not None
     assert jumping.offer(TOOL, [TOOL], 0.01) is None
@@ -256,12 +225,8 @@ def test_a_stream_that_was_dropped_is_not_taken_up_again_where_it_stands() -> No
     assert stream.offer(TOOL, [TOOL], 0.02) is None
 
 
-def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_command_away_from_them(
-    world: World, robot: Robot
-) -> None:
-    world.run(0.3)
-    tool = robot.tool_pose(world.q, "left")
-    world.run(0.1, tool)
+def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_jump(world: World) -> None:
+    tool = world.engage()
     world.blocked = True  # what moved the arms is gone
     world.run(0.3, raised(tool, 0.06))
     last = world.commanded[-1]
@@ -269,18 +234,28 @@ def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_command_
     assert 0.05 < np.abs(last - world.q).max() < 0.15
     assert world.supervisor.off_reference
     world.supervisor.let_go(Reason(ReasonKind.OTHER), world.now)
-    assert world.is_in(Phase.INACTIVE)
+    assert world.states == ["inactive"] * 2
     began = len(world.commanded)
     world.run(0.5, raised(tool, 0.06))
-    assert world.is_in(Phase.ACTIVE)
+    assert world.states == ["holding"] * 2
     assert all(np.abs(q - world.q).max() < 1e-6 for q in world.commanded[began:] if q is not None)
-    assert not world.supervisor.follows("left")
 
 
-def test_arms_that_lag_behind_the_commands_are_not_off_their_reference(world: World, robot: Robot) -> None:
-    world.run(0.3)
-    tool = robot.tool_pose(world.q, "left")
-    world.run(0.1, tool)
+def test_arms_that_brake_go_on_braking_when_their_receiver_is_gone(world: World) -> None:
+    world.engage(by=0.1)
+    world.supervisor.stop(Reason(ReasonKind.OTHER))
+    world.supervisor.let_go(Reason(ReasonKind.OTHER), world.now)
+    world.supervisor.start_over(Reason(ReasonKind.OTHER), world.now)
+    assert kinds(world.supervisor.reset()) == "arms_braking"
+    world.run(DT)
+    assert world.commanded[-1] is not None
+    world.run(0.5)
+    assert world.states == ["stopped"] * 2
+    assert kinds(world.supervisor.fault) == "other"
+
+
+def test_arms_that_lag_behind_the_commands_are_not_off_their_reference(world: World) -> None:
+    tool = world.engage()
     world.lag = 0.06
     deviation = 0.0
     for _ in range(100):

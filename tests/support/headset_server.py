@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import pytest
 
@@ -35,6 +36,15 @@ class HandClock:
         self.now += seconds
         read = self._readings
         eventually(lambda: self._readings >= read + 3, "the server looks at its clock")
+
+
+@contextmanager
+def running(server: HeadsetServer) -> Iterator[HeadsetServer]:
+    server.start()
+    try:
+        yield server
+    finally:
+        server.close()
 
 
 def eventually(condition: Callable[[], object], what: str = "") -> None:

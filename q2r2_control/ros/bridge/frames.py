@@ -21,8 +21,8 @@ from tf2_msgs.msg import TFMessage
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import nanoseconds, pose_of, pose_of_numbers, time_message
 from q2r2_control.ros.monitoring import Publishers
-from q2r2_control.supervision.message_watch import SequenceWatch
 from q2r2_control.supervision.target_stream import apart
+from q2r2_control.supervision.targets import SequenceWatch
 
 # Two publishers whose poses of a frame differ by more do not tell of the same robot [m], [rad].
 _SAME = 0.05, 0.1

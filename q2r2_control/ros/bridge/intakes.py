@@ -23,7 +23,7 @@ from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.joint_outputs import joints_of
 from q2r2_control.ros.bridge.messages import age, delay, ended_topic, nanoseconds, pose_of, robot_state
 from q2r2_control.ros.monitoring import Publishers
-from q2r2_control.supervision.message_watch import DelayWatch
+from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import Array, RobotState
 from q2r2_control.wording import sentence
 

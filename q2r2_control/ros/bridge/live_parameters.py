@@ -18,8 +18,7 @@ from q2r2_control.ros.bridge.parameters import Model, may_be_none, range_of, sta
 if TYPE_CHECKING:  # arms' nodes have no controller, and need not wait for its kernels
     from q2r2_control.compliance.impedance import ImpedanceController
     from q2r2_control.control.controller import CartesianController
-    from q2r2_control.supervision.external_arms import ExternalSettings
-    from q2r2_control.supervision.joint_watch import WatchSettings
+    from q2r2_control.supervision.joint_watch import ExternalSettings, WatchSettings
     from q2r2_control.supervision.target_stream import StreamSettings
 
 # Of the controller's watching: field, parameter, what it is, least and greatest value.

@@ -14,8 +14,8 @@ from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import ended_topic, stamped_pose, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
-from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
 from q2r2_control.supervision.target_stream import apart
+from q2r2_control.supervision.tick_pacer import PoseRateLimiter
 from q2r2_control.teleop.arm_states import ArmState
 
 _GRAPH_PERIOD = 0.1  # of asking the graph for subscribers [s]

@@ -27,8 +27,12 @@ from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import KINDS, NONE, make_output
 from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live, make_watching_live
 from q2r2_control.ros.executor import TickExecutor
-from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
-from q2r2_control.supervision.joint_watch import watch_settings
+from q2r2_control.supervision.joint_watch import (
+    ExternalArms,
+    ExternalSettings,
+    settings_for_external_arms,
+    watch_settings,
+)
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickClock

@@ -33,7 +33,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, STEADY, WARN, BaseNode
 from q2r2_control.ros.bridge.frames import link_transforms
 from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
-from q2r2_control.supervision.message_watch import DelayWatch
+from q2r2_control.supervision.targets import DelayWatch
 
 _LOG_PERIOD = 1.0  # of lines about refusals [s]
 _TRAJECTORY = "joint_trajectory"

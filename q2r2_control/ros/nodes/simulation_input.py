@@ -11,8 +11,7 @@ from typing import Any
 from q2r2_control.config.cell import load_config
 from q2r2_control.inputs.base import make_input
 from q2r2_control.inputs.messages import HandTwist, MessageType
-from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.inputs.trajectories import FIRST_PRESS, START, TRAJECTORIES
+from q2r2_control.inputs.scripted import FIRST_PRESS, START, TRAJECTORIES, ScriptedInput
 from q2r2_control.ros.base_node import OK, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_haptics
 from q2r2_control.ros.monitoring import HandListeners

@@ -14,11 +14,11 @@ from q2r2_control.config.cell import HeadsetConfig, load_config
 from q2r2_control.config.strict import network_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.inputs.addresses import access_lines, written
-from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.headset import HeadsetServer, watch_of
 from q2r2_control.inputs.headset_check import SILENCE
+from q2r2_control.inputs.listener import access_lines, written
 from q2r2_control.inputs.messages import HandMessage, HandPose
+from q2r2_control.inputs.samples import HandsWatch, Watched
 from q2r2_control.inputs.session import HAND_TOPICS, TopicRecorder, TopicStatistics
 from q2r2_control.ros.base_node import ERROR, OK, STEADY, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_hands, subscribe_to_haptics
