@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -24,7 +24,6 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.model_srdf import model_srdfs
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import Robot
 
@@ -48,48 +47,19 @@ def write_pairs(
     Raises :class:`ConfigError` for a clearance that is not above every distance in ``control``, and for a file that
     exists.
     """
-    _check_clearance(config, clearance)
+    key, least = config.control.largest_distance
+    if not least < clearance <= 1.0:
+        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.{key}, {least:g}, up to 1")
     if file.exists():
         raise ConfigError(f"{file}: exists; give the name of a new file")
     robot = Robot.from_config(config)
     found = nearest_approaches(robot, samples, 0, progress)
-    _write({file: srdf_of(robot, found, clearance, samples)})
+    try:
+        file.write_text(srdf_of(robot, found, clearance, samples), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error}") from error
     never = tuple(pair for pair in found if pair.nearest > clearance)
     return PairsWritten(str(file), samples, clearance, never, tuple(pair for pair in found if pair not in never))
-
-
-def write_model_pairs(
-    config: Config, folder: Path, samples: int, clearance: float, progress: Progress | None = None
-) -> dict[str, bool]:
-    """Write the SRDF of each model of a cell to ``folder``; returns by path whether the file is new.
-
-    Raises :class:`ConfigError` as :func:`write_pairs` does, and before anything is written for a file that exists and
-    says something else.
-    """
-    _check_clearance(config, clearance)
-    if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such folder")
-    files = {folder / name: text for name, text in model_srdfs(config, clearance, samples, 0, progress).items()}
-    new = {file: text for file, text in files.items() if not file.exists()}
-    for file, text in files.items():
-        if file not in new and file.read_bytes() != text.encode():
-            raise ConfigError(f"{file}: exists and says something else; remove it to have it written anew")
-    _write(new)
-    return {str(file): file in new for file in files}
-
-
-def _check_clearance(config: Config, clearance: float) -> None:
-    key, least = config.control.largest_distance
-    if not least < clearance <= 1.0:
-        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.{key}, {least:g}, up to 1")
-
-
-def _write(files: Mapping[Path, str]) -> None:
-    for file, text in files.items():
-        try:
-            file.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"{file}: cannot be written: {error}") from error
 
 
 def check(
@@ -98,31 +68,16 @@ def check(
         Path | None,
         typer.Option(metavar="FILE", help="Find pairs that can never meet and write them as an SRDF for the key srdf."),
     ] = None,
-    model_pairs: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Find such pairs of each arm and tool alone, and write ARM.srdf and so on."
-        ),
-    ] = None,
-    samples: Annotated[int, typer.Option(help="Random postures that --pairs and --model-pairs look at.")] = 20_000,
+    samples: Annotated[int, typer.Option(help="Random postures that --pairs looks at.")] = 20_000,
     clearance: Annotated[float, typer.Option(help="Pairs that stay farther apart need no watching [m].")] = 0.05,
     json: Json = False,
 ) -> None:
     """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
-    if pairs is not None and model_pairs is not None:
-        raise ConfigError("--pairs and --model-pairs exclude each other")
     cell = load_config(config)
     if pairs is not None:
         with counting() as progress:
             found = write_pairs(cell, pairs, samples, clearance, progress)
         print_report(asdict(found), (_pair_table(found),), json)
-        return
-    if model_pairs is not None:
-        with counting() as progress:
-            files = write_model_pairs(cell, model_pairs, samples, clearance, progress)
-        rows = ((file, "new" if new else "as it was") for file, new in files.items())
-        title = "pairs of the models' links that need no watching"
-        print_report(files, (figure_table(title, ("file", "is"), rows),), json)
         return
     result = check_cell(cell, notice_of_compiling(stderr_console()))
     if json:

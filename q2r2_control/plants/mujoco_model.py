@@ -29,8 +29,7 @@ from q2r2_control.plants.scene import (
     let_fingers_slide,
     set_obstacles,
 )
-from q2r2_control.robot.model_srdf import ENVELOPE
-from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.pairs import ENVELOPE, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 
 # Least viscous friction [Nm s/rad]: it keeps light wrist joints steady and is far below what a controller feels.

@@ -100,6 +100,8 @@ def _leader(joint: ET.Element) -> str | None:
 
 # Links that always stay farther apart than this need no watching: more than twice what is usually kept [m].
 CLEARANCE = 0.05
+# Links and shapes of this name ending stand for a whole tool at every opening: watched from afar, never touched.
+ENVELOPE = "_envelope"
 
 
 def link_of(geometry_name: str) -> str:

@@ -53,10 +53,6 @@ def test_the_help_lists_every_command_whose_own_has_an_example(command: str) -> 
         pytest.param(("headset-check", "--duration", "inf"), "--duration inf", id="a check without end"),
         pytest.param(("check", "pyproject.toml"), "pyproject.toml", id="a file that is no cell"),
         pytest.param(
-            ("check", CELL, "--pairs", "a.srdf", "--model-pairs", "."), "exclude each other", id="two kinds of pairs"
-        ),
-        pytest.param(("check", CELL, "--model-pairs", "nowhere"), "nowhere: no such folder", id="no folder"),
-        pytest.param(
             ("bench", "--work", "--motion", "dance"), "motion 'dance': allowed: carry-", id="an unknown motion"
         ),
         pytest.param(("bench", "--motion", "meet"), "needs --work", id="a motion of what times ticks"),
