@@ -17,8 +17,8 @@ from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import ArmAssembly, Model, check_position, load_model
 from q2r2_control.robot.floor import FLOOR, floor_link
-from q2r2_control.robot.locking import lock_joints, resting_position
 from q2r2_control.robot.pairs import KnownParts, exclusions_of_file
+from q2r2_control.robot.pinocchio_models import lock_joints, resting_position
 from q2r2_control.robot.urdf_parts import (
     WORLD,
     fixed_joint,
@@ -55,8 +55,7 @@ def compose(config: Config) -> ComposedCell:
     if not config.name.isprintable():
         raise ConfigError(f"name = {config.name!r:.60}: allowed: printable characters")
     check_models(config.robot, config.arms)
-    urdf = ET.Element("robot", name=config.name)
-    srdf = ET.Element("robot", name=config.name)
+    urdf, srdf = (ET.Element("robot", name=config.name) for _ in range(2))
     ET.SubElement(urdf, "link", name=WORLD)
     arms = _arms(config)
     for arm in arms.values():
@@ -92,7 +91,11 @@ def compose(config: Config) -> ComposedCell:
         obstacles=tuple(config.obstacles),
         parts=KnownParts(
             finger_joints={side: arm.finger_names() for side, arm in arms.items()},
-            strokes={side: arm.stroke() for side, arm in arms.items() if arm.config.gripper.joints},
+            strokes={
+                side: (arm.config.gripper.closed_position, arm.config.gripper.open_position)
+                for side, arm in arms.items()
+                if arm.config.gripper.joints
+            },
             tool_links={side: arm.tool_links() for side, arm in arms.items()},
             obstacles=(*config.obstacles, *([] if config.floor is None else [FLOOR])),
         ),
@@ -101,15 +104,12 @@ def compose(config: Config) -> ComposedCell:
 
 def _arms(config: Config) -> dict[str, ArmAssembly]:
     """Every arm of the cell with the joints that are its own."""
-    robot = None
-    if config.robot is not None:
-        robot = Model(load_model(config.robot, config.packages, "robot"), "")
+    robot = None if config.robot is None else Model(load_model(config.robot, config.packages, "robot"), "")
     arms: dict[str, ArmAssembly] = {}
-    for side in SIDES:
-        if side in config.arms:
-            made = config.arms[side]
-            model = robot or Model(load_model(made, config.packages, f"arms.{side}"), f"{side}_")
-            arms[side] = ArmAssembly(made, model, config.packages, side)
+    for side in (side for side in SIDES if side in config.arms):
+        made = config.arms[side]
+        model = robot or Model(load_model(made, config.packages, f"arms.{side}"), f"{side}_")
+        arms[side] = ArmAssembly(made, model, config.packages, side)
     for arm in arms.values():
         arm.leave_joints_of([other for other in arms.values() if other is not arm and other.model is arm.model])
     return arms

@@ -17,8 +17,8 @@ import pinocchio as pin
 
 from q2r2_control.robot.description import LinkTree, joint_limits
 from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
-from q2r2_control.robot.locking import joint_axis
 from q2r2_control.robot.pairs import KnownParts, link_of, links_moved_by
+from q2r2_control.robot.pinocchio_models import joint_axis
 from q2r2_control.robot.turning_fingers import FingerJoint, TurningBody, TurningSweeps
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 

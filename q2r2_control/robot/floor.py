@@ -14,8 +14,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.arms import PoseConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE, keep_pairs, link_of
+from q2r2_control.robot.urdf_parts import fixed_joint
 
 FLOOR = "floor"  # link
 
@@ -33,15 +35,12 @@ def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[E
         raise ConfigError(
             f"obstacles.{FLOOR}: the cell has a floor at z = {height:g} m; give this another name, or set floor: null"
         )
-    link = ET.Element("link", name=FLOOR)
-    shape = ET.SubElement(link, "collision", name=f"{FLOOR}_collision")
-    ET.SubElement(shape, "origin", xyz=f"0 0 {-_SIZE[2] / 2}")
-    ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=" ".join(map(repr, _SIZE)))
-    joint = ET.Element("joint", name=f"{parent}_to_{FLOOR}", type="fixed")
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=FLOOR)
-    ET.SubElement(joint, "origin", xyz=f"0 0 {height!r}")
-    return [link, joint]
+    link = ET.fromstring(
+        f"""<link name="{FLOOR}"><collision name="{FLOOR}_collision"><origin xyz="0 0 {-_SIZE[2] / 2}"/>
+        <geometry><box size="{_SIZE[0]} {_SIZE[1]} {_SIZE[2]}"/></geometry></collision></link>"""
+    )
+    place = PoseConfig(position=(0.0, 0.0, height))
+    return [link, fixed_joint(f"{parent}_to_{FLOOR}", parent, FLOOR, place)]
 
 
 def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
