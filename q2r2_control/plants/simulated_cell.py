@@ -1,11 +1,10 @@
-"""The simulated cell behind ``mujoco_robot``: commands that come when they come, a plant that runs in fixed steps."""
+"""The simulated cell behind ``mujoco_robot``: commands come at any time, the plant runs in fixed steps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# How long a joint goes on at the commanded velocity when the next command is late: three times what lies between two,
+# How long a joint goes on at the commanded velocity when the next command is late: three intervals between commands,
 # since a busy machine delivers them unevenly, but within these bounds [s].
 _COAST_INTERVALS, _SHORTEST_COAST, _LONGEST_COAST = 3.0, 0.01, 0.1
 # Share of the newest interval in its running mean.
@@ -49,7 +48,7 @@ class JointFollower:
         interval = due - self._due[joints]
         known = (interval > 0.0) & (interval <= _LONGEST_COAST)
         mean = self._interval[joints]
-        # The first interval after a silence says nothing, and one alone nothing certain.
+        # The first interval after a silence says nothing.
         mean = np.where(known, mean + _INTERVAL_SHARE * (interval - mean), mean)
         if v is None:
             v = np.where(known, (q - self._command_q[joints]) / mean, 0.0)
@@ -65,11 +64,6 @@ class JointFollower:
         coast = np.minimum(np.maximum(_COAST_INTERVALS * self._interval, _SHORTEST_COAST), _LONGEST_COAST)
         fresh = age <= coast
         reach = self._velocity_limit * dt
-        if fresh.all():
-            way = self._command_q + self._command_v * age - self.q
-            if (np.abs(way) <= reach).all():  # as it is but for a joint that is left behind
-                self.q, self.v = self.q + way, self._command_v.copy()
-                return
         slower = np.sign(self.v) * np.maximum(np.abs(self.v) - self._acceleration * dt, 0.0)
         way = np.where(
             fresh, self._command_q + self._command_v * np.where(fresh, age, 0.0) - self.q, 0.5 * (self.v + slower) * dt
@@ -99,7 +93,7 @@ class JointSetpoint:
 
 
 class SimulatedCell:
-    """Plant, follower of commands, and what happens without commands: a stop and position servos, in any mode.
+    """Plant and follower of commands; without commands it stops, and position servos hold it, in any mode.
 
     Every refusal is a line of text that is returned; nothing is commanded then.
     """
@@ -111,12 +105,11 @@ class SimulatedCell:
         self.dropped = 0.0  # time that the simulation fell behind, or waited for torques, in all [s]
         self._hold_after, self._max_jump = hold_after, max_jump
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
-        self._places = lru_cache(maxsize=64)(self._find)  # senders name the same joints again and again
         self._timestep = config.mujoco.timestep
         self._follower = JointFollower(
             robot.home, robot.capped_acceleration(config.control.acceleration_limit), robot.velocity_limit
         )
-        self.fingers = tuple(joint for arm in robot.arms.values() for joint in arm.finger_joints)
+        self.fingers = [joint for arm in robot.arms.values() for joint in arm.finger_joints]
         self._finger_q = [self.plant.model.joint(name).qposadr[0] for name in self.fingers]
         self._finger_v = [self.plant.model.joint(name).dofadr[0] for name in self.fingers]
         self._finger_force: dict[str, list[int]] = {
@@ -144,7 +137,7 @@ class SimulatedCell:
         """Follow joint positions that came at ``now`` [s]; joints of others may be among them."""
         if fault := self._unusable(setpoint):
             return fault
-        places = self._places(tuple(setpoint.names))
+        places = self._find(setpoint.names)
         if isinstance(places, str):
             return places
         ours, columns = places
@@ -202,42 +195,29 @@ class SimulatedCell:
 
     def advance(self, now: float) -> RobotState:
         """Let the whole physics steps pass that are due at ``now`` [s], and measure."""
-        if self._time is None:
-            self._time = now
-        behind = now - self._time
-        if behind > _LONGEST_CATCH_UP:
-            self._drop(behind - _LONGEST_CATCH_UP)
-        self._wait_for_torque(now)
-        steps = math.floor((now - self._time) / self._timestep + 1e-6)
-        if steps > 0:
-            dt = steps * self._timestep
-            self._time += dt
-            self._drive(dt)
-        return self.plant.state()
-
-    def _wait_for_torque(self, now: float) -> None:
-        """Drop the time in which the last torque is too old to act and not yet so old that the arms are held."""
-        assert self._time is not None
+        before = now if self._time is None else self._time
+        time = max(before, now - _LONGEST_CATCH_UP)
+        # While the last torque is too old to act, and not yet so old that the arms are held, its sender is waited for.
         age = now - self._last_command
         if self._tau is not None and _LONGEST_TORQUE < age <= self._hold_after:
-            self._drop(min(age - _LONGEST_TORQUE, now - self._time))
+            time = min(time + age - _LONGEST_TORQUE, now)
+        self.dropped += time - before
+        steps = math.floor((now - time) / self._timestep + 1e-6)
+        self._time = time + steps * self._timestep
+        if steps > 0:
+            self._drive(self._time, steps * self._timestep)
+        return self.plant.state()
 
-    def _drop(self, duration: float) -> None:
-        assert self._time is not None
-        self.dropped += duration
-        self._time += duration
-
-    def _drive(self, dt: float) -> None:
-        assert self._time is not None
+    def _drive(self, now: float, dt: float) -> None:
         # A torque that nobody renews is a push without end.
-        if self._tau is not None and self._time - self._last_command > self._hold_after:
+        if self._tau is not None and now - self._last_command > self._hold_after:
             self._back_to_servos()
         zero = np.zeros_like(self.robot.home)
         if self._tau is not None:
             state = self.plant.state()
             command = Command(CommandMode.TORQUE, state.q, state.v, self._tau, self._openings)
         else:
-            self._follower.advance(self._time, dt)
+            self._follower.advance(now, dt)
             command = Command(CommandMode.POSITION, self._follower.q, self._follower.v, zero, self._openings)
         self.plant.apply(command)
         self.plant.advance(dt)
@@ -258,7 +238,7 @@ class SimulatedCell:
             return f"due in {setpoint.delay:g} s; allowed: 0 .. 1"
         return None
 
-    def _find(self, names: tuple[str, ...]) -> tuple[Array, Array] | str:
+    def _find(self, names: Sequence[str]) -> tuple[Array, Array] | str:
         """Which of ``names`` are joints of ours, and their columns; or what is wrong with the names."""
         if len(set(names)) != len(names):
             return "a joint is named twice"
