@@ -15,8 +15,6 @@ from q2r2_control.config.strict import STREAM_TIMEOUT, StrictModel
 from q2r2_control.types import Array, Interval
 
 _Scale = Annotated[float, Field(ge=0, le=10)]
-
-
 _AXES = ("x", "y", "z")
 _ALLOWED = "three of +x -x +y -y +z -z that use x, y and z once each, e.g. [+z, -x, +y]"
 

@@ -1,8 +1,7 @@
 """Joins arms, mounts, tools, obstacles and the floor into one URDF and one SRDF under the root link ``world``.
 
-The one text feeds Pinocchio, MuJoCo, viewers and ``robot_description``. Names of an arm's own model and of its tool get
-the prefix ``left_`` or ``right_``; those of a ``robot`` that the arms are parts of and of obstacles stay as they are.
-Joints that neither an arm nor a gripper moves are fixed.
+Names of an arm's own model and of its tool get the prefix ``left_`` or ``right_``; those of a ``robot`` that the arms
+are parts of and of obstacles stay. Joints that neither an arm nor a gripper moves are fixed.
 """
 
 from __future__ import annotations
