@@ -42,7 +42,7 @@ LASTING = frozenset(
 
 
 class Gesture(StrEnum):
-    """How a control is used. ``DOWN`` is its beginning, which only stops an arm that the control pauses."""
+    """How a control is used. ``DOWN`` is its beginning, which only stops an arm that it pauses."""
 
     DOWN = "down"
     TAP = "tap"
@@ -190,7 +190,7 @@ class BindingSettings(StrictModel):
         return words | {"lower and upper together": "the headset's alignment: stops both arms until they are let go"}
 
     def action_of(self, control: str, gesture: Gesture) -> Action:
-        """What a gesture of a control does; the beginning of one nothing by itself."""
+        """What a gesture of a control does; its beginning does nothing by itself."""
         return Action.NONE if gesture is Gesture.DOWN else getattr(self, control + _SUFFIXES[gesture])
 
     def words_of(self, action: str) -> str | None:

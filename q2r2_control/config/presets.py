@@ -65,9 +65,7 @@ _ALL = (
         topic="{ctrl}/reference_pose",
     ),
     Preset(
-        "crisp",
-        "active; one publisher, unit quaternions; ctrl_prefix is its namespace",
-        topic="{ctrl}/target_pose",
+        "crisp", "active; one publisher, unit quaternions; ctrl_prefix is its namespace", topic="{ctrl}/target_pose"
     ),
     Preset(
         "moveit_servo",

@@ -13,7 +13,7 @@ from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# Longest time one call may ask for. A loop that fell further behind has to notice and not to catch up in one leap.
+# Longest time of one call [s]: a loop that fell further behind must not catch up in one leap.
 MAX_ADVANCE = 1.0
 
 
@@ -111,7 +111,7 @@ def check_duration(dt: float) -> None:
 
 
 class GripperMotion:
-    """Openings that the grippers are asked for, moving towards the commanded ones at the configured speed."""
+    """Openings of the grippers, moving towards the commanded ones at the configured speed."""
 
     def __init__(self, config: Config) -> None:
         self._rate: dict[str, float] = {

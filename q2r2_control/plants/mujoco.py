@@ -26,22 +26,13 @@ _MAX_STIFFNESS_STEP, _MAX_DAMPING_STEP = 0.16, 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class _Push:
-    wrench: Array  # (6,) force [N], torque [Nm], world axes, at the tool frame's origin
-    last_step: int
-
-
-@dataclass(frozen=True, slots=True)
 class _Fingers:
     """Where one gripper's joints are in MuJoCo's arrays, and what fully open and closed mean for them."""
 
-    positions: tuple[int, ...]
-    actuators: tuple[int, ...]
+    positions: list[int]
+    actuators: list[int]
     open_position: float
     closed_position: float
-
-    def position(self, opening: float) -> float:
-        return self.closed_position + opening * (self.open_position - self.closed_position)
 
     def opening(self, qpos: Array) -> float:
         total = 0.0
@@ -54,13 +45,10 @@ class _Fingers:
 class MujocoPlant:
     """The simulated cell, driven in one of three ways that each command chooses.
 
-    Position: a servo on each joint, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias, with the simulator's own M
-    and bias (gravity, Coriolis), computed at each physics step about a reference that moves straight from the last
-    command to the newest, and clipped at the robot's torque limits. Without a newer command it rests where the last one
-    led. Velocity: the same servos about a reference that goes on from its last position at the command's velocity, for
-    one ``advance``. Torque: the command's, clipped; gravity is the sender's to bear.
-
-    ``model`` and ``data`` are MuJoCo's own.
+    Position: a servo on each joint, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias, with the simulator's M and
+    bias (gravity, Coriolis), clipped at the torque limits. The reference moves straight from the last command to the
+    newest, and rests without one. Velocity: the same servos about a reference that goes on at the command's velocity
+    for one ``advance``. Torque: the command's, clipped; gravity is the sender's to bear.
     """
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY, CommandMode.TORQUE)
@@ -75,10 +63,10 @@ class MujocoPlant:
         self._timestep = config.mujoco.timestep
         self._window: mujoco.viewer.Handle | None = None
         self._grippers = GripperMotion(config)
-        self._fingers: dict[str, _Fingers] = {
+        self._fingers = {
             side: _Fingers(
-                tuple(self.model.joint(name).qposadr[0] for name in robot.arms[side].finger_joints),
-                tuple(self.model.actuator(name).id for name in robot.arms[side].finger_joints),
+                [self.model.joint(name).qposadr[0] for name in robot.arms[side].finger_joints],
+                [self.model.actuator(name).id for name in robot.arms[side].finger_joints],
                 arm.gripper.open_position,
                 arm.gripper.closed_position,
             )
@@ -106,13 +94,13 @@ class MujocoPlant:
         self.data.qpos[self._q_index] = posture
         self._grippers.reset()
         for fingers in self._fingers.values():
-            self.data.qpos[list(fingers.positions)] = fingers.open_position
+            self.data.qpos[fingers.positions] = fingers.open_position
         settle_mimics(self.model, self.data)
         self._start = self._end = self._at_rest(posture)  # posture and velocity at both ends of the tick
         self._next: tuple[Array, Array] | None = None  # commanded for the end of the next tick
         self._torque: Array | None = None  # commanded in torque mode
         self._velocity: Array | None = None  # commanded in velocity mode, for the next advance
-        self._pushes: dict[str, _Push] = {}
+        self._pushes: dict[str, tuple[Array, int]] = {}  # wrench, and the step that it ends before
         self._steps = 0
         self._clock = 0.0
         mujoco.mj_forward(self.model, self.data)
@@ -164,10 +152,11 @@ class MujocoPlant:
         """See :meth:`Plant.state`. External torque: contacts, pushes, and hard stops at the ends of a joint's range."""
         index, data = self._v_index, self.data
         self.observed_qpos = self._qpos.copy()
-        tau = data.qfrc_actuator[index]
+        tau = data.qfrc_actuator.take(index)
         # What MuJoCo adds up before contacts, less what is not external, leaves pushes from here and from its window.
-        external = (data.qfrc_constraint + data.qfrc_smooth - data.qfrc_passive + self._bias)[index] - tau
-        return RobotState(self._qpos[self._q_index], self._qvel[index], tau, external, self._steps * self._timestep)
+        external = (data.qfrc_constraint + data.qfrc_smooth - data.qfrc_passive + self._bias).take(index) - tau
+        q, v = self._qpos.take(self._q_index), self._qvel.take(index)
+        return RobotState(q, v, tau, external, self._steps * self._timestep)
 
     def gripper_openings(self) -> dict[str, float]:
         return {side: fingers.opening(self._qpos) for side, fingers in self._fingers.items()}
@@ -184,7 +173,7 @@ class MujocoPlant:
         if wrench.shape != (6,) or not np.isfinite(wrench).all() or not 0 <= duration < math.inf:
             allowed = "expected six finite numbers and a time >= 0"
             raise PlantError(f"push: wrench {wrench!s:.80} for {duration:g} s; {allowed}")
-        self._pushes[arm] = _Push(wrench, self._steps + round(duration / self._timestep))
+        self._pushes[arm] = wrench, self._steps + round(duration / self._timestep)
 
     def launch_viewer(self) -> None:
         """Open MuJoCo's own window. Raises :class:`PlantError` where there is no display."""
@@ -229,11 +218,13 @@ class MujocoPlant:
         self._steps += 1
 
     def _servo_torque(self, fraction: float) -> Array:
-        (start_q, start_v), (end_q, end_v) = self._start, self._end
+        (q, v), (end_q, end_v) = self._start, self._end
+        if fraction > 0.0:
+            q, v = q + fraction * (end_q - q), v + fraction * (end_v - v)
         mujoco.mj_mulM(self.model, self.data, self._inertial_torque, self._acceleration)
         torque = (self._inertial_torque + self._bias)[self._v_index]
-        torque += self._stiffness * (start_q + fraction * (end_q - start_q) - self._qpos[self._q_index])
-        torque += self._damping * (start_v + fraction * (end_v - start_v) - self._qvel[self._v_index])
+        torque += self._stiffness * (q - self._qpos[self._q_index])
+        torque += self._damping * (v - self._qvel[self._v_index])
         return torque
 
     def _drive_arms(self, torque: Array) -> None:
@@ -242,16 +233,16 @@ class MujocoPlant:
 
     def _drive_fingers(self) -> None:
         for side, fingers in self._fingers.items():
-            position = fingers.position(self._grippers.openings[side])
+            opening, closed = self._grippers.openings[side], fingers.closed_position
             for actuator in fingers.actuators:
-                self._ctrl[actuator] = position
+                self._ctrl[actuator] = closed + opening * (fingers.open_position - closed)
 
     def _apply_pushes(self) -> None:
         if not self._pushes:
             return
-        self._pushes = {arm: push for arm, push in self._pushes.items() if self._steps < push.last_step}
+        self._pushes = {arm: (wrench, end) for arm, (wrench, end) in self._pushes.items() if self._steps < end}
         data, applied = self.data, self.data.qfrc_applied
         applied[:] = 0
-        for arm, push in self._pushes.items():
+        for arm, (wrench, _) in self._pushes.items():
             body = self._tools[arm]
-            mujoco.mj_applyFT(self.model, data, push.wrench[:3], push.wrench[3:], data.xpos[body], body, applied)
+            mujoco.mj_applyFT(self.model, data, wrench[:3], wrench[3:], data.xpos[body], body, applied)

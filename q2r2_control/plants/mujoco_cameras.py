@@ -18,7 +18,7 @@ from q2r2_control.types import Array
 # MuJoCo's camera looks along -z, with y up in the picture; ours looks along x, with z up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _STRAIGHT = 1e-9  # of the sine between the line of sight and the vertical
-# Without a graphics card, the 8 samples a pixel and the shadow map of 8192 of a window take some five times as long.
+# Without a graphics card, a window's 8 samples a pixel and shadow map of 8192 take five times as long.
 _SHADOW_MAP, _SAMPLES = 1024, 0
 
 

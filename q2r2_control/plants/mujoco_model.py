@@ -30,6 +30,7 @@ from q2r2_control.plants.scene import (
 )
 from q2r2_control.robot.pairs import ENVELOPE, link_of, pair_names
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.urdf_parts import mimic_of
 
 # Least viscous friction [Nm s/rad]: it keeps light wrist joints steady.
 _MIN_DAMPING = 0.2
@@ -180,12 +181,12 @@ def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
             servo.set_to_position(kp=stiffness, dampratio=1.0)
             servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             servo.forcerange = (-gripper.force, gripper.force)
-        couplings = dict.fromkeys(names[1:], (names[0], 0.0, 1.0))  # follower -> leader, offset, multiplier
+        couplings = dict.fromkeys(names[1:], (names[0], 1.0, 0.0))  # follower -> leader, multiplier, offset
         for joint in robot_urdf.iterfind("joint"):
-            mimic, name = joint.find("mimic"), joint.get("name", "")
-            if mimic is not None and (leader := mimic.get("joint", "")) in names and name not in names:
-                couplings[name] = leader, float(mimic.get("offset", "0")), float(mimic.get("multiplier", "1"))
-        for name, (leader, offset, multiplier) in couplings.items():
+            mimic, name = mimic_of(joint), joint.get("name", "")
+            if mimic is not None and mimic[0] in names and name not in names:
+                couplings[name] = mimic
+        for name, (leader, multiplier, offset) in couplings.items():
             coupling = spec.add_equality(name=f"{name}_coupling", name1=name, name2=leader)
             coupling.type, coupling.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
             coupling.data[:5] = (offset, multiplier, 0, 0, 0)

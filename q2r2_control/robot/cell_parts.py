@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,7 +71,9 @@ class ArmAssembly:
         self.config, self.model, self.key = config, model, f"arms.{side}"
         self.mounted: list[Mounted] = []
         self.frame = carrier = self._carrier()
-        flat = carrier == _usual_tip(model.tree)
+        flat = False
+        with suppress(ConfigError):
+            flat = carrier == default_tip(model.tree, (), "")
         if (flange := load_flange(config.flange, packages, f"{self.key}.flange")) is not None:
             flat = flat and config.flange.model is not None
             self._mount(Model(flange, f"{side}_"), "flange", PoseConfig(), flat, config.flange.frame)
@@ -132,10 +135,8 @@ class ArmAssembly:
             theirs = {joint.get("name") for joint in other.chain}
             self.joints = [joint for joint in self.joints if joint.get("name") not in theirs]
             if not self.joints:
-                raise ConfigError(
-                    f"{self.key}: every joint that carries {self.frame} carries {other.frame} of {other.key} as well; "
-                    "name another tip"
-                )
+                shared = f"every joint that carries {self.frame} carries {other.frame} of {other.key} as well"
+                raise ConfigError(f"{self.key}: {shared}; name another tip")
 
     def mounted_urdf(self) -> list[ET.Element]:
         """What flange and tool add to the cell."""
@@ -158,9 +159,8 @@ class ArmAssembly:
         limits, names = self.config.acceleration_limit, [joint.get("name", "") for joint in self.joints]
         for name in limits:
             if name not in names:
-                raise ConfigError(
-                    f"{self.key}.acceleration_limit.{name!s:.60}: no joint of the arm; allowed: {', '.join(names)}"
-                )
+                key, allowed = f"{self.key}.acceleration_limit.{name!s:.60}", ", ".join(names)
+                raise ConfigError(f"{key}: no joint of the arm; allowed: {allowed}")
         return {self.name_in_cell(name): value for name, value in limits.items()}
 
     def posture(self) -> dict[str, float]:
@@ -169,10 +169,8 @@ class ArmAssembly:
         if len(config.home) != len(names):
             others = [name for name in self._beyond() if name not in names]
             hint = f"; not the arm's unless joints names it: {', '.join(others[:4])}" if others else ""
-            raise ConfigError(
-                f"{self.key}.home = {list(config.home)}: {len(config.home)} value(s), expected {len(names)}: "
-                f"{', '.join(names)}{hint}"
-            )
+            expected = f"{len(config.home)} value(s), expected {len(names)}: {', '.join(names)}{hint}"
+            raise ConfigError(f"{self.key}.home = {list(config.home)}: {expected}")
         for index, joint in enumerate(self.joints):
             check_position(joint, config.home[index], f"{self.key}.home[{index}]")
         return dict(zip(names, config.home, strict=True)) | self._open_gripper()
@@ -246,10 +244,3 @@ def _check_link(link: str, model: Model, key: str) -> None:
     if link not in model.links:
         name = model.description.name
         raise ConfigError(f"{key} = {link!r:.60}: {name} has no such link; allowed: {', '.join(model.links)}")
-
-
-def _usual_tip(tree: LinkTree) -> str | None:
-    try:
-        return default_tip(tree, (), "")
-    except ConfigError:
-        return None

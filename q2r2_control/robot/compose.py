@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from q2r2_control.config.arms import PoseConfig, RobotConfig, check_models
+from q2r2_control.config.arms import PoseConfig, check_models
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import ArmAssembly, Model, check_position, load_model
@@ -21,6 +21,7 @@ from q2r2_control.robot.pinocchio_models import lock_joints, resting_position
 from q2r2_control.robot.urdf_parts import (
     WORLD,
     fixed_joint,
+    mimic_of,
     name_shapes,
     obstacle_link,
     renamed_exclusions,
@@ -65,7 +66,8 @@ def compose(config: Config) -> ComposedCell:
         srdf.extend(arm.mounted_exclusions())
     _check_apart(urdf)
     home = _home(urdf, arms)
-    resting = {} if config.robot is None else _resting(urdf, config.robot, home)
+    resting = {} if config.robot is None else config.robot.home
+    _check_resting(urdf, resting, home)
     lock_joints(urdf, home, _locked_at(urdf, home | resting))
     for arm in arms.values():
         for name, limit in arm.acceleration_limits().items():
@@ -127,21 +129,18 @@ def _home(urdf: ET.Element, arms: Mapping[str, ArmAssembly]) -> dict[str, float]
             home[name], owner[name] = position, arm.key
         fingers |= set(arm.finger_names())
     for follower in urdf.findall("joint"):
-        mimic = follower.find("mimic")
-        if mimic is not None and mimic.get("joint") in fingers:
-            home.setdefault(follower.get("name", ""), _mimicked(mimic, home))
+        if (mimic := mimic_of(follower)) is not None and mimic[0] in fingers:
+            home.setdefault(follower.get("name", ""), mimic[1] * home[mimic[0]] + mimic[2])
     return home
 
 
-def _resting(urdf: ET.Element, robot: RobotConfig, home: Mapping[str, float]) -> dict[str, float]:
-    """Where ``robot.home`` has joints that rest."""
+def _check_resting(urdf: ET.Element, resting: Mapping[str, float], home: Mapping[str, float]) -> None:
     joints = {joint.get("name", ""): joint for joint in urdf.findall("joint") if joint.get("type") != "fixed"}
-    for name, position in robot.home.items():
+    for name, position in resting.items():
         if name not in joints or name in home:
             allowed = ", ".join(joint for joint in joints if joint not in home)
             raise ConfigError(f"robot.home.{name!s:.60}: no joint that rests; allowed: {allowed or 'none'}")
         check_position(joints[name], position, f"robot.home.{name}")
-    return robot.home
 
 
 def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]:
@@ -149,15 +148,9 @@ def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]
     joints = urdf.findall("joint")
     at = {joint.get("name", ""): resting_position(joint) for joint in joints} | dict(given)
     for joint in joints:
-        mimic = joint.find("mimic")
-        if mimic is not None and joint.get("name") not in given:
-            at[joint.get("name", "")] = _mimicked(mimic, at)
+        if (mimic := mimic_of(joint)) is not None and joint.get("name") not in given:
+            at[joint.get("name", "")] = mimic[1] * at.get(mimic[0], 0.0) + mimic[2]
     return at
-
-
-def _mimicked(mimic: ET.Element, positions: Mapping[str, float]) -> float:
-    multiplier, offset = (float(mimic.get(key, usual)) for key, usual in (("multiplier", "1"), ("offset", "0")))
-    return multiplier * positions.get(mimic.get("joint", ""), 0.0) + offset
 
 
 def _check_apart(urdf: ET.Element) -> None:
@@ -170,9 +163,8 @@ def _check_apart(urdf: ET.Element) -> None:
 
 def _check_obstacle_name(name: str, urdf: ET.Element) -> None:
     if not _OBSTACLE_NAME.fullmatch(name) or _RESERVED_NAME.match(name):
-        raise ConfigError(
-            f"obstacles.{name!r:.60}: allowed: letters, digits and _, starting with a letter, "
-            f"and not with {WORLD}, universe, {', '.join(f'{side}_' for side in SIDES)}"
-        )
+        reserved = f"{WORLD}, universe, {', '.join(f'{side}_' for side in SIDES)}"
+        letters = "letters, digits and _, starting with a letter"
+        raise ConfigError(f"obstacles.{name!r:.60}: allowed: {letters}, and not with {reserved}")
     if urdf.find(f"link[@name='{name}']") is not None:
         raise ConfigError(f"obstacles.{name}: the cell has a link of this name; allowed: another name")

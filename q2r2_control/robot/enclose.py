@@ -60,14 +60,10 @@ def enclosing_capsule(points: Array) -> tuple[float, Array, Array]:
     axes = np.linalg.svd(points - centre, full_matrices=True)[2]
     frames = [axes[[index - 2, index - 1, index]] for index in range(3)]  # rows: two across, one along
     views = [(points - centre) @ frame.T / scale for frame in frames]
-    volumes = [_volume(*_fit(view, _start(view))) for view in views]
-    best = int(np.argmin(volumes))
-    result = minimize(
-        lambda x: _volume(*_fit(views[best], x)),
-        _start(views[best]),
-        method="Nelder-Mead",
-        options={"maxiter": 600, "xatol": 1e-4, "fatol": 1e-5},
-    )
+    best = int(np.argmin([_volume(*_fit(view, _start(view))) for view in views]))
+    options = {"maxiter": 600, "xatol": 1e-4, "fatol": 1e-5}
+    start = _start(views[best])
+    result = minimize(lambda x: _volume(*_fit(views[best], x)), start, method="Nelder-Mead", options=options)
     radius, ends = _fit(views[best], result.x)
     start, end = ends * scale @ frames[best] + centre
     return radius * scale + _ROUNDING, start, end

@@ -20,6 +20,7 @@ from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
 from q2r2_control.robot.pairs import KnownParts, link_of, links_moved_by
 from q2r2_control.robot.pinocchio_models import joint_axis
 from q2r2_control.robot.turning_fingers import FingerJoint, TurningBody, TurningSweeps
+from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 
@@ -37,14 +38,12 @@ class FingerBody:
         """Which part of the segment, from 0 its start to 1 its end, the fingers are in at openings in ``interval``."""
         if interval == ALL_OF_THE_WAY:
             return 0.0, 1.0
-        least, greatest = self.length, 0.0
+        lowest, highest = [], []
         for at, slides in self.ends:
-            lowest = highest = at
-            for along, joint in slides:
-                ways = [along * (position - joint.home) for position in joint.travel(interval)]
-                lowest, highest = lowest + min(ways), highest + max(ways)
-            least, greatest = min(least, lowest), max(greatest, highest)
-        return max(least / self.length, 0.0), min(greatest / self.length, 1.0)
+            ways = [[along * (end - joint.home) for end in joint.travel(interval)] for along, joint in slides]
+            lowest.append(at + sum(map(min, ways)))
+            highest.append(at + sum(map(max, ways)))
+        return max(min(lowest) / self.length, 0.0), min(max(highest) / self.length, 1.0)
 
 
 def part_of_segment(start: Array, end: Array, part: tuple[float, float]) -> tuple[Array, Array]:
@@ -146,7 +145,8 @@ def _finger_joint(
     driver, multiplier, offset = _driver(tree, joint, driven if stroke is not None else ())
     lower, upper = joint_limits(driver)
     closed, opened = (lower, upper) if stroke is None else stroke
-    before, beyond = (lower, upper) if opened >= closed else (upper, lower)
+    ends = closed, opened, *((lower, upper) if opened >= closed else (upper, lower))
+    closed, opened, before, beyond = (multiplier * end + offset for end in ends)
     placement = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)].placement
     axis: Array = placement.rotation @ joint_axis(joint)
     return FingerJoint(
@@ -154,10 +154,10 @@ def _finger_joint(
         axis=np.asarray(axis),
         point=np.array(placement.translation),
         home=home.get(name, 0.0),
-        closed=multiplier * closed + offset,
-        open=multiplier * opened + offset,
-        before=multiplier * before + offset,
-        beyond=multiplier * beyond + offset,
+        closed=closed,
+        open=opened,
+        before=before,
+        beyond=beyond,
         driver=driver.get("name", ""),
     )
 
@@ -168,14 +168,12 @@ def _driver(tree: LinkTree, joint: ET.Element, driven: Collection[str]) -> tuple
     A joint that the gripper drives is its own driver, whatever it mimics.
     """
     movable, multiplier, offset, seen = tree.movable(), 1.0, 0.0, {joint.get("name", "")}
-    while joint.get("name", "") not in driven and (mimic := joint.find("mimic")) is not None:
-        leader = mimic.get("joint", "")
+    while joint.get("name", "") not in driven and (mimic := mimic_of(joint)) is not None:
+        leader, by, beside = mimic
         if leader not in movable or leader in seen:
             break
         seen.add(leader)
-        offset += multiplier * float(mimic.get("offset", "0"))
-        multiplier *= float(mimic.get("multiplier", "1"))
-        joint = movable[leader]
+        joint, multiplier, offset = movable[leader], multiplier * by, offset + multiplier * beside
     return joint, multiplier, offset
 
 

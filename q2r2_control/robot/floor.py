@@ -1,8 +1,7 @@
 """The floor of a cell: what stands for it in the URDF, and which links need no watching against it.
 
-It is a box whose top is at the floor's height: URDF has no plane, and the distance of a capsule from a fixed box is
-exact in closed form. No arm reaches beyond its edges, since no mount is farther than 20 m from the origin; and it is so
-thick that what is in it is pushed out through the top.
+It is a box whose top is at the floor's height, since URDF has no plane. No arm reaches beyond its edges, since no mount
+is farther than 20 m from the origin, and bodies inside are pushed out through the top, since it is thick.
 """
 
 from __future__ import annotations
@@ -69,8 +68,7 @@ def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel
     """Remove pairs of the floor with bodies that cannot come nearer to it than now.
 
     Two kinds, both proven: bodies that turn about vertical axes only, as an arm's first link does, and stay as high as
-    they are; and bodies whose distance from the first joint that can tip them is too short to come within
-    :data:`CLEARANCE`.
+    they are; and bodies too near to the first joint that can tip them to come within :data:`CLEARANCE`.
     """
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))

@@ -1,8 +1,7 @@
 """What grippers hold: bodies that are fixed to the tools, and what they are watched against.
 
-They stand beside ``Robot.collision_model``, in a copy of it that ends with them and their pairs, since they are there
-only while a gripper holds them. An object is watched against what the bodies on its link are, but for its own hand and
-the fingers of other hands, which have to be able to take it over.
+They stand in a copy of ``Robot.collision_model`` that ends with them and their pairs. An object is watched against what
+the bodies on its link are, but for its own hand and the fingers of other hands, which have to be able to take it over.
 
 **Boxes against boxes** have no short closed form. Where two convex polyhedra are closest, one of the two points can be
 taken on an edge: if both lie inside of faces, these are parallel, and both points may be moved along them until one

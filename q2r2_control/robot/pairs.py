@@ -18,7 +18,7 @@ from q2r2_control.types import Array
 
 
 class LinkClass(StrEnum):
-    """What a link is, in the words of ``control.distances``, the outermost first."""
+    """A link's class, as in ``control.distances``, the outermost first."""
 
     OBJECT = "object"
     FINGER = "finger"
@@ -164,13 +164,13 @@ def remove_overlapping_own_pairs(
 ) -> tuple[tuple[str, str], ...]:
     """Remove pairs of one arm's own links that touch at every one of ``postures``, and return their names.
 
-    For shapes that overlap by construction, such as capsules around neighbouring meshes. ``own_links`` has one set of
-    links an arm, from its base to its tool. A pair with the other arm or with an obstacle stays, however it lies.
+    Such shapes overlap by construction. ``own_links`` has one set of links an arm, from its base to its tool. A pair
+    with the other arm or with an obstacle stays, however it lies.
     """
     data, geometry_data = model.createData(), geometry.createData()
     names = pair_names(geometry)
-    within_one_arm = [any({link_of(name) for name in pair} <= links for links in own_links) for pair in names]
-    touching = np.array(within_one_arm, dtype=bool)  # of no pair too
+    within_one_arm = [any(set(map(link_of, pair)) <= links for links in own_links) for pair in names]
+    touching = np.array(within_one_arm, dtype=bool)
     for q in postures:
         pin.computeDistances(model, data, geometry, geometry_data, q)
         touching &= np.array([result.min_distance <= 0 for result in geometry_data.distanceResults], dtype=bool)

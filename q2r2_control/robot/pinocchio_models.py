@@ -64,8 +64,8 @@ def _vector(element: ET.Element | None, attribute: str) -> list[float]:
     return [] if element is None else [float(part) for part in element.get(attribute, "").split()]
 
 
-# Inertia that the rotor of a geared drive adds to its joint where the URDF does not say [kg m^2]. Without any, light
-# wrist joints would need torques faster than a control loop gives them.
+# Inertia that the rotor of a geared drive adds where the URDF does not say [kg m^2]. Without any, a control loop is too
+# slow for light wrist joints.
 _USUAL_ARMATURE = 0.1
 
 
@@ -86,9 +86,8 @@ def checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str]
             raise RobotError(f"{where}: joint {name} is {kind}; an arm's joints have to be revolute or prismatic")
         lower, upper = joint_limits(joint)
         if not lower < upper:
-            raise RobotError(
-                f"{where}: joint {name} has position limits {lower:g} .. {upper:g}; expected lower < upper"
-            )
+            limits = f"position limits {lower:g} .. {upper:g}"
+            raise RobotError(f"{where}: joint {name} has {limits}; expected lower < upper")
         limit = joint.find("limit")
         for what in ("velocity", "effort"):
             value = 0.0 if limit is None else float(limit.get(what, "0"))

@@ -66,12 +66,10 @@ class Robot:
     ``acceleration_limit`` is infinite for joints of which the model says none; what holds is
     :meth:`capped_acceleration`.
 
-    ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own
-    links that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box
-    fixed in the world; a finger is all that it sweeps, and ``finger_bodies`` says what counts while its gripper's
-    opening is known. ``objects`` are what grippers hold, of which the collision model knows nothing.
-    ``roles`` says what each link is. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction
-    and are not monitored.
+    ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, its own links that
+    can meet, and what stands in the cell. Every monitored shape is a capsule, a sphere, or a box fixed in the world; a
+    finger is all that it sweeps, and ``finger_bodies`` says what counts at a known opening. ``objects`` are what
+    grippers hold, beside the collision model. ``ignored_pairs`` of one arm's shapes overlap by construction.
     """
 
     def __init__(
@@ -196,7 +194,7 @@ class Robot:
             remove_disabled_pairs(self.collision_model, exclusions)
         postures = [self.home]
         if exclusions is not None:
-            # Who lists the pairs is believed: only what overlaps everywhere is dropped, since it can never be parted.
+            # An SRDF is believed: only pairs that overlap everywhere are dropped, since they can never be parted.
             random = np.random.default_rng(0)
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)

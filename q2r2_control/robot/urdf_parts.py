@@ -83,6 +83,13 @@ ACCELERATION = "acceleration"
 ATTRIBUTES = (ACCELERATION, "deceleration", "{http://drake.mit.edu}acceleration")  # of limit
 
 
+def mimic_of(joint: ET.Element) -> tuple[str, float, float] | None:
+    """The joint that this one follows, multiplier and offset; None where it follows none."""
+    if (mimic := joint.find("mimic")) is None:
+        return None
+    return mimic.get("joint", ""), float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+
+
 def acceleration_limit(joint: ET.Element) -> float:
     """The least of a joint's limits [rad/s^2, m/s^2 of a sliding joint]; infinity where it has none.
 

@@ -86,25 +86,21 @@ def test_what_really_can_meet_collides(plant: MujocoPlant, q: list[float], prefi
     assert prefixes in [{name.split("_")[0] for name in pair} for pair in _pairs_in_contact(plant)]
 
 
-@pytest.mark.parametrize(("floor", "rests_at"), [(0.0, 0.03), (-0.4, -0.37)])
-def test_the_simulated_floor_is_where_the_cells_is(config: Config, floor: float, rests_at: float) -> None:
-    plant = _with_a_falling_block(config, floor)
+SLAB = ObstacleConfig(shape="box", size=(9.0, 9.0, 0.1), position=(0.0, 0.0, -0.25))
+
+
+@pytest.mark.parametrize(
+    ("floor", "obstacles", "height"),
+    [(0.0, {}, 0.03), (-0.4, {}, -0.37), (None, {}, -4.405), (None, {"floor": SLAB}, -0.17)],
+    ids=["at zero", "lower", "none, and the drawing of one touches nothing", "an obstacle of this name"],
+)
+def test_a_block_falls_onto_the_floor(
+    config: Config, floor: float | None, obstacles: dict[str, ObstacleConfig], height: float
+) -> None:
+    plant = _with_a_falling_block(config.model_copy(update={"obstacles": obstacles}), floor)
     plant.advance(1.0)
-    assert plant.data.body("block").xpos[2] == pytest.approx(rests_at, abs=1e-3)
-
-
-def test_without_a_floor_one_is_drawn_that_nothing_touches(config: Config) -> None:
-    plant = _with_a_falling_block(config, None)
-    plant.advance(1.0)
-    assert plant.data.body("block").xpos[2] < -1.0
-    assert plant.model.geom("floor").type[0] == mujoco.mjtGeom.mjGEOM_PLANE
-
-
-def test_an_obstacle_called_floor_stays_what_it_is_in_a_cell_without_a_floor(config: Config) -> None:
-    slab = ObstacleConfig(shape="box", size=(9.0, 9.0, 0.1), position=(0.0, 0.0, -0.25))
-    plant = _with_a_falling_block(config.model_copy(update={"obstacles": {"floor": slab}}), None)
-    plant.advance(1.0)
-    assert plant.data.body("block").xpos[2] == pytest.approx(-0.2 + 0.03, abs=1e-3)
+    assert plant.data.body("block").xpos[2] == pytest.approx(height, abs=6e-3)
+    assert obstacles or plant.model.geom("floor").type[0] == mujoco.mjtGeom.mjGEOM_PLANE
 
 
 def test_a_finger_meets_the_floor(config: Config) -> None:

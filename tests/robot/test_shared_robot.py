@@ -143,7 +143,7 @@ def test_dynamics_are_those_of_the_whole_model_with_locked_joints(name: str, req
     np.testing.assert_array_equal(robot.torque_limit, expected.effortLimit)
 
 
-def test_a_joint_that_one_arm_names_moves_the_tools_of_both() -> None:
+def test_a_joint_that_one_arm_names_moves_the_tools_of_both_and_is_refused_to_the_other() -> None:
     cell = copy.deepcopy(TIAGO) | {"srdf": None, "robot": {"model": "example-robot-data:tiago_dual"}}
     names = [f"arm_left_{number}_joint" for number in range(1, 8)]
     left = cell["arms"]["left"]
@@ -152,6 +152,11 @@ def test_a_joint_that_one_arm_names_moves_the_tools_of_both() -> None:
     assert robot.joint_names[0] == "torso_lift_joint"
     assert robot.home[0] == 0.1
     assert all(0 in arm.joints for arm in robot.arms.values())
+    right = cell["arms"]["right"]
+    right["joints"] = ["torso_lift_joint", *(f"arm_right_{number}_joint" for number in range(1, 8))]
+    right["home"] = [0.1, *right["home"]]
+    with pytest.raises(ConfigError, match=r"^arms\.right: joint torso_lift_joint is one of arms.left as well"):
+        compose(Config.model_validate(cell))
 
 
 @pytest.mark.parametrize("name", ["baxter", "tiago"])
@@ -215,14 +220,4 @@ def test_a_bad_share_ends_in_one_line_that_says_what_is_allowed(path: str, value
     with pytest.raises(ConfigError) as error:
         Robot.from_config(_changed(path, value))
     assert says in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_joints_of_the_other_arm_are_refused() -> None:
-    cell = copy.deepcopy(TIAGO) | {"srdf": None}
-    for side, arm in cell["arms"].items():
-        arm["joints"] = ["torso_lift_joint", *(f"arm_{side}_{number}_joint" for number in range(1, 8))]
-        arm["home"] = [0.1, *arm["home"]]
-    with pytest.raises(ConfigError, match=r"arms\.right: joint torso_lift_joint is one of arms.left as well") as error:
-        compose(Config.model_validate(cell))
     assert "\n" not in str(error.value)

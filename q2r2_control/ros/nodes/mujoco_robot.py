@@ -25,7 +25,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.strict import STREAM_TIMEOUT
-from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
+from q2r2_control.plants.simulated_cell import SimulatedCell
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN
 from q2r2_control.ros.bridge.frames import LinkFrames
@@ -143,8 +143,8 @@ class MujocoRobot(ManagedNode):
 
     def _follow(self, topic: str, names: Any, positions: Any, velocities: Any, delay: Any = None) -> None:
         v = np.asarray(velocities, float) if len(velocities) else None
-        setpoint = JointSetpoint(names, np.asarray(positions, float), v, 0.0 if delay is None else seconds(delay))
-        self._note(topic, self._cell.command_positions(setpoint, self._received))
+        q, due = np.asarray(positions, float), 0.0 if delay is None else seconds(delay)
+        self._note(topic, self._cell.command_positions(names, q, v, self._received, due))
 
     def _note(self, topic: str, fault: str | None) -> None:
         """Say what was refused, until the topic brings something good again."""
