@@ -15,7 +15,6 @@ from q2r2_control.cli.cell_report import CellCheck, check_cell
 from q2r2_control.cli.output import ConfigFile, Json, as_json_text, counting, figure_table, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.model_srdf import model_srdfs
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import Robot
 
@@ -48,25 +47,6 @@ def write_pairs(
     return PairsWritten(str(file), samples, clearance, never, tuple(pair for pair in found if pair not in never))
 
 
-def write_model_pairs(
-    config: Config, folder: Path, samples: int, clearance: float, progress: Progress | None = None
-) -> dict[str, bool]:
-    """Write the SRDF of each model of a cell to ``folder``; returns by path whether the file is new.
-
-    Raises :class:`ConfigError` for such a clearance, and before it writes anything for a file that says something else.
-    """
-    _check_clearance(config, clearance)
-    if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such folder")
-    files = {folder / name: text for name, text in model_srdfs(config, clearance, samples, 0, progress).items()}
-    new = {file: text for file, text in files.items() if not file.exists()}
-    for file, text in files.items():
-        if file not in new and file.read_bytes() != text.encode():
-            raise ConfigError(f"{file}: exists and says something else; remove it to have it written anew")
-    _write(new)
-    return {str(file): file in new for file in files}
-
-
 def _check_clearance(config: Config, clearance: float) -> None:
     key, least = config.control.largest_distance
     if not least < clearance <= 1.0:
@@ -84,14 +64,11 @@ def _write(files: Mapping[Path, str]) -> None:
 def check(
     config: ConfigFile,
     pairs: Annotated[Path | None, Option(metavar="FILE", help="Write pairs that can never meet as an SRDF.")] = None,
-    model_pairs: Annotated[Path | None, Option(metavar="FOLDER", help="The same of each arm and tool alone.")] = None,
-    samples: Annotated[int, Option(help="Random postures that --pairs and --model-pairs look at.")] = 20_000,
+    samples: Annotated[int, Option(help="Random postures that --pairs looks at.")] = 20_000,
     clearance: Annotated[float, Option(help="Pairs that stay farther apart need no watching [m].")] = 0.05,
     json: Json = False,
 ) -> None:
     """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
-    if pairs is not None and model_pairs is not None:
-        raise ConfigError("--pairs and --model-pairs exclude each other")
     cell = load_config(config)
     if pairs is not None:
         with counting() as progress:
@@ -103,12 +80,6 @@ def check(
             ((f"{pair.link_a} | {pair.link_b}", 1e3 * pair.nearest) for pair in found.never),
         )
         print_report(found, (table,), json)
-    elif model_pairs is not None:
-        with counting() as progress:
-            files = write_model_pairs(cell, model_pairs, samples, clearance, progress)
-        rows = ((file, "new" if new else "as it was") for file, new in files.items())
-        title = "pairs of the models' links that need no watching"
-        print_report(files, (figure_table(title, ("file", "is"), rows),), json)
     else:
         result = check_cell(cell)
         if json:

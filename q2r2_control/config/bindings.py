@@ -14,26 +14,26 @@ from q2r2_control.types import DeviceControls
 
 
 class Action(StrEnum):
-    """What a hand can do with its controls."""
+    """What a hand can do with its controls: see ``MEANINGS``."""
 
     NONE = "none"
     # Once, when a control was tapped, or held for a while.
-    PAUSE_TOGGLE = "pause_toggle"  # engage, or pause
+    PAUSE_TOGGLE = "pause_toggle"
     GRIPPER_TOGGLE = "gripper_toggle"
-    HOME = "home"  # both arms
-    STOP = "stop"  # both arms, until it is done once more
-    CARRY = "carry"  # this hand moves both tools as one body
-    RECORD_TOGGLE = "record_toggle"  # an episode begins, or ends
-    RECORD_DISCARD = "record_discard"  # the episode is not worth keeping
-    RECORD_SUCCESS = "record_success"  # the episode succeeded, and ends
-    RECORD_FAILURE = "record_failure"  # it failed, and ends
-    RECORD_MARK = "record_mark"  # something happened now
+    HOME = "home"
+    STOP = "stop"
+    CARRY = "carry"
+    RECORD_TOGGLE = "record_toggle"
+    RECORD_DISCARD = "record_discard"
+    RECORD_SUCCESS = "record_success"
+    RECORD_FAILURE = "record_failure"
+    RECORD_MARK = "record_mark"
     # For as long as a trigger or stick is held.
-    DEAD_MAN = "dead_man"  # engaged while held
-    PRECISION = "precision"  # motion is scaled down
-    ROTATION_LOCK = "rotation_lock"  # the tool keeps its orientation
-    TRANSLATION_LOCK = "translation_lock"  # the tool keeps its position
-    GRIPPER_ANALOG = "gripper_analog"  # the gripper closes as far as the trigger is pressed
+    DEAD_MAN = "dead_man"
+    PRECISION = "precision"
+    ROTATION_LOCK = "rotation_lock"
+    TRANSLATION_LOCK = "translation_lock"
+    GRIPPER_ANALOG = "gripper_analog"
 
 
 LASTING = frozenset(
@@ -42,7 +42,7 @@ LASTING = frozenset(
 
 
 class Gesture(StrEnum):
-    """How a control is used. ``DOWN`` is its beginning, which only stops an arm that the control pauses."""
+    """How a control is used. ``DOWN`` is its beginning, which only stops an arm that it pauses."""
 
     DOWN = "down"
     TAP = "tap"
@@ -83,7 +83,6 @@ DEVICE_NAMES: dict[str, tuple[str, float]] = {
     "stick_left": ("thumb_stick_horizontal", -1.0),
     "stick_right": ("thumb_stick_horizontal", 1.0),
 }
-_WORDS = {Gesture.TAP: "", Gesture.HOLD: " held"}
 _SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold"}
 
 
@@ -102,7 +101,7 @@ class Binding(NamedTuple):
     @property
     def words(self) -> str:
         """As an operator calls it."""
-        return self.control + _WORDS[self.gesture]
+        return f"{self.control} held" if self.gesture is Gesture.HOLD else self.control
 
 
 class BindingSettings(StrictModel):
@@ -141,16 +140,14 @@ class BindingSettings(StrictModel):
             self._allow(binding)
         toggle, dead_man = bound.get(Action.PAUSE_TOGGLE), bound.get(Action.DEAD_MAN)
         if toggle and dead_man:
-            raise ValueError(
-                f"{toggle.field} is pause_toggle and {dead_man.field} is dead_man; allowed: one way to engage"
-            )
+            both = f"{toggle.field} is pause_toggle and {dead_man.field} is dead_man"
+            raise ValueError(f"{both}; allowed: one way to engage")
         if not (toggle or dead_man):
             raise ValueError("no control engages the arm; allowed: a control that is pause_toggle, or dead_man")
         analog = bound.get(Action.GRIPPER_ANALOG)
         if analog and (other := bound.get(Action.GRIPPER_TOGGLE)):
-            raise ValueError(
-                f"{other.field} is gripper_toggle and {analog.field} is gripper_analog; allowed: one of them"
-            )
+            both = f"{other.field} is gripper_toggle and {analog.field} is gripper_analog"
+            raise ValueError(f"{both}; allowed: one of them")
         return self
 
     def _allow(self, binding: Binding) -> None:
@@ -159,10 +156,8 @@ class BindingSettings(StrictModel):
         if action is Action.PAUSE_TOGGLE and gesture is not Gesture.TAP:
             raise ValueError(f"{binding.field} is pause_toggle, which must not wait; allowed: {control}")
         if action is Action.STOP and control in BUTTONS and gesture is Gesture.TAP:
-            raise ValueError(
-                f"{control} is stop, and the headset's alignment presses it too; allowed: {control}_hold, "
-                "or another control"
-            )
+            why = "and the headset's alignment presses it too"
+            raise ValueError(f"{control} is stop, {why}; allowed: {control}_hold, or another control")
         if action in LASTING and (gesture is not Gesture.TAP or control in BUTTONS):
             raise ValueError(f"{binding.field} is {action}, which lasts; allowed: {', '.join(HELD)}")
         if action is Action.GRIPPER_ANALOG and control not in TRIGGERS:
@@ -178,11 +173,9 @@ class BindingSettings(StrictModel):
         allowed = [control for control, (name, _) in DEVICE_NAMES.items() if name in names]
         for binding in self.bound():
             if binding.control not in allowed:
-                name, _ = DEVICE_NAMES[binding.control]
-                has = ", ".join(allowed) or "no control at all"
-                raise ConfigError(
-                    f"teleop.bindings.{binding.field} = {binding.action}: this input has no {name}; allowed: {has}"
-                )
+                no, has = DEVICE_NAMES[binding.control][0], ", ".join(allowed) or "no control at all"
+                key = f"teleop.bindings.{binding.field}"
+                raise ConfigError(f"{key} = {binding.action}: this input has no {no}; allowed: {has}")
 
     def bound(self) -> Iterator[Binding]:
         """All that is bound, control by control."""
@@ -197,7 +190,7 @@ class BindingSettings(StrictModel):
         return words | {"lower and upper together": "the headset's alignment: stops both arms until they are let go"}
 
     def action_of(self, control: str, gesture: Gesture) -> Action:
-        """What a gesture of a control does; the beginning of one nothing by itself."""
+        """What a gesture of a control does; its beginning does nothing by itself."""
         return Action.NONE if gesture is Gesture.DOWN else getattr(self, control + _SUFFIXES[gesture])
 
     def words_of(self, action: str) -> str | None:

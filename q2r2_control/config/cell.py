@@ -46,9 +46,7 @@ class ObstacleConfig(StrictModel):
 
     shape: Literal["box", "cylinder", "sphere", "capsule"]
     size: tuple[Extent, ...] = Field(
-        description="box: x y z; cylinder, capsule: radius length; sphere: radius [m]",
-        min_length=1,
-        max_length=3,
+        description="box: x y z; cylinder, capsule: radius length; sphere: radius [m]", min_length=1, max_length=3
     )
     position: Metres3 = (0.0, 0.0, 0.0)
     rpy: Radians3 = (0.0, 0.0, 0.0)
@@ -70,7 +68,6 @@ class HeadsetConfig(StrictModel):
     allow: tuple[str, ...] | None = Field(
         None, min_length=1, description="addresses and networks that may connect; none: all that reach the port"
     )
-
     frozen_time: float | None = Field(
         0.5, ge=0.1, le=10, description="poses that stay the same to the last bit for this long are lost [s]; none: not"
     )

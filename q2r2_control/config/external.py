@@ -134,10 +134,8 @@ class ExternalConfig(StrictModel):
         if self.rate is not None and self.rate < preset.lowest_rate:
             raise ValueError(f"rate = {self.rate:g}: preset {preset.name} needs at least {preset.lowest_rate:g} Hz")
         if not preset.takes_poses and (given := [key for key, value in self.limits if value is not None]):
-            raise ValueError(
-                f"limits.{given[0]}: is for targets; preset {preset.name} gets joint positions within the limits of "
-                "the block control"
-            )
+            gets = "gets joint positions within the limits of the block control"
+            raise ValueError(f"limits.{given[0]}: is for targets; preset {preset.name} {gets}")
         return self
 
     @property
@@ -172,11 +170,7 @@ def check_external(kind: ControllerKind, external: ExternalConfig | None, arms: 
         raise ConfigError(f"external.arms: without {', '.join(sorted(missing))}; needed: {', '.join(arms)}")
     if surplus := set(external.arms) - set(arms):
         raise ConfigError(f"external.arms.{sorted(surplus)[0]}: the cell has no such arm; allowed: {', '.join(arms)}")
-    _check_apart(external)
-
-
-def _check_apart(external: ExternalConfig) -> None:
-    """Two arms that share a topic would be pulled to and fro."""
+    # Two arms that share a topic would be pulled to and fro.
     topics = [external.topic(arm) for arm in external.arms]
     frames = [made.tool_frame for made in external.arms.values() if made.tool_frame is not None]
     for what, values in (("commands", topics), ("tool_frame", frames)):
@@ -187,9 +181,7 @@ def _check_apart(external: ExternalConfig) -> None:
 def describe(external: ExternalConfig) -> dict[str, str]:
     """What is driven and how, one line an arm."""
     preset = external.terms
-    source = "the hand's target"
-    if external.filtered:
-        source = f"what the built-in controller makes of {source}"
+    source = "what the built-in controller makes of the hand's target" if external.filtered else "the hand's target"
     lines: dict[str, str] = {}
     for arm, made in external.arms.items():
         message = preset.message.rpartition("/")[2] + (f" in {made.base_frame}" if preset.takes_poses else "")

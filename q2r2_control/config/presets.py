@@ -1,4 +1,4 @@
-"""What community controllers ask of who drives them: topic, type, frame, rate, activation, limits.
+"""Terms of community controllers: topic, type, frame, rate, activation, limits.
 
 ``{ctrl}`` stands for the controller's own name with its namespace, the parameter ``ctrl_prefix`` of an arm controller.
 """
@@ -21,7 +21,7 @@ class Hold(StrEnum):
     SILENCE = "silence"  # nothing: it holds by itself, and a stale target is its own reason to stop
 
 
-# For controllers that pass a target on without limits of their own.
+# For controllers without limits of their own.
 _CAREFUL = GuardSettings()
 # The built-in controller keeps its own limits, which are narrower; what is left is that no target jumps.
 _WIDE = GuardSettings(
@@ -65,9 +65,7 @@ _ALL = (
         topic="{ctrl}/reference_pose",
     ),
     Preset(
-        "crisp",
-        "active; one publisher, unit quaternions; ctrl_prefix is its namespace",
-        topic="{ctrl}/target_pose",
+        "crisp", "active; one publisher, unit quaternions; ctrl_prefix is its namespace", topic="{ctrl}/target_pose"
     ),
     Preset(
         "moveit_servo",
@@ -128,8 +126,6 @@ def preset_of(name: str, mode: str) -> tuple[Preset, Mode]:
         raise ConfigError(f"mode = {mode!r:.60}: allowed are {', '.join(Mode)}")
     preset = PRESETS[name]
     if mode == Mode.RAW and not preset.takes_poses:
-        raise ConfigError(
-            f"preset = {name!r} with mode = {mode!r}: it takes joint positions, which the built-in controller has to "
-            f"make of the hand's target; allowed is mode {Mode.FILTERED.value}"
-        )
+        takes = "it takes joint positions, which the built-in controller has to make of the hand's target"
+        raise ConfigError(f"preset = {name!r} with mode = {mode!r}: {takes}; allowed is mode {Mode.FILTERED.value}")
     return preset, Mode(mode)

@@ -6,10 +6,9 @@ from typing import Annotated
 
 from pydantic import Field, StringConstraints, model_validator
 
-from q2r2_control.config.arms import Metres3, Radians3
+from q2r2_control.config.arms import Metres3, Radians3, Share
 from q2r2_control.config.strict import StrictModel
 
-Share = Annotated[float, Field(ge=0, le=1)]
 Seconds = Annotated[float, Field(ge=0, le=10)]
 Metres = Annotated[float, Field(ge=0, le=2)]
 Radians = Annotated[float, Field(ge=0, le=3.15)]

@@ -15,9 +15,7 @@ from q2r2_control.config.strict import STREAM_TIMEOUT, StrictModel
 from q2r2_control.types import Array, Interval
 
 _Scale = Annotated[float, Field(ge=0, le=10)]
-
-
-_AXES = ("x", "y", "z")
+_SIGNS = (("+", 1.0), ("-", -1.0))
 _ALLOWED = "three of +x -x +y -y +z -z that use x, y and z once each, e.g. [+z, -x, +y]"
 
 
@@ -28,14 +26,10 @@ def axes_matrix(axes: Sequence[str]) -> Array:
     left-handed frame, as raw Unity does; M R M' is a proper rotation then too.
     Raises :class:`ValueError` that names the value and what is allowed.
     """
-    matrix = np.zeros((3, 3))
-    for row, axis in enumerate(axes):
-        if len(axes) != 3 or len(axis) != 2 or axis[0] not in "+-" or axis[1] not in _AXES:
-            raise ValueError(f"axes {list(axes)} are not {_ALLOWED}")
-        matrix[row, _AXES.index(axis[1])] = 1.0 if axis[0] == "+" else -1.0
-    if abs(round(float(np.linalg.det(matrix)))) != 1:
+    rows = {sign + axis: factor * row for sign, factor in _SIGNS for axis, row in zip("xyz", np.eye(3), strict=True)}
+    if any(axis not in rows for axis in axes) or sorted(axis[1] for axis in axes) != ["x", "y", "z"]:
         raise ValueError(f"axes {list(axes)} are not {_ALLOWED}")
-    return matrix
+    return np.array([rows[axis] for axis in axes])
 
 
 class Stance(StrEnum):

@@ -22,11 +22,9 @@ class KinematicPlant:
 
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> KinematicPlant:
-        """The plant of a cell."""
         return cls(robot, config)
 
     def reset(self, q: Array | None = None) -> None:
-        """See :meth:`Plant.reset`."""
         posture = self._robot.home if q is None else q
         check_joints("reset q", posture, self._robot)
         self._q = np.array(posture, dtype=np.float64)
@@ -37,14 +35,12 @@ class KinematicPlant:
         self._grippers.reset()
 
     def apply(self, command: Command) -> None:
-        """See :meth:`Plant.apply`. Raises :class:`PlantError` in torque mode."""
         check_command(command, self._robot, self.modes)
         self._due_q = None if command.mode is CommandMode.VELOCITY else command.q.copy()
         self._due_v = command.v.copy()
         self._grippers.command(command.grippers)
 
     def advance(self, dt: float) -> None:
-        """See :meth:`Plant.advance`."""
         check_duration(dt)
         if dt == 0:
             return
@@ -55,12 +51,9 @@ class KinematicPlant:
 
     def state(self) -> RobotState:
         """See :meth:`Plant.state`. Torques are zero; external torque cannot be told."""
-        return RobotState(
-            q=self._q.copy(), v=self._v.copy(), tau=np.zeros(len(self._q)), tau_external=None, stamp=self._time
-        )
+        return RobotState(self._q.copy(), self._v.copy(), np.zeros(len(self._q)), None, self._time)
 
     def gripper_openings(self) -> dict[str, float]:
-        """See :meth:`Plant.gripper_openings`."""
         return dict(self._grippers.openings)
 
     def close(self) -> None:

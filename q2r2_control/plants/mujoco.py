@@ -11,53 +11,44 @@ import numpy as np
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
-from q2r2_control.plants.mujoco_cameras import Window
+from q2r2_control.plants.mujoco_cameras import open_window
 from q2r2_control.plants.mujoco_model import build_model, settle_mimics
-from q2r2_control.plants.servo import ReferenceLine, ServoGains, servo_gains
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
 # In steps: a step that is due but for the rounding of the ticks' sum is due.
 _STEP_ROUNDING = 1e-6
 
-
-@dataclass(frozen=True, slots=True)
-class _Push:
-    wrench: Array  # (6,) force [N], torque [Nm], world axes, at the tool frame's origin
-    last_step: int
+# A joint's inertia is never less than its armature, whatever the posture: M >= diag(armature). With K dt^2 / armature
+# <= 0.16 and D dt / armature <= 1 all eigenvalues of 2 D dt + K dt^2 over M stay below 4, where semi-implicit Euler
+# integration turns unstable.
+_MAX_STIFFNESS_STEP, _MAX_DAMPING_STEP = 0.16, 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class _Fingers:
     """Where one gripper's joints are in MuJoCo's arrays, and what fully open and closed mean for them."""
 
-    positions: tuple[int, ...]
-    actuators: tuple[int, ...]
+    positions: list[int]
+    actuators: list[int]
     open_position: float
     closed_position: float
-
-    def position(self, opening: float) -> float:
-        return self.closed_position + opening * (self.open_position - self.closed_position)
 
     def opening(self, qpos: Array) -> float:
         total = 0.0
         for index in self.positions:
             total += qpos.item(index)
-        closed = self.closed_position
-        opening = (total / len(self.positions) - closed) / (self.open_position - closed)
-        return 0.0 if opening < 0.0 else min(opening, 1.0)
+        stroke = self.open_position - self.closed_position
+        return min(max((total / len(self.positions) - self.closed_position) / stroke, 0.0), 1.0)
 
 
 class MujocoPlant:
     """The simulated cell, driven in one of three ways that each command chooses.
 
-    Position: a servo on each joint, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias, with the simulator's own M
-    and bias (gravity, Coriolis), computed at each physics step about a reference that moves straight from the last
-    command to the newest, and clipped at the robot's torque limits. Velocity: the same servos about a reference that
-    goes on from its last position at the command's velocity, for one ``advance``. Torque: the command's, clipped;
-    gravity is the sender's to bear.
-
-    ``model`` and ``data`` are MuJoCo's own, to look at.
+    Position: a servo on each joint, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias, with the simulator's M and
+    bias (gravity, Coriolis), clipped at the torque limits. The reference moves straight from the last command to the
+    newest, and rests without one. Velocity: the same servos about a reference that goes on at the command's velocity
+    for one ``advance``. Torque: the command's, clipped; gravity is the sender's to bear.
     """
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY, CommandMode.TORQUE)
@@ -66,19 +57,16 @@ class MujocoPlant:
         """``robot`` has to be the one of ``config``. Raises :class:`PlantError` where MuJoCo cannot model it."""
         self.model: mujoco.MjModel = build_model(robot, config)
         self.data: mujoco.MjData = mujoco.MjData(self.model)
-        # Views of MuJoCo's arrays, kept since each access by name makes a new one.
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._bias, self._ctrl = self.data.qfrc_bias, self.data.ctrl
-        self._smooth, self._passive = self.data.qfrc_smooth, self.data.qfrc_passive
-        self._constraint, self._actuator = self.data.qfrc_constraint, self.data.qfrc_actuator
         self._robot = robot
         self._timestep = config.mujoco.timestep
-        self._window: Window | None = None
+        self._window: mujoco.viewer.Handle | None = None
         self._grippers = GripperMotion(config)
-        self._fingers: dict[str, _Fingers] = {
+        self._fingers = {
             side: _Fingers(
-                tuple(self.model.joint(name).qposadr[0] for name in robot.arms[side].finger_joints),
-                tuple(self.model.actuator(name).id for name in robot.arms[side].finger_joints),
+                [self.model.joint(name).qposadr[0] for name in robot.arms[side].finger_joints],
+                [self.model.actuator(name).id for name in robot.arms[side].finger_joints],
                 arm.gripper.open_position,
                 arm.gripper.closed_position,
             )
@@ -92,11 +80,10 @@ class MujocoPlant:
         self._inertial_torque = np.zeros(self.model.nv)
         self.observed_qpos: Array = self._qpos.copy()  # (model.nq,) of all that moves, at the last :meth:`state`
         self.reset()
-        self._gains: ServoGains = self._tuned(config)
+        self._stiffness, self._damping = self._tuned(config)
 
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> MujocoPlant:
-        """The plant of a cell. Raises :class:`PlantError` where MuJoCo cannot model it."""
         return cls(robot, config)
 
     def reset(self, q: Array | None = None) -> None:
@@ -107,12 +94,13 @@ class MujocoPlant:
         self.data.qpos[self._q_index] = posture
         self._grippers.reset()
         for fingers in self._fingers.values():
-            self.data.qpos[list(fingers.positions)] = fingers.open_position
+            self.data.qpos[fingers.positions] = fingers.open_position
         settle_mimics(self.model, self.data)
-        self._reference = ReferenceLine(self.data.qpos[self._q_index])
+        self._start = self._end = self._at_rest(posture)  # posture and velocity at both ends of the tick
+        self._next: tuple[Array, Array] | None = None  # commanded for the end of the next tick
         self._torque: Array | None = None  # commanded in torque mode
         self._velocity: Array | None = None  # commanded in velocity mode, for the next advance
-        self._pushes: dict[str, _Push] = {}
+        self._pushes: dict[str, tuple[Array, int]] = {}  # wrench, and the step that it ends before
         self._steps = 0
         self._clock = 0.0
         mujoco.mj_forward(self.model, self.data)
@@ -121,7 +109,6 @@ class MujocoPlant:
         mujoco.mj_forward(self.model, self.data)
 
     def apply(self, command: Command) -> None:
-        """See :meth:`Plant.apply`."""
         check_command(command, self._robot, self.modes)
         self._velocity = command.v.copy() if command.mode is CommandMode.VELOCITY else None
         if command.mode is CommandMode.TORQUE:
@@ -129,11 +116,10 @@ class MujocoPlant:
         else:
             if self._torque is not None:
                 # Back from torque mode there is no last command to start the line from.
-                measured = self.data.qpos[self._q_index]
-                self._reference = ReferenceLine(measured if self._velocity is not None else command.q)
-                self._torque = None
+                self._end = self._at_rest(command.q if self._velocity is None else self._qpos[self._q_index])
+                self._next = self._torque = None
             if self._velocity is None:
-                self._reference.command(command.q, command.v)
+                self._next = command.q.copy(), command.v.copy()
         self._grippers.command(command.grippers)
 
     def advance(self, dt: float) -> None:
@@ -146,13 +132,15 @@ class MujocoPlant:
             return
         start, self._clock = self._clock, self._clock + dt
         if self._velocity is not None:
-            self._reference.command(self._reference.end_q + dt * self._velocity, self._velocity)
-            self._velocity = None
-        self._reference.begin_tick()
+            self._next, self._velocity = (self._end[0] + dt * self._velocity, self._velocity), None
+        if self._next is None:
+            self._start = self._end = self._at_rest(self._end[0])  # a velocity never outlives its tick
+        else:
+            self._start, self._end, self._next = self._end, self._next, None
         self._grippers.advance(dt)
         self._drive_fingers()
         # A tick shorter than a step must not look like a jump of the velocity.
-        self._acceleration[self._v_index] = self._reference.acceleration(max(dt, self._timestep))
+        self._acceleration[self._v_index] = (self._end[1] - self._start[1]) / max(dt, self._timestep)
         due = math.floor(self._clock / self._timestep + _STEP_ROUNDING)
         while self._steps < due:
             # A step may begin before the tick that it ends in.
@@ -162,16 +150,15 @@ class MujocoPlant:
 
     def state(self) -> RobotState:
         """See :meth:`Plant.state`. External torque: contacts, pushes, and hard stops at the ends of a joint's range."""
-        index, qpos = self._v_index, self._qpos.copy()
-        self.observed_qpos = qpos
-        tau = self._actuator.take(index)
+        index, data = self._v_index, self.data
+        self.observed_qpos = self._qpos.copy()
+        tau = data.qfrc_actuator.take(index)
         # What MuJoCo adds up before contacts, less what is not external, leaves pushes from here and from its window.
-        external = (self._constraint + self._smooth - self._passive + self._bias).take(index)
-        external -= tau
-        return RobotState(qpos.take(self._q_index), self._qvel.take(index), tau, external, self._steps * self._timestep)
+        external = (data.qfrc_constraint + data.qfrc_smooth - data.qfrc_passive + self._bias).take(index) - tau
+        q, v = self._qpos.take(self._q_index), self._qvel.take(index)
+        return RobotState(q, v, tau, external, self._steps * self._timestep)
 
     def gripper_openings(self) -> dict[str, float]:
-        """See :meth:`Plant.gripper_openings`."""
         return {side: fingers.opening(self._qpos) for side, fingers in self._fingers.items()}
 
     def push(self, arm: str, wrench: Array, duration: float) -> None:
@@ -184,42 +171,43 @@ class MujocoPlant:
             raise PlantError(f"push: no arm {arm!r:.40}; arms: {', '.join(self._tools)}")
         wrench = np.array(wrench, dtype=np.float64)
         if wrench.shape != (6,) or not np.isfinite(wrench).all() or not 0 <= duration < math.inf:
-            raise PlantError(
-                f"push: wrench {wrench!s:.80} for {duration:g} s; expected six finite numbers and a time >= 0"
-            )
-        self._pushes[arm] = _Push(wrench, self._steps + round(duration / self._timestep))
+            allowed = "expected six finite numbers and a time >= 0"
+            raise PlantError(f"push: wrench {wrench!s:.80} for {duration:g} s; {allowed}")
+        self._pushes[arm] = wrench, self._steps + round(duration / self._timestep)
 
     def launch_viewer(self) -> None:
         """Open MuJoCo's own window. Raises :class:`PlantError` where there is no display."""
         if self._window is None:
-            self._window = Window(self.model, self.data)
+            self._window = open_window(self.model, self.data)
 
     def viewer_sync(self) -> bool:
         """Show the state of now in the window, if there is one; False when there is none or the user has closed it."""
-        if self._window is None or not self._window.is_open:
+        if self._window is None or not self._window.is_running():
             return False
         self._window.sync()
         return True
 
     def close(self) -> None:
-        """See :meth:`Plant.close`."""
         if self._window is not None:
             self._window.close()
             self._window = None
 
-    def _tuned(self, config: Config) -> ServoGains:
-        """Gains for each joint's effective inertia at home, 1 / (M^-1)_ii: what it feels while the others give way."""
+    def _tuned(self, config: Config) -> tuple[Array, Array]:
+        """Stiffness [Nm/rad] and damping [Nm s/rad] of the servos (nv,), below what the timestep can integrate.
+
+        Damping is for each joint's effective inertia at home, 1 / (M^-1)_ii: what it feels while the others give way.
+        """
         inertia = np.zeros((self.model.nv, self.model.nv))
         mujoco.mj_fullM(self.model, self.data, inertia)
         effective = 1 / np.diag(np.linalg.inv(inertia))[self._v_index]
-        settings = config.mujoco
-        return servo_gains(
-            settings.position_stiffness,
-            settings.position_damping_ratio,
-            effective,
-            self.model.dof_armature[self._v_index],
-            settings.timestep,
-        )
+        armature, dt = self.model.dof_armature[self._v_index], self._timestep
+        stiffness = np.minimum(config.mujoco.position_stiffness, _MAX_STIFFNESS_STEP * armature / dt**2)
+        damping = 2 * config.mujoco.position_damping_ratio * np.sqrt(stiffness * effective)
+        return stiffness, np.minimum(damping, _MAX_DAMPING_STEP * armature / dt)
+
+    @staticmethod
+    def _at_rest(q: Array) -> tuple[Array, Array]:
+        return np.array(q), np.zeros(len(q))
 
     def _step(self, fraction: float) -> None:
         """One physics step, which begins when ``fraction`` of the tick has passed."""
@@ -230,11 +218,13 @@ class MujocoPlant:
         self._steps += 1
 
     def _servo_torque(self, fraction: float) -> Array:
-        q, v = self._reference.at(fraction)
+        (q, v), (end_q, end_v) = self._start, self._end
+        if fraction > 0.0:
+            q, v = q + fraction * (end_q - q), v + fraction * (end_v - v)
         mujoco.mj_mulM(self.model, self.data, self._inertial_torque, self._acceleration)
         torque = (self._inertial_torque + self._bias)[self._v_index]
-        torque += self._gains.stiffness * (q - self._qpos[self._q_index])
-        torque += self._gains.damping * (v - self._qvel[self._v_index])
+        torque += self._stiffness * (q - self._qpos[self._q_index])
+        torque += self._damping * (v - self._qvel[self._v_index])
         return torque
 
     def _drive_arms(self, torque: Array) -> None:
@@ -243,18 +233,16 @@ class MujocoPlant:
 
     def _drive_fingers(self) -> None:
         for side, fingers in self._fingers.items():
-            position = fingers.position(self._grippers.openings[side])
+            opening, closed = self._grippers.openings[side], fingers.closed_position
             for actuator in fingers.actuators:
-                self._ctrl[actuator] = position
+                self._ctrl[actuator] = closed + opening * (fingers.open_position - closed)
 
     def _apply_pushes(self) -> None:
         if not self._pushes:
             return
-        self._pushes = {arm: push for arm, push in self._pushes.items() if self._steps < push.last_step}
-        data = self.data
-        data.qfrc_applied[:] = 0
-        for arm, push in self._pushes.items():
+        self._pushes = {arm: (wrench, end) for arm, (wrench, end) in self._pushes.items() if self._steps < end}
+        data, applied = self.data, self.data.qfrc_applied
+        applied[:] = 0
+        for arm, (wrench, _) in self._pushes.items():
             body = self._tools[arm]
-            mujoco.mj_applyFT(
-                self.model, data, push.wrench[:3], push.wrench[3:], data.xpos[body], body, data.qfrc_applied
-            )
+            mujoco.mj_applyFT(self.model, data, wrench[:3], wrench[3:], data.xpos[body], body, applied)

@@ -1,4 +1,4 @@
-"""The cell's own cameras in MuJoCo: their places in the model, and pictures of them without a window."""
+"""The cell's own cameras in MuJoCo: their places in the model, pictures without a window, and MuJoCo's window."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from q2r2_control.types import Array
 # MuJoCo's camera looks along -z, with y up in the picture; ours looks along x, with z up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _STRAIGHT = 1e-9  # of the sine between the line of sight and the vertical
-# Without a graphics card, the 8 samples a pixel and the shadow map of 8192 of a window take some five times as long.
+# Without a graphics card, a window's 8 samples a pixel and shadow map of 8192 take five times as long.
 _SHADOW_MAP, _SAMPLES = 1024, 0
 
 
@@ -87,43 +87,17 @@ class CellPictures:
         return np.asarray(renderer.render())
 
 
-class Window:
-    """MuJoCo's passive viewer on a running simulation."""
-
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Raises :class:`PlantError` where there is no display."""
-        _check_display()
-        from mujoco import viewer
-
-        try:
-            self._handle = viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
-        except (RuntimeError, mujoco.FatalError) as error:
-            raise PlantError(f"MuJoCo's window cannot be opened: {error}") from error
-
-    @property
-    def is_open(self) -> bool:
-        """False once the user has closed it."""
-        return bool(self._handle.is_running())
-
-    def sync(self) -> None:
-        """Show the state of now; nothing happens when the user has closed the window."""
-        if self.is_open:
-            self._handle.sync()
-
-    def close(self) -> None:
-        """Close the window."""
-        self._handle.close()
-
-
-def _check_display() -> None:
-    """MuJoCo waits for ever for a window that its thread cannot open, so try first."""
+def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.viewer.Handle:
+    """MuJoCo's passive viewer on a running simulation. Raises :class:`PlantError` where there is no display."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise PlantError("MuJoCo's window needs a display: neither DISPLAY nor WAYLAND_DISPLAY is set; run headless")
     import glfw
+    from mujoco import viewer
 
     try:
-        ready = glfw.init()
-    except glfw.GLFWError as error:
+        # MuJoCo waits for ever for a window that its thread cannot open, so try first.
+        if not glfw.init():
+            raise PlantError("MuJoCo's window cannot be opened on this display; run headless")
+        return viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+    except (RuntimeError, mujoco.FatalError, glfw.GLFWError) as error:
         raise PlantError(f"MuJoCo's window cannot be opened: {error}") from error
-    if not ready:
-        raise PlantError("MuJoCo's window cannot be opened on this display; run headless")

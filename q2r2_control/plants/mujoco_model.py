@@ -1,14 +1,13 @@
 """Builds the MuJoCo model of a cell from its URDF.
 
-MuJoCo's URDF reader knows neither capsules nor rotors, SRDF or servos: what it misses is put in here, from the same
-:class:`Robot` that the controller uses.
+MuJoCo's URDF reader knows neither capsules nor rotors, SRDF or servos: they are put in here, from the :class:`Robot`
+that the controller uses.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from itertools import combinations
-from pathlib import Path
 
 import coal
 import mujoco
@@ -29,11 +28,11 @@ from q2r2_control.plants.scene import (
     let_fingers_slide,
     set_obstacles,
 )
-from q2r2_control.robot.model_srdf import ENVELOPE
-from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.pairs import ENVELOPE, link_of, pair_names
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.urdf_parts import mimic_of
 
-# Least viscous friction [Nm s/rad]: it keeps light wrist joints steady and is far below what a controller feels.
+# Least viscous friction [Nm s/rad]: it keeps light wrist joints steady.
 _MIN_DAMPING = 0.2
 
 # [kg m^2]: a thousandth of what a drive's rotor adds to its joint.
@@ -64,7 +63,7 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
         _load_meshes(spec)
         _correct_inertias(spec)
         _set_solver(spec, config.mujoco)
-        _set_shapes(spec, _capsules(robot.urdf))
+        _set_shapes(spec, robot)
         set_obstacles(spec, config)
         _set_arm_joints(spec, robot, config.mujoco)
         _set_grippers(spec, robot, config)
@@ -89,7 +88,7 @@ def _readable_urdf(urdf: str) -> str:
     for link in root.findall("link"):
         for visual in link.findall("visual"):
             mesh = visual.find("geometry/mesh")
-            if mesh is not None and not _is_readable(mesh.get("filename", "")):
+            if mesh is not None and not mesh.get("filename", "").lower().endswith(_FORMATS):
                 link.remove(visual)
     for joint in root.findall("joint"):
         for mimic in joint.findall("mimic"):
@@ -97,14 +96,10 @@ def _readable_urdf(urdf: str) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def _is_readable(file: str) -> bool:
-    return Path(file).suffix.lower() in _FORMATS
-
-
 def _load_meshes(spec: mujoco.MjSpec) -> None:
     """Read every mesh of ``spec`` that MuJoCo cannot, such as DAE, by Coal; their scale stays the mesh's."""
     for mesh in spec.meshes:
-        if _is_readable(mesh.file):
+        if mesh.file.lower().endswith(_FORMATS):
             continue
         try:
             read = coal.MeshLoader().load(mesh.file, np.ones(3))
@@ -117,16 +112,10 @@ def _load_meshes(spec: mujoco.MjSpec) -> None:
         mesh.file = ""
 
 
-def _capsules(urdf: str) -> set[str]:
-    """Names of the cylinders that the URDF's ``collision_checking`` declares to be capsules."""
-    return {capsule.get("name", "") for capsule in ET.fromstring(urdf).iterfind("link/collision_checking/capsule")}
-
-
 def _set_solver(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
     spec.option.timestep = config.timestep
-    # A state that cannot be is an error here, and no reason to jump back to the start.
+    # A diverged simulation is an error here, and no reason to jump back to the start.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    # What lies still costs nothing.
     spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # The elliptic cone with this ratio keeps what is grasped from creeping out of the fingers.
@@ -149,8 +138,10 @@ def _correct_inertias(spec: mujoco.MjSpec) -> None:
             body.fullinertia = [*np.diag(full), full[0, 1], full[0, 2], full[1, 2]]
 
 
-def _set_shapes(spec: mujoco.MjSpec, capsules: set[str]) -> None:
-    """Sort shapes into groups, restore capsules, and keep envelopes out of contact."""
+def _set_shapes(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Sort shapes into groups, keep envelopes out of contact, and restore capsules, which the URDF has as cylinders."""
+    declared = ET.fromstring(robot.urdf).iterfind("link/collision_checking/capsule")
+    capsules = {capsule.get("name", "") for capsule in declared}
     for body in spec.bodies:
         drawn = any(not geom.contype for geom in body.geoms)
         for geom in body.geoms:
@@ -179,7 +170,7 @@ def _set_arm_joints(spec: mujoco.MjSpec, robot: Robot, config: MujocoConfig) -> 
 
 def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
     """A servo for each finger joint, all of one gripper coupled as by its gear, with contacts that hold a box."""
-    mimics = [joint for joint in ET.fromstring(robot.urdf).iterfind("joint") if joint.find("mimic") is not None]
+    robot_urdf = ET.fromstring(robot.urdf)
     for side, arm in config.arms.items():
         gripper, names = arm.gripper, robot.arms[side].finger_joints
         if not names:
@@ -190,15 +181,16 @@ def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
             servo.set_to_position(kp=stiffness, dampratio=1.0)
             servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             servo.forcerange = (-gripper.force, gripper.force)
-        for name in names[1:]:
-            _couple(spec, name, names[0], multiplier=1.0, offset=0.0)
-        moved = list(names)
-        for joint in mimics:
-            mimic, name = joint.find("mimic"), joint.get("name", "")
-            if mimic is not None and mimic.get("joint") in names and name not in names:
-                multiplier, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
-                _couple(spec, name, mimic.get("joint", ""), multiplier, offset)
-                moved.append(name)
+        couplings = dict.fromkeys(names[1:], (names[0], 1.0, 0.0))  # follower -> leader, multiplier, offset
+        for joint in robot_urdf.iterfind("joint"):
+            mimic, name = mimic_of(joint), joint.get("name", "")
+            if mimic is not None and mimic[0] in names and name not in names:
+                couplings[name] = mimic
+        for name, (leader, multiplier, offset) in couplings.items():
+            coupling = spec.add_equality(name=f"{name}_coupling", name1=name, name2=leader)
+            coupling.type, coupling.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
+            coupling.data[:5] = (offset, multiplier, 0, 0, 0)
+        moved = [names[0], *couplings]
         for name in moved:
             for geom in spec.joint(name).parent.geoms:
                 geom.condim, geom.friction, geom.solref = 4, _PAD_FRICTION, _PAD_STIFFNESS
@@ -206,12 +198,6 @@ def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
         # The joint limits keep the fingers apart already.
         for first, second in combinations(moved, 2):
             _exclude(spec, spec.joint(first).parent.name, spec.joint(second).parent.name)
-
-
-def _couple(spec: mujoco.MjSpec, follower: str, leader: str, multiplier: float, offset: float) -> None:
-    coupling = spec.add_equality(name=f"{follower}_coupling", name1=follower, name2=leader)
-    coupling.type, coupling.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
-    coupling.data[:5] = (offset, multiplier, 0, 0, 0)
 
 
 def settle_mimics(model: mujoco.MjModel, data: mujoco.MjData) -> None:

@@ -1,8 +1,4 @@
-"""What makes the simulated cell pleasant to look at: floor, sky and light. Only the floor can be touched.
-
-The floor is a plane at the height of the cell's floor. A cell without one (``floor: null``) gets a drawing of one at
-z = 0 that touches nothing, since its arms may reach below.
-"""
+"""Floor, sky and light of the simulated cell, and how obstacles and the fingers on them touch."""
 
 from __future__ import annotations
 
@@ -16,9 +12,20 @@ VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4
 
 
 def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
-    """Add sky and lights, make a plane of the cell's ``floor`` if it has one, and set the view of a window."""
-    _add_sky(spec)
-    _add_floor(spec, None if not floor else spec.body(FLOOR))
+    """Add sky and lights, make a plane of the cell's ``floor`` if it has one, and set the view of a window.
+
+    A cell without a floor gets a drawing of one at z = 0 that touches nothing, since its arms may reach below.
+    """
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.90, 0.94, 0.98),
+        rgb2=(0.55, 0.66, 0.78),
+        width=256,
+        height=256 * 6,
+    )
+    _add_floor(spec, spec.body(FLOOR) if floor else None)
     _add_lights(spec)
     spec.visual.headlight.ambient = (0.25, 0.25, 0.25)
     spec.visual.headlight.diffuse = (0.25, 0.25, 0.25)
@@ -29,18 +36,6 @@ def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 3840, 2160
     spec.visual.global_.azimuth, spec.visual.global_.elevation = 145, -20
     spec.stat.center, spec.stat.extent = (0.4, 0.0, 0.4), 1.6
-
-
-def _add_sky(spec: mujoco.MjSpec) -> None:
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=(0.90, 0.94, 0.98),
-        rgb2=(0.55, 0.66, 0.78),
-        width=256,
-        height=256 * 6,
-    )
 
 
 def _add_floor(spec: mujoco.MjSpec, body: mujoco.MjsBody | None) -> None:
@@ -125,14 +120,9 @@ def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
                 finger = pad.parent.name
                 if any(spec.exclude("|".join(pair)) is not None for pair in ((finger, name), (name, finger))):
                     continue
-                pair = spec.add_pair(geomname1=_named(pad), geomname2=_named(geom))
+                for shape in (pad, geom):  # a pair needs names
+                    number = next(i for i, other in enumerate(shape.parent.geoms) if other == shape)
+                    shape.name = shape.name or f"{shape.parent.name}_shape_{number}"
+                pair = spec.add_pair(geomname1=pad.name, geomname2=geom.name)
                 pair.condim, pair.friction = 4, (friction, friction, TORSION, ROLLING, ROLLING)
                 pair.solref, pair.solreffriction = _STIFFNESS, _SLIDING
-
-
-def _named(geom: mujoco.MjsGeom) -> str:
-    """The name of a shape, which gets one where it has none."""
-    if not geom.name:
-        shapes = list(geom.parent.geoms)
-        geom.name = f"{geom.parent.name}_shape_{next(i for i, shape in enumerate(shapes) if shape == geom)}"
-    return str(geom.name)

@@ -1,11 +1,9 @@
-"""The simulated cell behind ``mujoco_robot``: commands that come when they come, a plant that runs in fixed steps."""
+"""The simulated cell behind ``mujoco_robot``: commands come at any time, the plant runs in fixed steps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -14,7 +12,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# How long a joint goes on at the commanded velocity when the next command is late: three times what lies between two,
+# How long a joint goes on at the commanded velocity when the next command is late: three intervals between commands,
 # since a busy machine delivers them unevenly, but within these bounds [s].
 _COAST_INTERVALS, _SHORTEST_COAST, _LONGEST_COAST = 3.0, 0.01, 0.1
 # Share of the newest interval in its running mean.
@@ -49,7 +47,7 @@ class JointFollower:
         interval = due - self._due[joints]
         known = (interval > 0.0) & (interval <= _LONGEST_COAST)
         mean = self._interval[joints]
-        # The first interval after a silence says nothing, and one alone nothing certain.
+        # The first interval after a silence says nothing.
         mean = np.where(known, mean + _INTERVAL_SHARE * (interval - mean), mean)
         if v is None:
             v = np.where(known, (q - self._command_q[joints]) / mean, 0.0)
@@ -65,11 +63,6 @@ class JointFollower:
         coast = np.minimum(np.maximum(_COAST_INTERVALS * self._interval, _SHORTEST_COAST), _LONGEST_COAST)
         fresh = age <= coast
         reach = self._velocity_limit * dt
-        if fresh.all():
-            way = self._command_q + self._command_v * age - self.q
-            if (np.abs(way) <= reach).all():  # as it is but for a joint that is left behind
-                self.q, self.v = self.q + way, self._command_v.copy()
-                return
         slower = np.sign(self.v) * np.maximum(np.abs(self.v) - self._acceleration * dt, 0.0)
         way = np.where(
             fresh, self._command_q + self._command_v * np.where(fresh, age, 0.0) - self.q, 0.5 * (self.v + slower) * dt
@@ -83,23 +76,12 @@ class JointFollower:
 
 # A loop that fell further behind drops the time instead of catching up in one leap [s].
 _LONGEST_CATCH_UP = 0.05
-# How long one torque acts [s]. A robot that is driven by torques stops by itself when its sender misses a few periods
-# of a millisecond; here, where nothing runs in real time, the simulation waits for the sender instead.
+# How long one torque acts [s]. A robot stops when its sender misses a few periods; the simulation waits instead.
 _LONGEST_TORQUE = 0.012
 
 
-@dataclass(frozen=True, slots=True)
-class JointSetpoint:
-    """A command for the joints that it names; velocities may be unknown."""
-
-    names: Sequence[str]
-    q: Array  # [rad]
-    v: Array | None  # [rad/s]
-    delay: float = 0.0  # from receipt until it is due [s]
-
-
 class SimulatedCell:
-    """Plant, follower of commands, and what happens without commands: a stop and position servos, in any mode.
+    """Plant and follower of commands; without commands it stops, and position servos hold it, in any mode.
 
     Every refusal is a line of text that is returned; nothing is commanded then.
     """
@@ -111,18 +93,13 @@ class SimulatedCell:
         self.dropped = 0.0  # time that the simulation fell behind, or waited for torques, in all [s]
         self._hold_after, self._max_jump = hold_after, max_jump
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
-        self._places = lru_cache(maxsize=64)(self._find)  # senders name the same joints again and again
         self._timestep = config.mujoco.timestep
         self._follower = JointFollower(
             robot.home, robot.capped_acceleration(config.control.acceleration_limit), robot.velocity_limit
         )
-        self.fingers = tuple(joint for arm in robot.arms.values() for joint in arm.finger_joints)
+        self.fingers = [joint for arm in robot.arms.values() for joint in arm.finger_joints]
         self._finger_q = [self.plant.model.joint(name).qposadr[0] for name in self.fingers]
         self._finger_v = [self.plant.model.joint(name).dofadr[0] for name in self.fingers]
-        self._finger_force: dict[str, list[int]] = {
-            name: [self.plant.model.actuator(joint).id for joint in arm.finger_joints]
-            for name, arm in robot.arms.items()
-        }
         self._time: float | None = None
         self.reset()
 
@@ -140,38 +117,38 @@ class SimulatedCell:
             return "holding"
         return "position" if self._tau is None else "torque"
 
-    def command_positions(self, setpoint: JointSetpoint, now: float) -> str | None:
-        """Follow joint positions that came at ``now`` [s]; joints of others may be among them."""
-        if fault := self._unusable(setpoint):
+    def command_positions(
+        self, names: Sequence[str], q: Array, v: Array | None, now: float, delay: float = 0.0
+    ) -> str | None:
+        """Follow positions [rad] and velocities [rad/s], if known, of the joints ``names``; others' may be among them.
+
+        They came at ``now`` and are due ``delay`` later [s].
+        """
+        if fault := self._unusable(names, q, v, delay):
             return fault
-        places = self._places(tuple(setpoint.names))
-        if isinstance(places, str):
-            return places
-        ours, columns = places
-        q = setpoint.q[ours]
+        ours = [place for place, name in enumerate(names) if name in self._columns]
+        columns = np.array([self._columns[names[place]] for place in ours])
+        q = q[ours]
         reference = self._follower.q if self._tau is None else self.plant.state().q
         jump = np.abs(q - reference[columns])
         if jump.max() > self._max_jump:
             worst = int(jump.argmax())
-            return (
-                f"{self.robot.joint_names[columns[worst]]} is asked to jump by {jump[worst]:.3f} rad; "
-                f"allowed: {self._max_jump:g}"
-            )
+            name = self.robot.joint_names[columns[worst]]
+            return f"{name} is asked to jump by {jump[worst]:.3f} rad; allowed: {self._max_jump:g}"
         if self._tau is not None:
             self._back_to_servos()
-        self._follower.command(columns, q, None if setpoint.v is None else setpoint.v[ours], now + setpoint.delay)
+        self._follower.command(columns, q, None if v is None else v[ours], now + delay)
         self._last_command = now
         return None
 
     def command_velocities(self, v: Array, now: float) -> str | None:
         """Move all joints on at velocities ``v`` (nv,) [rad/s] that came at ``now`` [s], from where they are due."""
-        q = self._follower.q if self._tau is None else self.plant.state().q
-        if self._time is not None and len(v) == len(q):  # where it is due now; the follower stands at the last step
-            q = q + v * min(max(now - self._time, 0.0), _LONGEST_CATCH_UP)
-        setpoint = JointSetpoint(self.robot.joint_names, q, v)
         if len(v) != len(self._columns):
             return f"{len(v)} velocities for {len(self._columns)} joints"
-        return self.command_positions(setpoint, now)
+        q = self._follower.q if self._tau is None else self.plant.state().q
+        if self._time is not None:  # where it is due now; the follower stands at the last step
+            q = q + v * min(max(now - self._time, 0.0), _LONGEST_CATCH_UP)
+        return self.command_positions(self.robot.joint_names, q, v, now)
 
     def command_torques(self, tau: Array, now: float) -> str | None:
         """Apply joint torques (nv,) [Nm] that came at ``now`` [s]; gravity is the sender's to bear."""
@@ -189,55 +166,42 @@ class SimulatedCell:
 
     def gripper_force(self, arm: str) -> float:
         """What an arm's gripper presses with [N]."""
-        forces = self.plant.data.actuator_force[self._finger_force[arm]]
-        return float(np.abs(forces).max()) if len(forces) else 0.0
+        forces = [self.plant.data.actuator(joint).force[0] for joint in self.robot.arms[arm].finger_joints]
+        return float(np.abs(forces).max(initial=0.0))
 
     def finger_positions(self) -> Array:
-        """Of ``fingers`` [m or rad]."""
+        """Positions of ``fingers`` [m or rad]."""
         return np.array(self.plant.data.qpos[self._finger_q])
 
     def finger_velocities(self) -> Array:
-        """Of ``fingers`` [m/s or rad/s]."""
+        """Velocities of ``fingers`` [m/s or rad/s]."""
         return np.array(self.plant.data.qvel[self._finger_v])
 
     def advance(self, now: float) -> RobotState:
         """Let the whole physics steps pass that are due at ``now`` [s], and measure."""
-        if self._time is None:
-            self._time = now
-        behind = now - self._time
-        if behind > _LONGEST_CATCH_UP:
-            self._drop(behind - _LONGEST_CATCH_UP)
-        self._wait_for_torque(now)
-        steps = math.floor((now - self._time) / self._timestep + 1e-6)
-        if steps > 0:
-            dt = steps * self._timestep
-            self._time += dt
-            self._drive(dt)
-        return self.plant.state()
-
-    def _wait_for_torque(self, now: float) -> None:
-        """Drop the time in which the last torque is too old to act and not yet so old that the arms are held."""
-        assert self._time is not None
+        before = now if self._time is None else self._time
+        time = max(before, now - _LONGEST_CATCH_UP)
+        # While the last torque is too old to act, and not yet so old that the arms are held, its sender is waited for.
         age = now - self._last_command
         if self._tau is not None and _LONGEST_TORQUE < age <= self._hold_after:
-            self._drop(min(age - _LONGEST_TORQUE, now - self._time))
+            time = min(time + age - _LONGEST_TORQUE, now)
+        self.dropped += time - before
+        steps = math.floor((now - time) / self._timestep + 1e-6)
+        self._time = time + steps * self._timestep
+        if steps > 0:
+            self._drive(self._time, steps * self._timestep)
+        return self.plant.state()
 
-    def _drop(self, duration: float) -> None:
-        assert self._time is not None
-        self.dropped += duration
-        self._time += duration
-
-    def _drive(self, dt: float) -> None:
-        assert self._time is not None
+    def _drive(self, now: float, dt: float) -> None:
         # A torque that nobody renews is a push without end.
-        if self._tau is not None and self._time - self._last_command > self._hold_after:
+        if self._tau is not None and now - self._last_command > self._hold_after:
             self._back_to_servos()
         zero = np.zeros_like(self.robot.home)
         if self._tau is not None:
             state = self.plant.state()
             command = Command(CommandMode.TORQUE, state.q, state.v, self._tau, self._openings)
         else:
-            self._follower.advance(self._time, dt)
+            self._follower.advance(now, dt)
             command = Command(CommandMode.POSITION, self._follower.q, self._follower.v, zero, self._openings)
         self.plant.apply(command)
         self.plant.advance(dt)
@@ -247,22 +211,16 @@ class SimulatedCell:
         self._follower.stop(state.q, state.v)
         self._tau = None
 
-    def _unusable(self, setpoint: JointSetpoint) -> str | None:
-        """What is wrong with a setpoint's numbers, or None."""
-        count = len(setpoint.names)
-        if len(setpoint.q) != count or (setpoint.v is not None and len(setpoint.v) != count):
-            return f"{len(setpoint.q)} positions for {count} joints"
-        if not math.isfinite(sum(setpoint.q.tolist()) + (0.0 if setpoint.v is None else sum(setpoint.v.tolist()))):
+    def _unusable(self, names: Sequence[str], q: Array, v: Array | None, delay: float) -> str | None:
+        """What is wrong with commanded positions, or None."""
+        if len(q) != len(names) or (v is not None and len(v) != len(names)):
+            return f"{len(q)} positions for {len(names)} joints"
+        if not (np.isfinite(q).all() and (v is None or np.isfinite(v).all())):
             return "a number is not finite"
-        if not 0.0 <= setpoint.delay <= 1.0:
-            return f"due in {setpoint.delay:g} s; allowed: 0 .. 1"
-        return None
-
-    def _find(self, names: tuple[str, ...]) -> tuple[Array, Array] | str:
-        """Which of ``names`` are joints of ours, and their columns; or what is wrong with the names."""
+        if not 0.0 <= delay <= 1.0:
+            return f"due in {delay:g} s; allowed: 0 .. 1"
         if len(set(names)) != len(names):
             return "a joint is named twice"
-        ours = [place for place, name in enumerate(names) if name in self._columns]
-        if not ours:
+        if not set(names) & self._columns.keys():
             return f"none of its joints is one of {', '.join(self._columns)}"[:200]
-        return np.array(ours), np.array([self._columns[names[place]] for place in ours])
+        return None

@@ -11,17 +11,17 @@ import xml.etree.ElementTree as ET
 from collections.abc import Collection, Sequence
 
 import numpy as np
+import pinocchio as pin
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.description import LinkTree, joint_end
-from q2r2_control.robot.locking import joint_origin
+from q2r2_control.robot.pinocchio_models import joint_origin
 
-# What the joints of grippers are called; arms' are not.
 _GRIPPER_JOINT = re.compile(r"gripper|finger|jaw|thumb|knuckle", re.IGNORECASE)
-# What sticks out of a flange beside the tool, with all that it carries. A sensor may carry the tool.
+# Links beside the tool. A sensor may carry the tool.
 _SIDE_BRANCH = re.compile(r"finger|jaw|thumb|knuckle|camera|antenna|imu", re.IGNORECASE)
 _SENSOR = re.compile(r"sensor", re.IGNORECASE)
-# What a link is called that is there to be a tool frame, the most telling first.
+# Names of tool frames, the most telling first.
 _TOOL_FRAMES = [
     re.compile(pattern, re.IGNORECASE)
     for pattern in (r"tcp", r"tool", r"(^|_)eef?(_|$)|end_?effector|endpoint", r"grasp|gripper_?frame", r"flange")
@@ -36,9 +36,15 @@ def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str) -> st
     """
     link, depth = tree.root, 0
     while True:
-        onwards = _arm_joints_from(tree, link, gripper_joints)
+        body = tree.fixed_to(link)
+        onwards = [
+            joint
+            for name, joint in tree.movable().items()
+            if joint_end(joint, "parent") in body and name not in gripper_joints and not _is_gripper_joint(tree, joint)
+        ]
         if len(onwards) > 1:
-            longest = max(_longest_chain(tree, joint) for joint in onwards)
+            ends = {joint_end(joint, "child") for joint in onwards}
+            longest = max(len(tree.chain(end)) - depth for end in tree.joint_to if ends & set(tree.path(end)))
             if depth >= longest > 0:
                 break  # the fingers of a hand, whatever they are called
             names = ", ".join(joint.get("name", "") for joint in onwards)
@@ -54,7 +60,13 @@ def end_of(tree: LinkTree, link: str, key: str) -> str:
 
     Raises :class:`ConfigError` that begins with ``key`` where several could be meant.
     """
-    body = [name for name in tree.fixed_to(link) if not _is_side_branch(tree, link, name)]
+
+    def is_side_branch(end: str) -> bool:
+        # A fixed joint that mimics one is a gripper's, out of use.
+        beyond = tree.path(end)[len(tree.path(link)) :]
+        return any(_SIDE_BRANCH.search(name) or tree.joint_to[name].find("mimic") is not None for name in beyond)
+
+    body = [name for name in tree.fixed_to(link) if not is_side_branch(name)]
     carriers = {joint_end(tree.joint_to[name], "parent") for name in body if name != link}
     ends = [name for name in body if name not in carriers]
     ends = [name for name in ends if not _SENSOR.search(name)] or ends
@@ -85,42 +97,15 @@ def named_joints(tree: LinkTree, tip: str, names: Sequence[str], key: str) -> li
     return [joint for joint in chain if not names or joint.get("name") in names]
 
 
-def is_gripper_joint(tree: LinkTree, joint: ET.Element) -> bool:
-    """Whether a joint is a gripper's: its name says so, or another one mimics it, or it mimics one."""
+def _is_gripper_joint(tree: LinkTree, joint: ET.Element) -> bool:
     name = joint.get("name", "")
     mimicked = any(found.get("joint") == name for other in tree.joint_to.values() for found in other.findall("mimic"))
     return mimicked or joint.find("mimic") is not None or _GRIPPER_JOINT.search(name) is not None
 
 
-def _arm_joints_from(tree: LinkTree, link: str, gripper_joints: Collection[str]) -> list[ET.Element]:
-    body = tree.fixed_to(link)
-    return [
-        joint
-        for joint in tree.joint_to.values()
-        if joint.get("type") != "fixed"
-        and joint_end(joint, "parent") in body
-        and joint.get("name") not in gripper_joints
-        and not is_gripper_joint(tree, joint)
-    ]
-
-
-def _longest_chain(tree: LinkTree, joint: ET.Element) -> int:
-    child = joint_end(joint, "child")
-    before = len(tree.chain(child)) - 1
-    return max(len(tree.chain(link)) - before for link in tree.joint_to if child in tree.path(link))
-
-
-def _is_side_branch(tree: LinkTree, link: str, end: str) -> bool:
-    path = tree.path(end)
-    beyond = path[path.index(link) + 1 :]
-    # A fixed joint that mimics one is a gripper's, out of use.
-    return any(_SIDE_BRANCH.search(name) or tree.joint_to[name].find("mimic") is not None for name in beyond)
-
-
 def _place_in(tree: LinkTree, link: str, end: str) -> np.ndarray:
     """Origin of ``end`` in the frame of ``link``, to which it is fixed [m]."""
-    path = tree.path(end)
-    place = np.eye(4)
-    for name in path[path.index(link) + 1 :]:
-        place = place @ joint_origin(tree.joint_to[name]).homogeneous
-    return place[:3, 3]
+    place = pin.SE3.Identity()
+    for name in tree.path(end)[len(tree.path(link)) :]:
+        place = place * joint_origin(tree.joint_to[name])
+    return np.asarray(place.translation)

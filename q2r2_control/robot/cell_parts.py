@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,33 +13,24 @@ from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.arm_chain import default_tip, end_of, named_joints
 from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits, load_description, parse_srdf
 from q2r2_control.robot.pairs import hand_links
-from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, numbers, renamed, renamed_exclusions
-
-_BODY, _END = "flange_body", "flange_end"  # links
-_COLOUR = (0.55, 0.56, 0.58, 1.0)
+from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, renamed, renamed_exclusions
 
 
 def cylinder_flange(thickness: float, radius: float, mass: float) -> Description:
     """A cylinder [m, m, kg] that stands on the arm's last link along z, and a link at its far end."""
-    urdf = ET.Element("robot", name="flange")
-    body = ET.SubElement(urdf, "link", name=_BODY)
-    middle = numbers((0.0, 0.0, thickness / 2))
-    if mass > 0.0:
-        across = mass * (3.0 * radius**2 + thickness**2) / 12.0
-        inertial = ET.SubElement(body, "inertial")
-        ET.SubElement(inertial, "origin", xyz=middle)
-        ET.SubElement(inertial, "mass", value=repr(mass))
-        moments = {"ixx": across, "iyy": across, "izz": mass * radius**2 / 2.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
-        ET.SubElement(inertial, "inertia", {name: repr(moment) for name, moment in moments.items()})
-    for tag in ("visual", "collision"):
-        shape = ET.SubElement(body, tag, name=f"{_BODY}_{tag}")
-        ET.SubElement(shape, "origin", xyz=middle)
-        ET.SubElement(ET.SubElement(shape, "geometry"), "cylinder", radius=repr(radius), length=repr(thickness))
-        if tag == "visual":
-            material = ET.SubElement(shape, "material", name=f"{_BODY}_colour")
-            ET.SubElement(material, "color", rgba=numbers(_COLOUR))
-    ET.SubElement(urdf, "link", name=_END)
-    urdf.append(fixed_joint(f"{_END}_mount", _BODY, _END, PoseConfig(position=(0.0, 0.0, thickness))))
+    across, along = mass * (3.0 * radius**2 + thickness**2) / 12.0, mass * radius**2 / 2.0
+    moments = f'ixx="{across}" iyy="{across}" izz="{along}" ixy="0" ixz="0" iyz="0"'
+    middle = f'<origin xyz="0 0 {thickness / 2}"/>'
+    inertial = f'<inertial>{middle}<mass value="{mass}"/><inertia {moments}/></inertial>' if mass > 0.0 else ""
+    shape = f'{middle}<geometry><cylinder radius="{radius}" length="{thickness}"/></geometry>'
+    colour = '<material name="flange_body_colour"><color rgba="0.55 0.56 0.58 1"/></material>'
+    urdf = ET.fromstring(
+        f"""<robot name="flange"><link name="flange_body">{inertial}
+        <visual name="flange_body_visual">{shape}{colour}</visual>
+        <collision name="flange_body_collision">{shape}</collision></link><link name="flange_end"/></robot>"""
+    )
+    end = PoseConfig(position=(0.0, 0.0, thickness))
+    urdf.append(fixed_joint("flange_end_mount", "flange_body", "flange_end", end))
     return Description(urdf=urdf, srdf=None, file=Path("flange"))
 
 
@@ -79,7 +71,9 @@ class ArmAssembly:
         self.config, self.model, self.key = config, model, f"arms.{side}"
         self.mounted: list[Mounted] = []
         self.frame = carrier = self._carrier()
-        flat = carrier == _usual_tip(model.tree)
+        flat = False
+        with suppress(ConfigError):
+            flat = carrier == default_tip(model.tree, (), "")
         if (flange := load_flange(config.flange, packages, f"{self.key}.flange")) is not None:
             flat = flat and config.flange.model is not None
             self._mount(Model(flange, f"{side}_"), "flange", PoseConfig(), flat, config.flange.frame)
@@ -90,23 +84,28 @@ class ArmAssembly:
             tool = Model(load_model(config.tool, packages, f"{self.key}.tool"), f"{side}_")
             self._mount(tool, "tool", config.tool.mount, flat and config.tool.mount == PoseConfig(), config.tool.frame)
         whole = ET.Element("robot")
-        whole.extend(
-            [*model.parts, *(part for mounted in self.mounted for part in [*mounted.model.parts, mounted.joint])]
-        )
+        whole.extend(model.parts)
+        for mounted in self.mounted:
+            whole.extend([*mounted.model.parts, mounted.joint])
         self.tree = LinkTree(whole, self.key)
         self.chain = self.tree.chain(self.frame)
         if not self.chain:
             named = "tip" if config.tip == self.frame else "tool.frame"
-            raise ConfigError(
-                f"{self.key}.{named} = {self.frame!r:.60}: no movable joint carries it; name a link that the arm moves"
-            )
+            no_arm = "no movable joint carries it; name a link that the arm moves"
+            raise ConfigError(f"{self.key}.{named} = {self.frame!r:.60}: {no_arm}")
         self.joints = named_joints(self.tree, self.frame, config.joints, self.key)
 
     def _mount(self, part: Model, what: str, mount: PoseConfig, is_flat: bool, frame: str | None = None) -> None:
         """Put a flange or a tool on the arm as it is by now, whose end from then on is ``frame`` or the part's own."""
         key = f"{self.key}.{what}"
         for other in (self.model, *(mounted.model for mounted in self.mounted)):
-            _check_clash(other, part, f"{key}.model")
+            for tag in ("link", "joint"):
+                theirs, ours = (
+                    {found.get("name", "") for found in one.parts if found.tag == tag} for one in (other, part)
+                )
+                if clash := theirs & ours:
+                    name, names = part.description.name, ", ".join(sorted(clash))
+                    raise ConfigError(f"{key}.model = {name!r}: {tag} names {names} occur in the arm as well")
         joint = fixed_joint(f"{what}_mount", self.frame, part.tree.root, mount)
         self.mounted.append(Mounted(part, joint, is_flat))
         self.frame = frame or end_of(part.tree, part.tree.root, f"{key}.frame")
@@ -122,10 +121,6 @@ class ArmAssembly:
         """The joints that the gripper drives, as they are called in the cell."""
         return tuple(map(self.name_in_cell, self.config.gripper.joints))
 
-    def stroke(self) -> tuple[float, float]:
-        """Where each of those joints is when the gripper is closed, and when it is open [m or rad]."""
-        return self.config.gripper.closed_position, self.config.gripper.open_position
-
     def tool_links(self) -> tuple[str, ...]:
         """The links of the tool, or else of the hand that carries the gripper's joints, as they are in the cell."""
         has_tool = self.config.tool.model is not None
@@ -140,10 +135,8 @@ class ArmAssembly:
             theirs = {joint.get("name") for joint in other.chain}
             self.joints = [joint for joint in self.joints if joint.get("name") not in theirs]
             if not self.joints:
-                raise ConfigError(
-                    f"{self.key}: every joint that carries {self.frame} carries {other.frame} of {other.key} as well; "
-                    "name another tip"
-                )
+                shared = f"every joint that carries {self.frame} carries {other.frame} of {other.key} as well"
+                raise ConfigError(f"{self.key}: {shared}; name another tip")
 
     def mounted_urdf(self) -> list[ET.Element]:
         """What flange and tool add to the cell."""
@@ -153,10 +146,12 @@ class ArmAssembly:
         """Pairs of the flange's links, of the tool's, and of those of each with what it sits on flat."""
         parts, carriers = [], [self.model.description]
         for mounted in self.mounted:
+            part = mounted.model.description
             parts += mounted.model.exclusions
             if mounted.is_flat:
-                parts += _exclusions_on(carriers, mounted.model.description)
-            carriers.append(mounted.model.description)
+                file = part.file.with_name(f"{name_of_stack([*carriers, part])}.srdf")
+                parts += parse_srdf(file.read_text(encoding="utf-8"), str(file)) if file.is_file() else []
+            carriers.append(part)
         return renamed_exclusions(parts, self.name_in_cell)
 
     def acceleration_limits(self) -> dict[str, float]:
@@ -164,9 +159,8 @@ class ArmAssembly:
         limits, names = self.config.acceleration_limit, [joint.get("name", "") for joint in self.joints]
         for name in limits:
             if name not in names:
-                raise ConfigError(
-                    f"{self.key}.acceleration_limit.{name!s:.60}: no joint of the arm; allowed: {', '.join(names)}"
-                )
+                key, allowed = f"{self.key}.acceleration_limit.{name!s:.60}", ", ".join(names)
+                raise ConfigError(f"{key}: no joint of the arm; allowed: {allowed}")
         return {self.name_in_cell(name): value for name, value in limits.items()}
 
     def posture(self) -> dict[str, float]:
@@ -175,10 +169,8 @@ class ArmAssembly:
         if len(config.home) != len(names):
             others = [name for name in self._beyond() if name not in names]
             hint = f"; not the arm's unless joints names it: {', '.join(others[:4])}" if others else ""
-            raise ConfigError(
-                f"{self.key}.home = {list(config.home)}: {len(config.home)} value(s), expected {len(names)}: "
-                f"{', '.join(names)}{hint}"
-            )
+            expected = f"{len(config.home)} value(s), expected {len(names)}: {', '.join(names)}{hint}"
+            raise ConfigError(f"{self.key}.home = {list(config.home)}: {expected}")
         for index, joint in enumerate(self.joints):
             check_position(joint, config.home[index], f"{self.key}.home[{index}]")
         return dict(zip(names, config.home, strict=True)) | self._open_gripper()
@@ -252,24 +244,3 @@ def _check_link(link: str, model: Model, key: str) -> None:
     if link not in model.links:
         name = model.description.name
         raise ConfigError(f"{key} = {link!r:.60}: {name} has no such link; allowed: {', '.join(model.links)}")
-
-
-def _check_clash(carrier: Model, part: Model, key: str) -> None:
-    for tag in ("link", "joint"):
-        names = {element.get("name", "") for element in carrier.parts if element.tag == tag}
-        if clash := names & {element.get("name", "") for element in part.parts if element.tag == tag}:
-            name = part.description.name
-            raise ConfigError(f"{key} = {name!r}: {tag} names {', '.join(sorted(clash))} occur in the arm as well")
-
-
-def _usual_tip(tree: LinkTree) -> str | None:
-    try:
-        return default_tip(tree, (), "")
-    except ConfigError:
-        return None
-
-
-def _exclusions_on(carriers: Sequence[Description], part: Description) -> list[ET.Element]:
-    """Pairs known of just this part flat on just these: ``TOOL_on_ARM.srdf`` or ``TOOL_on_FLANGE_on_ARM.srdf``."""
-    file = part.file.with_name(f"{name_of_stack([*carriers, part])}.srdf")
-    return [*parse_srdf(file.read_text(encoding="utf-8"), str(file))] if file.is_file() else []

@@ -1,8 +1,7 @@
 """Joins arms, mounts, tools, obstacles and the floor into one URDF and one SRDF under the root link ``world``.
 
-The one text feeds Pinocchio, MuJoCo, viewers and ``robot_description``. Names of an arm's own model and of its tool get
-the prefix ``left_`` or ``right_``; those of a ``robot`` that the arms are parts of and of obstacles stay as they are.
-Joints that neither an arm nor a gripper moves are fixed.
+Names of an arm's own model and of its tool get the prefix ``left_`` or ``right_``; those of a ``robot`` that the arms
+are parts of and of obstacles stay. Joints that neither an arm nor a gripper moves are fixed.
 """
 
 from __future__ import annotations
@@ -12,16 +11,17 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from q2r2_control.config.arms import PoseConfig, RobotConfig, check_models
+from q2r2_control.config.arms import PoseConfig, check_models
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import ArmAssembly, Model, check_position, load_model
 from q2r2_control.robot.floor import FLOOR, floor_link
-from q2r2_control.robot.locking import lock_joints, resting_position
 from q2r2_control.robot.pairs import KnownParts, exclusions_of_file
+from q2r2_control.robot.pinocchio_models import lock_joints, resting_position
 from q2r2_control.robot.urdf_parts import (
     WORLD,
     fixed_joint,
+    mimic_of,
     name_shapes,
     obstacle_link,
     renamed_exclusions,
@@ -55,8 +55,7 @@ def compose(config: Config) -> ComposedCell:
     if not config.name.isprintable():
         raise ConfigError(f"name = {config.name!r:.60}: allowed: printable characters")
     check_models(config.robot, config.arms)
-    urdf = ET.Element("robot", name=config.name)
-    srdf = ET.Element("robot", name=config.name)
+    urdf, srdf = (ET.Element("robot", name=config.name) for _ in range(2))
     ET.SubElement(urdf, "link", name=WORLD)
     arms = _arms(config)
     for arm in arms.values():
@@ -67,7 +66,8 @@ def compose(config: Config) -> ComposedCell:
         srdf.extend(arm.mounted_exclusions())
     _check_apart(urdf)
     home = _home(urdf, arms)
-    resting = {} if config.robot is None else _resting(urdf, config.robot, home)
+    resting = {} if config.robot is None else config.robot.home
+    _check_resting(urdf, resting, home)
     lock_joints(urdf, home, _locked_at(urdf, home | resting))
     for arm in arms.values():
         for name, limit in arm.acceleration_limits().items():
@@ -92,7 +92,11 @@ def compose(config: Config) -> ComposedCell:
         obstacles=tuple(config.obstacles),
         parts=KnownParts(
             finger_joints={side: arm.finger_names() for side, arm in arms.items()},
-            strokes={side: arm.stroke() for side, arm in arms.items() if arm.config.gripper.joints},
+            strokes={
+                side: (arm.config.gripper.closed_position, arm.config.gripper.open_position)
+                for side, arm in arms.items()
+                if arm.config.gripper.joints
+            },
             tool_links={side: arm.tool_links() for side, arm in arms.items()},
             obstacles=(*config.obstacles, *([] if config.floor is None else [FLOOR])),
         ),
@@ -101,15 +105,12 @@ def compose(config: Config) -> ComposedCell:
 
 def _arms(config: Config) -> dict[str, ArmAssembly]:
     """Every arm of the cell with the joints that are its own."""
-    robot = None
-    if config.robot is not None:
-        robot = Model(load_model(config.robot, config.packages, "robot"), "")
+    robot = None if config.robot is None else Model(load_model(config.robot, config.packages, "robot"), "")
     arms: dict[str, ArmAssembly] = {}
-    for side in SIDES:
-        if side in config.arms:
-            made = config.arms[side]
-            model = robot or Model(load_model(made, config.packages, f"arms.{side}"), f"{side}_")
-            arms[side] = ArmAssembly(made, model, config.packages, side)
+    for side in (side for side in SIDES if side in config.arms):
+        made = config.arms[side]
+        model = robot or Model(load_model(made, config.packages, f"arms.{side}"), f"{side}_")
+        arms[side] = ArmAssembly(made, model, config.packages, side)
     for arm in arms.values():
         arm.leave_joints_of([other for other in arms.values() if other is not arm and other.model is arm.model])
     return arms
@@ -128,21 +129,18 @@ def _home(urdf: ET.Element, arms: Mapping[str, ArmAssembly]) -> dict[str, float]
             home[name], owner[name] = position, arm.key
         fingers |= set(arm.finger_names())
     for follower in urdf.findall("joint"):
-        mimic = follower.find("mimic")
-        if mimic is not None and mimic.get("joint") in fingers:
-            home.setdefault(follower.get("name", ""), _mimicked(mimic, home))
+        if (mimic := mimic_of(follower)) is not None and mimic[0] in fingers:
+            home.setdefault(follower.get("name", ""), mimic[1] * home[mimic[0]] + mimic[2])
     return home
 
 
-def _resting(urdf: ET.Element, robot: RobotConfig, home: Mapping[str, float]) -> dict[str, float]:
-    """Where ``robot.home`` has joints that rest."""
+def _check_resting(urdf: ET.Element, resting: Mapping[str, float], home: Mapping[str, float]) -> None:
     joints = {joint.get("name", ""): joint for joint in urdf.findall("joint") if joint.get("type") != "fixed"}
-    for name, position in robot.home.items():
+    for name, position in resting.items():
         if name not in joints or name in home:
             allowed = ", ".join(joint for joint in joints if joint not in home)
             raise ConfigError(f"robot.home.{name!s:.60}: no joint that rests; allowed: {allowed or 'none'}")
         check_position(joints[name], position, f"robot.home.{name}")
-    return robot.home
 
 
 def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]:
@@ -150,15 +148,9 @@ def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]
     joints = urdf.findall("joint")
     at = {joint.get("name", ""): resting_position(joint) for joint in joints} | dict(given)
     for joint in joints:
-        mimic = joint.find("mimic")
-        if mimic is not None and joint.get("name") not in given:
-            at[joint.get("name", "")] = _mimicked(mimic, at)
+        if (mimic := mimic_of(joint)) is not None and joint.get("name") not in given:
+            at[joint.get("name", "")] = mimic[1] * at.get(mimic[0], 0.0) + mimic[2]
     return at
-
-
-def _mimicked(mimic: ET.Element, positions: Mapping[str, float]) -> float:
-    multiplier, offset = (float(mimic.get(key, usual)) for key, usual in (("multiplier", "1"), ("offset", "0")))
-    return multiplier * positions.get(mimic.get("joint", ""), 0.0) + offset
 
 
 def _check_apart(urdf: ET.Element) -> None:
@@ -171,9 +163,8 @@ def _check_apart(urdf: ET.Element) -> None:
 
 def _check_obstacle_name(name: str, urdf: ET.Element) -> None:
     if not _OBSTACLE_NAME.fullmatch(name) or _RESERVED_NAME.match(name):
-        raise ConfigError(
-            f"obstacles.{name!r:.60}: allowed: letters, digits and _, starting with a letter, "
-            f"and not with {WORLD}, universe, {', '.join(f'{side}_' for side in SIDES)}"
-        )
+        reserved = f"{WORLD}, universe, {', '.join(f'{side}_' for side in SIDES)}"
+        letters = "letters, digits and _, starting with a letter"
+        raise ConfigError(f"obstacles.{name!r:.60}: allowed: {letters}, and not with {reserved}")
     if urdf.find(f"link[@name='{name}']") is not None:
         raise ConfigError(f"obstacles.{name}: the cell has a link of this name; allowed: another name")

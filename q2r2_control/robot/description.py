@@ -1,6 +1,6 @@
-"""A robot description as it comes from outside: found, parsed, checked, its meshes resolved. Nothing is joined here.
+"""A robot description from outside: found, parsed, its meshes resolved.
 
-Everything later relies on what is checked here: one tree, unique names, finite numbers, meshes that exist.
+Checked for all that follows: one tree, unique names, finite numbers, meshes that exist.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from q2r2_control.robot.urdf_parts import ATTRIBUTES
 
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
 
-# Range given to a joint without limits. A bound that the real joint does not have only takes postures away, and two
-# turns each way are more than any task of an arm winds up.
+# Range given to a joint without limits: two turns each way.
 CONTINUOUS_RANGE = 4 * math.pi
 
 _JOINT_TYPES = ("fixed", "revolute", "prismatic", "continuous", "planar", "floating")
@@ -53,13 +52,13 @@ class Description:
 
     @property
     def name(self) -> str:
-        """The model's own name."""
+        """The name in the URDF."""
         return self.urdf.get("name", self.stem)
 
     @property
     def stem(self) -> str:
         """The file's name without its endings."""
-        return _stem(self.file)
+        return self.file.name.removesuffix(".xacro").removesuffix(".urdf")
 
 
 def load_description(
@@ -75,8 +74,13 @@ def load_description(
     if model.startswith(EXAMPLE_ROBOT_DATA):
         file, srdf_file = _example_robot(model.removeprefix(EXAMPLE_ROBOT_DATA))
     else:
-        file = _model_file(model, packages)
-        srdf_file = file.with_name(f"{_stem(file)}.srdf")
+        if model.startswith("package://"):
+            file = package_file(model, None, packages)
+        elif model.endswith((".urdf", ".xacro")):
+            file = find_resource(model).resolve()
+        else:
+            file = find_resource(f"robots/{model}.urdf")
+        srdf_file = file.with_name(file.name.removesuffix(".xacro").removesuffix(".urdf") + ".srdf")
     if file.suffix == ".xacro":
         text = expand_xacro(file, xacro_args or {}, packages)
     elif xacro_args:
@@ -97,15 +101,25 @@ def parse_urdf(
     need a bound. ``where`` names the text in errors, ``folder`` is what relative mesh paths start from, ``packages``
     has folders of ``package://`` by name. Raises :class:`RobotError`.
     """
-    root = _parse(text, where)
+    root = parse_srdf(text, where)  # both begin alike
     _check_numbers(root, where)
-    _check_shapes(root, where)
+    # A shape that a reader skips would be a body that nobody watches.
+    for link in root.findall("link"):
+        for collision in link.findall("collision"):
+            shapes = [shape.tag for shape in collision.findall("geometry/*")]
+            if len(shapes) != 1 or shapes[0] not in _SHAPES:
+                has = f"a collision of link {link.get('name')} has shapes {shapes}"
+                raise RobotError(f"{where}: {has}; allowed: one of {', '.join(_SHAPES)}")
     links = _unique_names(root, "link", where)
     _unique_names(root, "joint", where)
     for joint in root.findall("joint"):
         _check_joint(joint, links, where)
         if joint.get("type") == "continuous":
-            _bound(joint)
+            joint.set("type", "revolute")
+            if (limit := joint.find("limit")) is None:
+                limit = ET.SubElement(joint, "limit", velocity="0", effort="0")
+            limit.set("lower", repr(-CONTINUOUS_RANGE))
+            limit.set("upper", repr(CONTINUOUS_RANGE))
     LinkTree(root, where)
     for mesh in root.iter("mesh"):
         mesh.set("filename", _mesh_file(mesh.get("filename", ""), where, folder, packages or {}))
@@ -113,8 +127,14 @@ def parse_urdf(
 
 
 def parse_srdf(text: str, where: str) -> ET.Element:
-    """Parse an SRDF. Raises :class:`RobotError`."""
-    return _parse(text, where)
+    """Parse an SRDF. Raises :class:`RobotError` that begins with ``where``."""
+    try:
+        root = ET.fromstring(text)
+    except (ET.ParseError, ValueError) as error:
+        raise RobotError(f"{where}: not XML: {error}") from error
+    if root.tag != "robot":
+        raise RobotError(f"{where}: the root element is <{root.tag}>; a robot description starts with <robot>")
+    return root
 
 
 class LinkTree:
@@ -176,16 +196,6 @@ def joint_limits(joint: ET.Element) -> tuple[float, float]:
     return (0.0, 0.0) if limit is None else (float(limit.get("lower", "0")), float(limit.get("upper", "0")))
 
 
-def _parse(text: str, where: str) -> ET.Element:
-    try:
-        root = ET.fromstring(text)
-    except (ET.ParseError, ValueError) as error:
-        raise RobotError(f"{where}: not XML: {error}") from error
-    if root.tag != "robot":
-        raise RobotError(f"{where}: the root element is <{root.tag}>; a robot description starts with <robot>")
-    return root
-
-
 def _check_numbers(root: ET.Element, where: str) -> None:
     for element in root.iter():
         for attribute in (*_VECTORS, *_SCALARS.get(element.tag, ())):
@@ -194,9 +204,8 @@ def _check_numbers(root: ET.Element, where: str) -> None:
                 continue
             count = 3 if attribute in _VECTORS else 1
             parts = text.split()
-            if len(parts) != count or not all(
-                _NUMBER.fullmatch(part) and abs(float(part)) < _LARGEST for part in parts
-            ):
+            finite = all(_NUMBER.fullmatch(part) and abs(float(part)) < _LARGEST for part in parts)
+            if len(parts) != count or not finite:
                 allowed = f"{count} finite number(s)"
             elif attribute in _POSITIVE and min(map(float, parts)) <= 0:
                 allowed = "more than 0"
@@ -205,18 +214,6 @@ def _check_numbers(root: ET.Element, where: str) -> None:
             else:
                 continue
             raise RobotError(f"{where}: <{element.tag}> has {attribute} = {text!r:.40}; allowed: {allowed}")
-
-
-def _check_shapes(root: ET.Element, where: str) -> None:
-    """Every collision has one known shape: one that a reader skips would be a body that nobody watches."""
-    for link in root.findall("link"):
-        for collision in link.findall("collision"):
-            shapes = [shape.tag for shape in collision.findall("geometry/*")]
-            if len(shapes) != 1 or shapes[0] not in _SHAPES:
-                raise RobotError(
-                    f"{where}: a collision of link {link.get('name')} has shapes {shapes}; allowed: one of "
-                    f"{', '.join(_SHAPES)}"
-                )
 
 
 def _unique_names(root: ET.Element, tag: str, where: str) -> set[str]:
@@ -242,15 +239,6 @@ def _check_joint(joint: ET.Element, links: set[str], where: str) -> None:
         raise RobotError(f"{where}: joint {name} has axis {direction}; allowed: a direction")
 
 
-def _bound(joint: ET.Element) -> None:
-    joint.set("type", "revolute")
-    limit = joint.find("limit")
-    if limit is None:
-        limit = ET.SubElement(joint, "limit", velocity="0", effort="0")
-    limit.set("lower", repr(-CONTINUOUS_RANGE))
-    limit.set("upper", repr(CONTINUOUS_RANGE))
-
-
 def _example_robot(name: str) -> tuple[Path, Path | None]:
     from example_robot_data.robots_loader import ROBOTS, getModelPath
 
@@ -262,18 +250,6 @@ def _example_robot(name: str) -> tuple[Path, Path | None]:
     folder = Path(getModelPath(loader.path)) / loader.path
     srdf = folder / loader.srdf_subpath / loader.srdf_filename if loader.srdf_filename else None
     return folder / loader.urdf_subpath / loader.urdf_filename, srdf
-
-
-def _model_file(model: str, packages: Mapping[str, str]) -> Path:
-    if model.startswith("package://"):
-        return package_file(model, None, packages)
-    if model.endswith((".urdf", ".xacro")):
-        return find_resource(model).resolve()
-    return find_resource(f"robots/{model}.urdf")
-
-
-def _stem(file: Path) -> str:
-    return file.name.removesuffix(".xacro").removesuffix(".urdf")
 
 
 def _read(file: Path) -> str:

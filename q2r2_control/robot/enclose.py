@@ -1,15 +1,15 @@
 """Collision shapes as the distance kernels want them.
 
 Capsules, spheres and boxes fixed in the world stay; everything else is enclosed. A box that moves becomes a capsule
-too, so that a pair of two boxes, which has no short closed form, cannot occur.
+too: a pair of two boxes has no short closed form.
 
-A mesh or convex becomes a capsule around its vertices, hence around its triangles, since a capsule is convex. The
-capsule is close to the smallest; safety rests on its enclosing every vertex only, which its construction gives for any
-axis and any centre.
+A mesh or convex becomes a capsule around its vertices, hence around its triangles, since a capsule is convex. Safety
+rests on its enclosing every vertex only, which its construction gives for any axis and any centre.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import lru_cache
 from itertools import product
 
@@ -35,9 +35,12 @@ def enclose_shapes(geometry: pin.GeometryModel) -> None:
         fixed_box = isinstance(item.geometry, coal.Box) and item.parentJoint == 0
         if fixed_box or isinstance(item.geometry, coal.Capsule | coal.Sphere):
             continue
-        shape, placement = _enclosing_shape(item.geometry, item.name, fixed=item.parentJoint == 0)
-        item.placement = item.placement * placement
-        item.geometry = shape
+        if isinstance(shape := item.geometry, coal.Cylinder):
+            radius, half_length = float(shape.radius), float(shape.halfLength)
+            item.geometry = _around_cylinder(radius, half_length, box_allowed=item.parentJoint == 0)
+        else:
+            item.geometry, placement = capsule_between(*_cached_capsule(_vertices(shape, item.name).tobytes()))
+            item.placement = item.placement * placement
         item.meshPath = ""
         item.meshScale = np.ones(3)
 
@@ -49,20 +52,18 @@ def enclosing_capsule(points: Array) -> tuple[float, Array, Array]:
     radius beyond the least one. For an axis with radius r, a point at height t and distance rho from it is inside when
     the segment covers a height within sqrt(r^2 - rho^2) of t.
     """
-    points = _hull(np.asarray(points, dtype=float))
+    points = np.asarray(points, dtype=float)
+    with suppress(QhullError, ValueError):  # of points in a plane, or too few
+        points = points[ConvexHull(points).vertices]
     centre = points.mean(axis=0)
     scale = max(float(np.abs(points - centre).max()), 1e-9)
     axes = np.linalg.svd(points - centre, full_matrices=True)[2]
     frames = [axes[[index - 2, index - 1, index]] for index in range(3)]  # rows: two across, one along
     views = [(points - centre) @ frame.T / scale for frame in frames]
-    volumes = [_volume(*_fit(view, _start(view))) for view in views]
-    best = int(np.argmin(volumes))
-    result = minimize(
-        lambda x: _volume(*_fit(views[best], x)),
-        _start(views[best]),
-        method="Nelder-Mead",
-        options={"maxiter": 600, "xatol": 1e-4, "fatol": 1e-5},
-    )
+    best = int(np.argmin([_volume(*_fit(view, _start(view))) for view in views]))
+    options = {"maxiter": 600, "xatol": 1e-4, "fatol": 1e-5}
+    start = _start(views[best])
+    result = minimize(lambda x: _volume(*_fit(views[best], x)), start, method="Nelder-Mead", options=options)
     radius, ends = _fit(views[best], result.x)
     start, end = ends * scale @ frames[best] + centre
     return radius * scale + _ROUNDING, start, end
@@ -72,14 +73,6 @@ def enclosing_capsule(points: Array) -> tuple[float, Array, Array]:
 def _cached_capsule(points: bytes) -> tuple[float, Array, Array]:
     """Both arms of a cell usually share their meshes."""
     return enclosing_capsule(np.frombuffer(points).reshape(-1, 3))
-
-
-def _enclosing_shape(shape: coal.CollisionGeometry, name: str, fixed: bool) -> tuple[coal.CollisionGeometry, pin.SE3]:
-    if isinstance(shape, coal.Cylinder):
-        return _around_cylinder(float(shape.radius), float(shape.halfLength), fixed), pin.SE3.Identity()
-    vertices = _vertices(shape, name)
-    radius, start, end = _cached_capsule(vertices.tobytes())
-    return capsule_between(radius, start, end)
 
 
 def _vertices(shape: coal.CollisionGeometry, name: str) -> Array:
@@ -94,14 +87,6 @@ def _vertices(shape: coal.CollisionGeometry, name: str) -> Array:
     if vertices.size == 0 or not np.isfinite(vertices).all():
         raise RobotError(f"collision mesh {name} has no vertices, or some that are not finite")
     return vertices.reshape(-1, 3)
-
-
-def _hull(points: Array) -> Array:
-    """Corners of the convex hull; all points where they lie in a plane or are too few for one."""
-    try:
-        return points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):
-        return points
 
 
 def _start(local: Array) -> Array:

@@ -1,7 +1,7 @@
 """The bodies of fingers: each is what it sweeps from one end of its joints' travel to the other.
 
-Distances know arm joints only, so a finger's body is all of its way; what of it counts while the gripper's opening is
-known says finger_openings.py of those that slide, turning_fingers.py of those that turn.
+Distances know arm joints only, so a finger's body is all of its way. While the gripper's opening is known, less of it
+counts: of fingers that slide a part of the segment, of those that turn a capsule of turning_fingers.py.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.robot.description import LinkTree, joint_limits
+from q2r2_control.robot.description import LinkTree, joint_end, joint_limits
 from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
-from q2r2_control.robot.locking import joint_axis
 from q2r2_control.robot.pairs import KnownParts, link_of, links_moved_by
+from q2r2_control.robot.pinocchio_models import joint_axis
 from q2r2_control.robot.turning_fingers import FingerJoint, TurningBody, TurningSweeps
+from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 
 @dataclass(frozen=True, slots=True)
 class FingerBody:
-    """A body that is all of the way of one arm's fingers along a line, and what of them is where on it."""
+    """A body that is all of the way of one arm's fingers along a line."""
 
     arm: str
     name: str  # of the geometry
@@ -37,14 +38,12 @@ class FingerBody:
         """Which part of the segment, from 0 its start to 1 its end, the fingers are in at openings in ``interval``."""
         if interval == ALL_OF_THE_WAY:
             return 0.0, 1.0
-        least, greatest = self.length, 0.0
+        lowest, highest = [], []
         for at, slides in self.ends:
-            lowest = highest = at
-            for along, joint in slides:
-                ways = [along * (position - joint.home) for position in joint.travel(interval)]
-                lowest, highest = lowest + min(ways), highest + max(ways)
-            least, greatest = min(least, lowest), max(greatest, highest)
-        return max(least / self.length, 0.0), min(greatest / self.length, 1.0)
+            ways = [[along * (end - joint.home) for end in joint.travel(interval)] for along, joint in slides]
+            lowest.append(at + sum(map(min, ways)))
+            highest.append(at + sum(map(max, ways)))
+        return max(min(lowest) / self.length, 0.0), min(max(highest) / self.length, 1.0)
 
 
 def part_of_segment(start: Array, end: Array, part: tuple[float, float]) -> tuple[Array, Array]:
@@ -58,27 +57,28 @@ def collision_model_at(
 ) -> pin.GeometryModel:
     """A copy of ``Robot.collision_model`` with fingers as they are at ``openings`` by arm, others all of their way."""
     made, bodies = geometry.copy(), list(fingers)
-    for body in bodies:
-        interval = openings.get(body.arm, ALL_OF_THE_WAY)
-        if isinstance(body, FingerBody) and interval != ALL_OF_THE_WAY:
-            item = made.geometryObjects[made.getGeometryId(body.name)]
-            half = item.geometry.halfLength * item.placement.rotation[:, 2]
-            middle = item.placement.translation
-            start, end = part_of_segment(middle - half, middle + half, body.part(interval))
-            item.geometry, item.placement = capsule_between(float(item.geometry.radius), start, end)
     for arm, interval in openings.items():
-        # All of an arm's at once, as the kernels have them: how many samples are taken is a matter of all of them.
-        turning = [body for body in bodies if isinstance(body, TurningBody) and body.arm == arm]
-        if turning and interval != ALL_OF_THE_WAY:
-            for body, *capsule in zip(turning, *TurningSweeps(turning).capsules(interval), strict=True):
+        if interval == ALL_OF_THE_WAY:
+            continue
+        of_arm = [body for body in bodies if body.arm == arm]
+        capsules: dict[str, tuple[float, Array, Array]] = {}
+        for body in of_arm:
+            if isinstance(body, FingerBody):
                 item = made.geometryObjects[made.getGeometryId(body.name)]
-                item.geometry, item.placement = capsule_between(float(capsule[2]), capsule[0], capsule[1])
+                start, end = _ends(item)
+                capsules[body.name] = float(item.geometry.radius), *part_of_segment(start, end, body.part(interval))
+        # All of an arm's at once, as the kernels have them: the number of samples depends on all of them.
+        if turning := [body for body in of_arm if isinstance(body, TurningBody)]:
+            for body, start, end, radius in zip(turning, *TurningSweeps(turning).capsules(interval), strict=True):
+                capsules[body.name] = float(radius), start, end
+        for name, capsule in capsules.items():
+            item = made.geometryObjects[made.getGeometryId(name)]
+            item.geometry, item.placement = capsule_between(*capsule)
     return made
 
 
 _ON_ONE_LINE = 1e-9  # [m]
 _KINDS = {"revolute", "prismatic"}  # of joints
-
 
 # Both ends of a shape as it was drawn (2, 3) [m] and what moves them.
 _Finger = tuple[Array, tuple[FingerJoint, ...]]
@@ -99,11 +99,12 @@ def sweep_fingers(
         links, stroke = links_moved_by(tree, joints), parts.strokes.get(arm)
         swept: dict[str, list[_Finger] | None] = {}
         for item in geometry.geometryObjects:
-            chain = _chain(tree, link_of(item.name), links)
+            # The finger joints that carry the body, from the hand outwards.
+            chain = [joint for joint in tree.chain(link_of(item.name)) if joint_end(joint, "child") in links]
             kinds = {joint.get("type", "") for joint in chain}
             if not chain or not kinds <= _KINDS:
                 continue
-            moving = tuple(finger_joint(model, tree, joint, home, joints, stroke) for joint in chain)
+            moving = tuple(_finger_joint(model, tree, joint, home, joints, stroke) for joint in chain)
             if "revolute" in kinds:
                 body = TurningBody(arm, item.name, _ends(item), float(item.geometry.radius), moving)
                 start, end, radius = body.capsule(ALL_OF_THE_WAY)
@@ -113,20 +114,20 @@ def sweep_fingers(
                 drawn = _ends(item)
                 swept[item.name] = [(drawn, moving)] if _sweep(item, moving) else None
         for name, fingers in _merge(geometry, swept).items():
-            if fingers and stroke is not None:
-                bodies += _bodies(arm, geometry.geometryObjects[geometry.getGeometryId(name)], fingers)
+            start, end = _ends(geometry.geometryObjects[geometry.getGeometryId(name)])
+            length = float(np.linalg.norm(end - start))
+            if fingers and stroke is not None and length > _ON_ONE_LINE:
+                along = (end - start) / length
+                ends = tuple(
+                    (float((point - start) @ along), tuple((float(joint.axis @ along), joint) for joint in moving))
+                    for drawn, moving in fingers
+                    for point in drawn
+                )
+                bodies.append(FingerBody(arm, name, length, ends))
     return tuple(bodies)
 
 
-def _chain(tree: LinkTree, link: str, links: set[str]) -> list[ET.Element]:
-    """The finger joints that carry ``link``, from the hand outwards, of a gripper that moves ``links``."""
-    if link not in links:
-        return []
-    moving = {id(joint) for child, joint in tree.joint_to.items() if child in links}
-    return [joint for joint in tree.chain(link) if id(joint) in moving]
-
-
-def finger_joint(
+def _finger_joint(
     model: pin.Model,
     tree: LinkTree,
     joint: ET.Element,
@@ -144,7 +145,8 @@ def finger_joint(
     driver, multiplier, offset = _driver(tree, joint, driven if stroke is not None else ())
     lower, upper = joint_limits(driver)
     closed, opened = (lower, upper) if stroke is None else stroke
-    before, beyond = (lower, upper) if opened >= closed else (upper, lower)
+    ends = closed, opened, *((lower, upper) if opened >= closed else (upper, lower))
+    closed, opened, before, beyond = (multiplier * end + offset for end in ends)
     placement = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)].placement
     axis: Array = placement.rotation @ joint_axis(joint)
     return FingerJoint(
@@ -152,10 +154,10 @@ def finger_joint(
         axis=np.asarray(axis),
         point=np.array(placement.translation),
         home=home.get(name, 0.0),
-        closed=multiplier * closed + offset,
-        open=multiplier * opened + offset,
-        before=multiplier * before + offset,
-        beyond=multiplier * beyond + offset,
+        closed=closed,
+        open=opened,
+        before=before,
+        beyond=beyond,
         driver=driver.get("name", ""),
     )
 
@@ -166,30 +168,13 @@ def _driver(tree: LinkTree, joint: ET.Element, driven: Collection[str]) -> tuple
     A joint that the gripper drives is its own driver, whatever it mimics.
     """
     movable, multiplier, offset, seen = tree.movable(), 1.0, 0.0, {joint.get("name", "")}
-    while joint.get("name", "") not in driven and (mimic := joint.find("mimic")) is not None:
-        leader = mimic.get("joint", "")
+    while joint.get("name", "") not in driven and (mimic := mimic_of(joint)) is not None:
+        leader, by, beside = mimic
         if leader not in movable or leader in seen:
             break
         seen.add(leader)
-        offset += multiplier * float(mimic.get("offset", "0"))
-        multiplier *= float(mimic.get("multiplier", "1"))
-        joint = movable[leader]
+        joint, multiplier, offset = movable[leader], multiplier * by, offset + multiplier * beside
     return joint, multiplier, offset
-
-
-def _bodies(arm: str, item: pin.GeometryObject, fingers: list[_Finger]) -> list[FingerBody]:
-    """A swept body as it depends on the opening; none where it has no length."""
-    start, end = _ends(item)
-    length = float(np.linalg.norm(end - start))
-    if length <= _ON_ONE_LINE:
-        return []
-    along = (end - start) / length
-    ends = tuple(
-        (float((point - start) @ along), tuple((float(joint.axis @ along), joint) for joint in joints))
-        for drawn, joints in fingers
-        for point in drawn
-    )
-    return [FingerBody(arm, item.name, length, ends)]
 
 
 def _ends(item: pin.GeometryObject) -> Array:
@@ -204,13 +189,10 @@ def _sweep(item: pin.GeometryObject, joints: tuple[FingerJoint, ...]) -> bool:
     ways = [[(end - joint.home) * joint.axis for end in (joint.before, joint.beyond)] for joint in joints]
     points = np.array([end + np.sum(move, axis=0) for move in product(*ways) for end in _ends(item)])
     radius, line = float(item.geometry.radius), _line_of(points)
-    on_one_line = line is not None
-    if line is None:
-        # A capsule is convex: the one around the corners of what the segment sweeps holds all of it.
-        thicker, start, end = enclosing_capsule(points)
-        radius, line = radius + thicker, np.array([start, end])
-    item.geometry, item.placement = capsule_between(radius, line[0], line[1])
-    return on_one_line
+    # A capsule is convex: the one around the corners of what the segment sweeps holds all of it.
+    thicker, start, end = enclosing_capsule(points) if line is None else (0.0, *line)
+    item.geometry, item.placement = capsule_between(radius + thicker, start, end)
+    return line is not None
 
 
 def _line_of(points: Array) -> Array | None:

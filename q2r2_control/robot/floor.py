@@ -1,8 +1,7 @@
 """The floor of a cell: what stands for it in the URDF, and which links need no watching against it.
 
-It is a box whose top is at the floor's height: URDF has no plane, and the distance of a capsule from a fixed box is
-exact in closed form. No arm reaches beyond its edges, since no mount is farther than 20 m from the origin; and it is so
-thick that what is in it is pushed out through the top.
+It is a box whose top is at the floor's height, since URDF has no plane. No arm reaches beyond its edges, since no mount
+is farther than 20 m from the origin, and bodies inside are pushed out through the top, since it is thick.
 """
 
 from __future__ import annotations
@@ -14,8 +13,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.arms import PoseConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE, keep_pairs, link_of
+from q2r2_control.robot.urdf_parts import fixed_joint
 
 FLOOR = "floor"  # link
 
@@ -33,15 +34,12 @@ def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[E
         raise ConfigError(
             f"obstacles.{FLOOR}: the cell has a floor at z = {height:g} m; give this another name, or set floor: null"
         )
-    link = ET.Element("link", name=FLOOR)
-    shape = ET.SubElement(link, "collision", name=f"{FLOOR}_collision")
-    ET.SubElement(shape, "origin", xyz=f"0 0 {-_SIZE[2] / 2}")
-    ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=" ".join(map(repr, _SIZE)))
-    joint = ET.Element("joint", name=f"{parent}_to_{FLOOR}", type="fixed")
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=FLOOR)
-    ET.SubElement(joint, "origin", xyz=f"0 0 {height!r}")
-    return [link, joint]
+    link = ET.fromstring(
+        f"""<link name="{FLOOR}"><collision name="{FLOOR}_collision"><origin xyz="0 0 {-_SIZE[2] / 2}"/>
+        <geometry><box size="{_SIZE[0]} {_SIZE[1]} {_SIZE[2]}"/></geometry></collision></link>"""
+    )
+    place = PoseConfig(position=(0.0, 0.0, height))
+    return [link, fixed_joint(f"{parent}_to_{FLOOR}", parent, FLOOR, place)]
 
 
 def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
@@ -70,8 +68,7 @@ def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel
     """Remove pairs of the floor with bodies that cannot come nearer to it than now.
 
     Two kinds, both proven: bodies that turn about vertical axes only, as an arm's first link does, and stay as high as
-    they are; and bodies whose distance from the first joint that can tip them is too short to come within
-    :data:`CLEARANCE`.
+    they are; and bodies too near to the first joint that can tip them to come within :data:`CLEARANCE`.
     """
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))

@@ -1,8 +1,7 @@
 """What grippers hold: bodies that are fixed to the tools, and what they are watched against.
 
-They stand beside ``Robot.collision_model``, in a copy of it that ends with them and their pairs, since they are there
-only while a gripper holds them. An object is watched against what the bodies on its link are, but for its own hand and
-the fingers of other hands, which have to be able to take it over.
+They stand in a copy of ``Robot.collision_model`` that ends with them and their pairs. An object is watched against what
+the bodies on its link are, but for its own hand and the fingers of other hands, which have to be able to take it over.
 
 **Boxes against boxes** have no short closed form. Where two convex polyhedra are closest, one of the two points can be
 taken on an edge: if both lie inside of faces, these are parallel, and both points may be moved along them until one
@@ -14,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 
 import coal
 import numpy as np
@@ -24,7 +23,6 @@ from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.robot.enclose import capsule_between
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
-from q2r2_control.types import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +55,6 @@ class HeldObjects:
         names = pair_names(self.geometry)
         return names[len(names) - len(self.holders) :]
 
-    def roles(self) -> dict[str, Role]:
-        """What the objects are, by link."""
-        return {held.link: Role(LinkClass.OBJECT, frozenset({arm})) for arm, held in self.by_arm.items()}
-
 
 def held_objects(
     model: pin.Model,
@@ -82,11 +76,9 @@ def held_objects(
         made.add_object(held)
         for other in _watched(geometry, roles, held):
             made.watch({arm}, held.link, other)
-    arms = list(by_arm)
-    for i, arm in enumerate(arms):
-        for other_arm in arms[i + 1 :]:
-            if by_arm[arm].joint != by_arm[other_arm].joint:
-                made.watch({arm, other_arm}, by_arm[arm].link, by_arm[other_arm].link)
+    for one, two in combinations(by_arm.values(), 2):
+        if one.joint != two.joint:
+            made.watch({one.arm, two.arm}, one.link, two.link)
     return HeldObjects(made.geometry, by_arm, tuple(made.holders))
 
 
@@ -122,31 +114,16 @@ class _Pairs:
     def _edges_of(self, solid: str) -> list[int]:
         if solid not in self._edges:
             item = self.geometry.geometryObjects[self._solids[solid]]
-            joint, placement, half = item.parentJoint, item.placement.copy(), np.array(item.geometry.halfSide)
-            self._edges[solid] = [
-                self._add(f"{link_of(item.name)}_edge{number}", joint, *_edge(placement, start, end))
-                for number, (start, end) in enumerate(_edges(half))
-            ]
+            link, joint, placement = link_of(item.name), item.parentJoint, item.placement.copy()
+            half, edges = np.array(item.geometry.halfSide), self._edges.setdefault(solid, [])
+            for axis, signs in product(range(3), product((-1.0, 1.0), repeat=2)):
+                corner, other = (half * np.insert(np.array(signs), axis, end) for end in (1.0, -1.0))
+                edge = capsule_between(0.0, placement.act(other), placement.act(corner))
+                edges.append(self._add(f"{link}_edge{len(edges)}", joint, *edge))
         return self._edges[solid]
 
     def _add(self, name: str, joint: int, shape: coal.CollisionGeometry, placement: pin.SE3) -> int:
         return int(self.geometry.addGeometryObject(pin.GeometryObject(name, joint, placement, shape)))
-
-
-def _edges(half: Array) -> list[tuple[Array, Array]]:
-    """Ends (3,) of a box's twelve edges."""
-    found = []
-    for axis in range(3):
-        for signs in product((-1.0, 1.0), repeat=2):
-            corner = half * np.insert(np.array(signs), axis, 1.0)
-            other = corner.copy()
-            other[axis] = -corner[axis]
-            found.append((other, corner))
-    return found
-
-
-def _edge(placement: pin.SE3, start: Array, end: Array) -> tuple[coal.CollisionGeometry, pin.SE3]:
-    return capsule_between(0.0, placement.act(start), placement.act(end))
 
 
 def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldObject) -> list[str]:
@@ -158,11 +135,7 @@ def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldO
         first, second = items[pair.first], items[pair.second]
         for one, other in ((first, second), (second, first)):
             role = roles[link_of(other.name)]
-            own_hand = held.arm in role.arms and role.part in (LinkClass.FINGER, LinkClass.TOOL)
-            if (
-                one.parentJoint == held.joint != other.parentJoint
-                and not own_hand
-                and role.part is not LinkClass.FINGER
-            ):
+            takes = role.part is LinkClass.FINGER or (role.part is LinkClass.TOOL and held.arm in role.arms)
+            if one.parentJoint == held.joint != other.parentJoint and not takes:
                 found[other.name] = None
     return list(found)

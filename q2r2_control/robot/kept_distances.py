@@ -11,7 +11,7 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
-from q2r2_control.robot.robot import PairDistance, Robot
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 _OUTERMOST_FIRST = list(LinkClass)
@@ -32,39 +32,29 @@ def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
     Raises :class:`ConfigError` for names in ``settings.pairs`` and ``settings.contact_allowed`` that no monitored pair
     has.
     """
-    kept = _of_all_pairs(robot, settings)
-    return _part(kept, slice(0, len(kept.keys) - len(robot.objects.holders)))
+    return _of_all_pairs(robot, settings)[0]
 
 
 def kept_by_objects(robot: Robot, settings: ControllerSettings) -> KeptDistances:
     """The same of the pairs of ``robot.objects``; raises as :func:`kept_distances` does."""
-    kept = _of_all_pairs(robot, settings)
-    return _part(kept, slice(len(kept.keys) - len(robot.objects.holders), None))
+    return _of_all_pairs(robot, settings)[1]
 
 
 def too_close_at_home(robot: Robot, kept: KeptDistances) -> list[str]:
     """A line for each pair that is nearer at home than it has to be, the nearest first."""
     pairs = zip(robot.distances(robot.home), kept.values.tolist(), kept.keys, strict=True)
-    return [
-        f"home: {pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart; "
-        f"allowed: at least {key}, {1e3 * least:.1f} mm{_way_out(pair)}"
-        for pair, least, key in sorted(pairs, key=lambda found: found[0].distance)
-        if pair.distance < least
-    ]
+    lines = []
+    for pair, least, key in sorted(pairs, key=lambda found: found[0].distance):
+        if pair.distance < least:
+            apart = f"{pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart"
+            with_floor = FLOOR in (link_of(pair.name_a), link_of(pair.name_b))
+            hint = "; the key floor takes another height, or null for no floor" if with_floor else ""
+            lines.append(f"home: {apart}; allowed: at least {key}, {1e3 * least:.1f} mm{hint}")
+    return lines
 
 
-def _way_out(pair: PairDistance) -> str:
-    """What the cell's YAML says about a floor that is not where it was meant to be, or was not meant at all."""
-    with_floor = FLOOR in (link_of(pair.name_a), link_of(pair.name_b))
-    return "; the key floor takes another height, or null for no floor" if with_floor else ""
-
-
-def _part(kept: KeptDistances, pairs: slice) -> KeptDistances:
-    return KeptDistances(kept.values[pairs], kept.keys[pairs], kept.contact_speed[pairs])
-
-
-def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> KeptDistances:
-    """Of the monitored pairs, then of those of objects."""
+def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDistances, KeptDistances]:
+    """Of the monitored pairs, and of those of objects."""
     names = pair_names(robot.objects.geometry)
     keys = ["min_distance"] * len(names)
     values = np.full(len(names), settings.min_distance)
@@ -77,11 +67,13 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> KeptDistances:
         for p in _found(f"pairs[{i}]", named.pair, names):
             values[p], keys[p] = named.distance, f"pairs[{i}]"
     speed = np.full(len(names), np.inf)
-    monitored = names[: len(names) - len(robot.objects.holders)]
-    for i, contact in enumerate(settings.contact_allowed):  # which objects need none of: their classes allow contact
-        for p in _found(f"contact_allowed[{i}]", contact.pair, monitored):
+    count = len(names) - len(robot.objects.holders)
+    for i, contact in enumerate(settings.contact_allowed):  # objects need none: their classes allow contact
+        for p in _found(f"contact_allowed[{i}]", contact.pair, names[:count]):
             values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed
-    return KeptDistances(values, tuple(keys), speed)
+    parts = slice(0, count), slice(count, None)
+    monitored, of_objects = (KeptDistances(values[part], tuple(keys[part]), speed[part]) for part in parts)
+    return monitored, of_objects
 
 
 def pair_class(first: Role, second: Role) -> str:
@@ -95,14 +87,11 @@ def pair_class(first: Role, second: Role) -> str:
 
 def _found(key: str, patterns: tuple[str, str], names: tuple[tuple[str, str], ...]) -> list[int]:
     """Numbers of the pairs that ``patterns`` mean."""
-    found = [p for p, pair in enumerate(names) if _are(patterns, pair)]
+    one, two = patterns
+    found = [p for p, (a, b) in enumerate(names) if (_is(one, a) and _is(two, b)) or (_is(one, b) and _is(two, a))]
     if not found:
         raise ConfigError(f"control.{key}.pair = {list(patterns)!s:.120}: {_why_none(patterns, names)}")
     return found
-
-
-def _are(patterns: tuple[str, str], pair: tuple[str, str]) -> bool:
-    return any(_is(patterns[0], first) and _is(patterns[1], second) for first, second in (pair, pair[::-1]))
 
 
 def _is(pattern: str, geometry: str) -> bool:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from q2r2_control.errors import ConfigError, RobotError
 
@@ -42,13 +40,9 @@ def _folders(name: str, near: Path | None, packages: Mapping[str, str]) -> Itera
         yield from (Path(root) / below / name for root in os.environ.get(variable, "").split(os.pathsep) if root)
     if near is not None:
         yield from (folder / name for folder in near.resolve().parents)
-    yield _example_robot_data_share() / name
-
-
-def _example_robot_data_share() -> Path:
     from example_robot_data.robots_loader import getModelPath
 
-    return Path(getModelPath("panda_description")).parent.parent
+    yield Path(getModelPath("panda_description")).parent.parent / name
 
 
 def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[str, str]) -> str:
@@ -64,25 +58,32 @@ def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[
         raise ConfigError(
             f"{file}: needs the Python package xacro: pip install 'q2r2_control[xacro]', or expand it to .urdf"
         ) from error
-    given = _Arguments({name: _as_text(value) for name, value in arguments.items()})
+    # As on xacro's command line.
+    texts = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
+    given, usual = _Arguments(texts), substitution_args._eval_find
+
+    def find(name: str) -> str:
+        return str(package_folder(name, file.parent, packages))
+
     try:
-        with _packages_found_by(substitution_args, lambda name: str(package_folder(name, file.parent, packages))):
-            text: str = xacro.process_file(str(file), mappings=given).toxml()
+        # For $(find NAME) xacro asks ament's Python package only, which need not be installed.
+        substitution_args._eval_find = substitution_args._eval_dict["find"] = find
+        text: str = xacro.process_file(str(file), mappings=given).toxml()
     # A file holds Python expressions, from which any exception can come.
     except (Exception, SystemExit) as error:
         inside = next((f" (in {name})" for name in reversed(xacro.filestack or []) if name != str(file)), "")
         reason = " ".join(str(error).split())[:300] or type(error).__name__
         raise RobotError(f"{file}: xacro cannot expand it: {reason}{inside}") from error
+    finally:
+        substitution_args._eval_find = substitution_args._eval_dict["find"] = usual
     if unknown := sorted(set(arguments) - given.asked_for):
-        raise ConfigError(
-            f"xacro_args.{unknown[0]:.60}: {file} has no such argument; allowed: "
-            f"{', '.join(sorted(given.asked_for)) or 'none'}"
-        )
+        allowed = ", ".join(sorted(given.asked_for)) or "none"
+        raise ConfigError(f"xacro_args.{unknown[0]:.60}: {file} has no such argument; allowed: {allowed}")
     return text
 
 
 class _Arguments(dict[str, str]):
-    """Arguments by name, and which of them the file declares: xacro does not tell of those that it has no use for."""
+    """Arguments by name, and which of them the file declares: xacro ignores the others."""
 
     def __init__(self, given: Mapping[str, str]) -> None:
         super().__init__(given)
@@ -91,19 +92,3 @@ class _Arguments(dict[str, str]):
     def __contains__(self, name: object) -> bool:
         self.asked_for.add(str(name))
         return super().__contains__(name)
-
-
-def _as_text(value: object) -> str:
-    """As it would be written on xacro's command line."""
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-@contextmanager
-def _packages_found_by(substitution_args: Any, find: Callable[[str], str]) -> Iterator[None]:
-    """Let ``find`` answer ``$(find NAME)``: xacro asks ament's Python package only, which need not be installed."""
-    usual = substitution_args._eval_find
-    substitution_args._eval_find = substitution_args._eval_dict["find"] = find
-    try:
-        yield
-    finally:
-        substitution_args._eval_find = substitution_args._eval_dict["find"] = usual

@@ -18,7 +18,7 @@ from q2r2_control.types import Array
 
 
 class LinkClass(StrEnum):
-    """What a link is, in the words of ``control.distances``, the outermost first."""
+    """A link's class, as in ``control.distances``, the outermost first."""
 
     OBJECT = "object"
     FINGER = "finger"
@@ -62,27 +62,26 @@ class Role:
 
 def roles_of(tree: LinkTree, own_links: Mapping[str, set[str]], parts: KnownParts) -> dict[str, Role]:
     """The role of every link; ``own_links`` are those of each arm, from the root to whatever its joints carry."""
-    fingers = {link for joints in parts.finger_joints.values() for link in links_moved_by(tree, joints)}
-    tools = {link for links in parts.tool_links.values() for link in links}
-    obstacles = set(parts.obstacles)
-
-    def part_of(link: str) -> LinkClass:
-        if link in fingers:
-            return LinkClass.FINGER
-        if link in tools:
-            return LinkClass.TOOL
-        return LinkClass.OBSTACLE if link in obstacles else LinkClass.ARM
-
+    classes = dict.fromkeys([tree.root, *tree.joint_to], LinkClass.ARM)
+    classes |= dict.fromkeys(parts.obstacles, LinkClass.OBSTACLE)
+    for links in parts.tool_links.values():
+        classes |= dict.fromkeys(links, LinkClass.TOOL)
+    for joints in parts.finger_joints.values():
+        classes |= dict.fromkeys(links_moved_by(tree, joints), LinkClass.FINGER)
     return {
-        link: Role(part_of(link), frozenset(arm for arm, links in own_links.items() if link in links))
-        for link in [tree.root, *tree.joint_to]
+        link: Role(part, frozenset(arm for arm, links in own_links.items() if link in links))
+        for link, part in classes.items()
     }
 
 
 def links_moved_by(tree: LinkTree, joints: Iterable[str]) -> set[str]:
     """Links that ``joints``, or joints that mimic one of them, carry."""
     named = set(joints)
-    moved = {child for child, joint in tree.joint_to.items() if joint.get("name") in named or _leader(joint) in named}
+    moved = {
+        child
+        for child, joint in tree.joint_to.items()
+        if named & {joint.get("name"), *(mimic.get("joint") for mimic in joint.findall("mimic"))}
+    }
     return {link for link in tree.joint_to if moved & set(tree.path(link))}
 
 
@@ -93,13 +92,10 @@ def hand_links(tree: LinkTree, finger_joints: Iterable[str]) -> set[str]:
     return {link for link in tree.joint_to if palms & set(tree.path(link))}
 
 
-def _leader(joint: ET.Element) -> str | None:
-    mimic = joint.find("mimic")
-    return None if mimic is None else mimic.get("joint")
-
-
 # Links that always stay farther apart than this need no watching: more than twice what is usually kept [m].
 CLEARANCE = 0.05
+# Links and shapes of this name ending stand for a whole tool at every opening: watched from afar, never touched.
+ENVELOPE = "_envelope"
 
 
 def link_of(geometry_name: str) -> str:
@@ -109,12 +105,8 @@ def link_of(geometry_name: str) -> str:
 
 def pairs_with_others(pairs: Iterable[tuple[str, str]], roles: Mapping[str, Role], arm: str) -> np.ndarray:
     """Numbers (p,) of those ``pairs`` of geometry names that are of a part of ``arm`` and of something else."""
-    numbers = [
-        number
-        for number, names in enumerate(pairs)
-        if [arm in roles[link_of(name)].arms for name in names].count(True) == 1
-    ]
-    return np.array(numbers, dtype=np.int64)
+    own = [[arm in roles[link_of(name)].arms for name in names].count(True) for names in pairs]
+    return np.flatnonzero(np.array(own, dtype=np.int64) == 1)
 
 
 def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkTree) -> None:
@@ -124,17 +116,16 @@ def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkT
     them. What stands fixed in the world is one body for Pinocchio, yet a table is no neighbour of an arm's first
     link: there only the link that carries the joint is.
     """
+    carrier = {joint.get("name", ""): joint_end(joint, "parent") for joint in tree.joint_to.values()}
     geometry.removeAllCollisionPairs()
     for first, second in combinations(range(geometry.ngeoms), 2):
         a, b = (geometry.geometryObjects[index] for index in (first, second))
         if a.parentJoint == b.parentJoint:
             continue
         inner, outer = (a, b) if a.parentJoint < b.parentJoint else (b, a)
-        if model.parents[outer.parentJoint] == inner.parentJoint and (
-            inner.parentJoint != 0 or _carries(link_of(inner.name), model.names[outer.parentJoint], tree)
-        ):
-            continue
-        geometry.addCollisionPair(pin.CollisionPair(first, second))
+        carries = inner.parentJoint != 0 or carrier.get(model.names[outer.parentJoint]) == link_of(inner.name)
+        if not (model.parents[outer.parentJoint] == inner.parentJoint and carries):
+            geometry.addCollisionPair(pin.CollisionPair(first, second))
 
 
 def remove_disabled_pairs(geometry: pin.GeometryModel, exclusions: Iterable[ET.Element]) -> None:
@@ -173,13 +164,13 @@ def remove_overlapping_own_pairs(
 ) -> tuple[tuple[str, str], ...]:
     """Remove pairs of one arm's own links that touch at every one of ``postures``, and return their names.
 
-    For shapes that overlap by construction, such as capsules around neighbouring meshes. ``own_links`` has one set of
-    links an arm, from its base to its tool. A pair with the other arm or with an obstacle stays, however it lies.
+    Such shapes overlap by construction. ``own_links`` has one set of links an arm, from its base to its tool. A pair
+    with the other arm or with an obstacle stays, however it lies.
     """
     data, geometry_data = model.createData(), geometry.createData()
     names = pair_names(geometry)
-    within_one_arm = [any({link_of(name) for name in pair} <= links for links in own_links) for pair in names]
-    touching = np.array(within_one_arm, dtype=bool)  # of no pair too
+    within_one_arm = [any(set(map(link_of, pair)) <= links for links in own_links) for pair in names]
+    touching = np.array(within_one_arm, dtype=bool)
     for q in postures:
         pin.computeDistances(model, data, geometry, geometry_data, q)
         touching &= np.array([result.min_distance <= 0 for result in geometry_data.distanceResults], dtype=bool)
@@ -202,9 +193,3 @@ def keep_pairs(geometry: pin.GeometryModel, wanted: Callable[[str, str], bool]) 
     for pair, (a, b) in zip(pairs, names, strict=True):
         if wanted(a, b):
             geometry.addCollisionPair(pair)
-
-
-def _carries(link: str, joint: str, tree: LinkTree) -> bool:
-    return any(
-        element.get("name") == joint and joint_end(element, "parent") == link for element in tree.joint_to.values()
-    )

@@ -3,18 +3,69 @@
 from __future__ import annotations
 
 import copy
+import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
+import numpy as np
 import pinocchio as pin
 
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.description import LinkTree, joint_limits
-from q2r2_control.robot.locking import lock_joints
 from q2r2_control.robot.urdf_parts import acceleration_limit
+from q2r2_control.types import Array
 
-# Inertia that the rotor of a geared drive adds to its joint where the URDF does not say [kg m^2]. Without any, light
-# wrist joints would need torques faster than a control loop gives them.
+
+def joint_origin(joint: ET.Element) -> pin.SE3:
+    """Placement of a joint's child link in its parent link, at position 0."""
+    xyz, rpy = (_vector(joint.find("origin"), name) or [0.0, 0.0, 0.0] for name in ("xyz", "rpy"))
+    return pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
+
+
+def lock_joints(robot: ET.Element, movable: Collection[str], positions: Mapping[str, float]) -> None:
+    """Fix every joint of the URDF ``robot`` but the ``movable`` ones, in place, so that every reader locks them alike.
+
+    A joint with one axis is fixed at its value in ``positions`` [rad or m], at 0 without one; a planar or floating
+    joint where it stands.
+    """
+    for joint in robot.findall("joint"):
+        name, kind = joint.get("name", ""), joint.get("type")
+        if kind == "fixed" or name in movable:
+            continue
+        position = positions.get(name, 0.0)
+        if position != 0.0 and kind in ("revolute", "continuous", "prismatic"):
+            axis = joint_axis(joint)
+            turn = pin.AngleAxis(math.remainder(position, 2 * math.pi), axis).matrix()
+            moved = pin.SE3(np.eye(3), position * axis) if kind == "prismatic" else pin.SE3(turn, np.zeros(3))
+            place = joint_origin(joint) * moved
+            if (origin := joint.find("origin")) is None:
+                origin = ET.SubElement(joint, "origin")
+            for key, values in (("xyz", place.translation), ("rpy", pin.rpy.matrixToRpy(place.rotation))):
+                origin.set(key, " ".join(repr(float(value)) for value in values))
+        joint.set("type", "fixed")
+        for tag in ("axis", "limit", "mimic", "dynamics", "safety_controller", "calibration", "rotor"):
+            for element in joint.findall(tag):
+                joint.remove(element)
+
+
+def resting_position(joint: ET.Element) -> float:
+    """0, or what the joint's limits allow that is nearest to it."""
+    lower, upper = joint_limits(joint)
+    return min(max(0.0, lower), upper)
+
+
+def joint_axis(joint: ET.Element) -> Array:
+    """Unit vector (3,) that a joint turns about or slides along, in its own frame."""
+    axis = np.array(_vector(joint.find("axis"), "xyz") or [1.0, 0.0, 0.0])
+    return np.asarray(axis / np.linalg.norm(axis))
+
+
+def _vector(element: ET.Element | None, attribute: str) -> list[float]:
+    return [] if element is None else [float(part) for part in element.get(attribute, "").split()]
+
+
+# Inertia that the rotor of a geared drive adds where the URDF does not say [kg m^2]. Without any, a control loop is too
+# slow for light wrist joints.
 _USUAL_ARMATURE = 0.1
 
 
@@ -35,9 +86,8 @@ def checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str]
             raise RobotError(f"{where}: joint {name} is {kind}; an arm's joints have to be revolute or prismatic")
         lower, upper = joint_limits(joint)
         if not lower < upper:
-            raise RobotError(
-                f"{where}: joint {name} has position limits {lower:g} .. {upper:g}; expected lower < upper"
-            )
+            limits = f"position limits {lower:g} .. {upper:g}"
+            raise RobotError(f"{where}: joint {name} has {limits}; expected lower < upper")
         limit = joint.find("limit")
         for what in ("velocity", "effort"):
             value = 0.0 if limit is None else float(limit.get(what, "0"))
@@ -74,10 +124,8 @@ def _set_rotors(model: pin.Model, urdf: ET.Element) -> None:
     model.armature[:] = _USUAL_ARMATURE
     for joint in urdf.findall("joint"):
         rotor, name = joint.find("rotor"), joint.get("name", "")
-        if rotor is None or not model.existJointName(name):
-            continue
-        index = model.joints[model.getJointId(name)].idx_v
-        inertia, gear = float(rotor.get("inertia", "0")), float(rotor.get("gear", "1"))
-        model.rotorInertia[index] = inertia
-        model.rotorGearRatio[index] = gear
-        model.armature[index] = inertia * gear**2 or _USUAL_ARMATURE
+        if rotor is not None and model.existJointName(name):
+            index = model.joints[model.getJointId(name)].idx_v
+            inertia, gear = float(rotor.get("inertia", "0")), float(rotor.get("gear", "1"))
+            model.rotorInertia[index], model.rotorGearRatio[index] = inertia, gear
+            model.armature[index] = inertia * gear**2 or _USUAL_ARMATURE

@@ -1,8 +1,7 @@
 """Which monitored pairs can meet at all inside the joint limits, found by sampling, and the SRDF that says so.
 
-A sample only shows that two bodies can come near, never that they cannot. So the nearest postures found of each pair
-are followed downhill, and a pair counts as out of reach only if it stays farther apart than a clearance well above the
-distance that the controller keeps.
+A sample shows that two bodies can come near, never that they cannot. The nearest postures found of each pair are
+followed downhill. A pair is out of reach only if it stays farther apart than a clearance well above what is kept.
 """
 
 from __future__ import annotations
@@ -44,9 +43,8 @@ def nearest_approaches(robot: Robot, samples: int, seed: int, progress: Progress
     """
     if samples < 100:
         raise RobotError(f"samples = {samples}: allowed: 100 or more")
-    postures = np.random.default_rng(seed).uniform(
-        robot.position_lower, robot.position_upper, (samples, robot.model.nv)
-    )
+    lower, upper = robot.position_lower, robot.position_upper
+    postures = np.random.default_rng(seed).uniform(lower, upper, (samples, robot.model.nv))
     names = pair_names(robot.collision_model)
     distances = np.zeros((samples, len(names)))
     for i, q in enumerate(postures):
@@ -74,16 +72,14 @@ def srdf_of(robot: Robot, approaches: Sequence[PairReach], clearance: float, sam
     )
     overlapping = dict.fromkeys((link_of(a), link_of(b)) for a, b in robot.ignored_pairs)
     never = ((pair.link_a, pair.link_b) for pair in approaches if pair.nearest > clearance)
-    return srdf_text(
-        robot.name, comment, [*((a, b, "Always") for a, b in overlapping), *((a, b, "Never") for a, b in never)]
-    )
+    pairs = [*((a, b, "Always") for a, b in overlapping), *((a, b, "Never") for a, b in never)]
+    return srdf_text(robot.name, comment, pairs)
 
 
 def srdf_text(name: str, comment: str, pairs: Iterable[tuple[str, str, str]], links: Iterable[str] = ()) -> str:
     """SRDF text that disables ``links``, and ``pairs`` of links with the reason, in MoveIt's words."""
     root = ET.Element("robot", name=name)
-    lines = textwrap.wrap(comment, 112)
-    root.append(ET.Comment("\n    " + "\n    ".join(lines) + "\n  "))
+    root.append(ET.Comment("\n    " + "\n    ".join(textwrap.wrap(comment, 112)) + "\n  "))
     for link in links:
         ET.SubElement(root, "disable_default_collisions", link=link)
     for a, b, reason in pairs:

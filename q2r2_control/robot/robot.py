@@ -17,11 +17,12 @@ from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
-from q2r2_control.robot.finger_bodies import FingerBody, sweep_fingers
+from q2r2_control.robot.finger_bodies import sweep_fingers
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
 from q2r2_control.robot.held_objects import HeldObjects, held_objects
 from q2r2_control.robot.pairs import (
     KnownParts,
+    LinkClass,
     Role,
     add_movable_pairs,
     pair_names,
@@ -65,12 +66,10 @@ class Robot:
     ``acceleration_limit`` is infinite for joints of which the model says none; what holds is
     :meth:`capped_acceleration`.
 
-    ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own
-    links that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box
-    fixed in the world; a finger is all that it sweeps, and ``finger_bodies`` says what counts while its gripper's
-    opening is known. ``objects`` are what grippers hold, of which the collision model knows nothing.
-    ``roles`` says what each link is. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction
-    and are not monitored.
+    ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, its own links that
+    can meet, and what stands in the cell. Every monitored shape is a capsule, a sphere, or a box fixed in the world; a
+    finger is all that it sweeps, and ``finger_bodies`` says what counts at a known opening. ``objects`` are what
+    grippers hold, beside the collision model. ``ignored_pairs`` of one arm's shapes overlap by construction.
     """
 
     def __init__(
@@ -96,7 +95,7 @@ class Robot:
                 frame_id=int(self.model.getFrameId(frame, pin.FrameType.BODY)),
                 joints=np.array([self.model.joints[self.model.getJointId(joint)].idx_v for joint in chains[name]]),
                 finger_joints=parts.finger_joints.get(name, ()),
-                stroke=_length(parts.strokes.get(name)),
+                stroke=abs(float(np.subtract(*parts.strokes.get(name, (0.0, 0.0))))),
             )
             for name, frame in tool_frames.items()
         }
@@ -107,12 +106,18 @@ class Robot:
         self.torque_limit: Array = self.model.effortLimit.copy()
         joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}
         self.acceleration_limit: Array = np.array([acceleration_limit(joints[name]) for name in self.joint_names])
-        own_links = {name: set(tree.path(arm.tool_frame)) | self._moved_links(arm) for name, arm in self.arms.items()}
+        # From the root to the tool, and branches beside that way, such as fingers.
+        bodies = [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
+        own_links = {
+            name: {*tree.path(arm.tool_frame), *(body.name for body in bodies if body.parentJoint - 1 in arm.joints)}
+            for name, arm in self.arms.items()
+        }
         self.roles: dict[str, Role] = roles_of(tree, own_links, parts)
         enclose_shapes(self.collision_model)
         self.finger_bodies = sweep_fingers(self.model, self.collision_model, tree, parts, home)
         for name, arm in self.arms.items():
-            self.arms[name] = replace(arm, finger_way=_finger_way(arm, self.finger_bodies))
+            ways = [body.way for body in self.finger_bodies if isinstance(body, TurningBody) and body.arm == name]
+            self.arms[name] = replace(arm, finger_way=max(ways, default=0.0) or arm.stroke)
         self.ignored_pairs = self._monitor(tree, exclusions, list(own_links.values()))
         self.objects = HeldObjects(self.collision_model, {}, ())
         self._data: pin.Data = self.model.createData()
@@ -144,7 +149,8 @@ class Robot:
         exclusions = None if srdf is None else parse_srdf(*_text_of(srdf, "SRDF text")[:2])
         if not arms:
             raise RobotError(f"{where}: no arms given; expected a mapping such as {{'left': 'left_tool_frame'}}")
-        home = {joint.get("name", ""): _resting(*joint_limits(joint)) for joint in urdf.findall("joint")}
+        limits = {joint.get("name", ""): joint_limits(joint) for joint in urdf.findall("joint")}
+        home = {name: 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2 for name, (lower, upper) in limits.items()}
         return cls(urdf, exclusions, dict(arms), home, where)
 
     def capped_acceleration(self, cap: float) -> Array:
@@ -164,7 +170,7 @@ class Robot:
         ]
 
     def distance_values(self, q: Array) -> Array:
-        """The numbers of :meth:`distances` alone (pairs,) [m], in a fifth of the time."""
+        """The numbers of :meth:`distances` alone (pairs,) [m]."""
         pin.computeDistances(self.model, self._data, self.collision_model, self._collision_data, q)
         return np.array([result.min_distance for result in self._collision_data.distanceResults], dtype=np.float64)
 
@@ -188,7 +194,7 @@ class Robot:
             remove_disabled_pairs(self.collision_model, exclusions)
         postures = [self.home]
         if exclusions is not None:
-            # Who lists the pairs is believed: only what overlaps everywhere is dropped, since it can never be parted.
+            # An SRDF is believed: only pairs that overlap everywhere are dropped, since they can never be parted.
             random = np.random.default_rng(0)
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
@@ -199,27 +205,11 @@ class Robot:
         }
         tools = {name: arm.frame_id for name, arm in self.arms.items()}
         self.objects = held_objects(self.model, self.collision_model, self.roles, tools, configs)
-        for link, role in self.objects.roles().items():
-            if link in self.roles:
-                arm = next(iter(role.arms))
-                raise ConfigError(f"arms.{arm}.gripper.object: the cell has a link {link}; allowed: none of that name")
-            self.roles[link] = role
-
-    def _moved_links(self, arm: Arm) -> set[str]:
-        """Links that an arm's joints carry, of branches beside the way to the tool too, such as fingers."""
-        joints = {int(index) + 1 for index in arm.joints}
-        bodies = (frame for frame in self.model.frames if frame.type == pin.FrameType.BODY)
-        return {body.name for body in bodies if body.parentJoint in joints}
-
-
-def _finger_way(arm: Arm, bodies: Iterable[FingerBody | TurningBody]) -> float:
-    """How far the finger moves that moves the most [m]; of fingers that slide, their joints' stroke."""
-    ways = [body.way for body in bodies if isinstance(body, TurningBody) and body.arm == arm.name]
-    return max(ways, default=arm.stroke) or arm.stroke
-
-
-def _length(stroke: tuple[float, float] | None) -> float:
-    return 0.0 if stroke is None else abs(stroke[1] - stroke[0])
+        for arm, held in self.objects.by_arm.items():
+            if held.link in self.roles:
+                has = f"the cell has a link {held.link}"
+                raise ConfigError(f"arms.{arm}.gripper.object: {has}; allowed: none of that name")
+            self.roles[held.link] = Role(LinkClass.OBJECT, frozenset({arm}))
 
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:
@@ -231,7 +221,3 @@ def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[s
         return file.read_text(encoding="utf-8"), str(file), file.parent
     except (OSError, ValueError) as error:
         raise RobotError(f"{str(path_or_text)[:200]!r}: neither XML nor a file that can be read: {error}") from error
-
-
-def _resting(lower: float, upper: float) -> float:
-    return 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2

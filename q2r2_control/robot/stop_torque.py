@@ -5,9 +5,8 @@ from a low speed may do so with any signs, so joint i is asked for at most
 
     |g_i(q)| + sum_j |M_ij(q)| a_j
 
-which the signs of M's row, turned to gravity's, do ask. It is inverse dynamics at v = 0, rotors included; a stop from
-speed asks for Coriolis torques as well, and friction helps it: neither is counted. Where gravity alone is more than a
-joint has, no deceleration is low enough, and what is wrong is the model or the posture.
+which the signs of M's row, turned to gravity's, do ask. It is inverse dynamics at v = 0, rotors included; Coriolis
+torques and friction are not counted. Where gravity alone is too much, the model or the posture is wrong.
 """
 
 from __future__ import annotations

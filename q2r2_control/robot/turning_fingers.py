@@ -16,11 +16,10 @@ what was there, so the errors add up and derivatives by two different driven joi
 lies in the hull of the samples. A capsule is convex: one that holds each sample with the shape's radius and that
 remainder holds all. For any segment the radius that does this is the farthest sample's distance from it, plus both. []
 
-So the choice of the segment decides on size only. Some along the shape and some along its way are tried, and the one of
-the least mean width is taken, the convex body that reaches beyond the finger the least on the average of all
-directions. Capsules of two intervals are not nested even if the intervals are: one for less may stick out of one for
-more. Who narrows an interval has to prove that as if a body grew (:func:`sticks_out`); the wider interval's capsule
-stays valid as long as the opening is in it, so that a narrower one may always be refused.
+The choice of the segment decides on size only: of some along the shape and some along its way, the one of the least
+mean width is taken. Capsules of two intervals are not nested even if the intervals are: one for less may stick out of
+one for more. A narrower interval has to be proven as if a body grew (:func:`sticks_out`). The wider interval's capsule
+stays valid as long as the opening is in it, so a narrower one may always be refused.
 """
 
 from __future__ import annotations
@@ -84,29 +83,18 @@ class TurningBody:
     radius: float  # as drawn [m], which no capsule around it is below
     joints: tuple[FingerJoint, ...]  # from the hand outwards
 
-    def levers(self) -> list[float]:
-        """How far, at most, the ends are ever from a point on each joint's axis [m]; 1 for a slide."""
-        levers: list[float] = []
-        farthest, beyond = 0.0, None
-        for joint in reversed(self.joints):
-            if beyond is None:
-                farthest = float(np.linalg.norm(self.ends - joint.point, axis=1).max())
-            else:
-                farthest += float(np.linalg.norm(beyond - joint.point))
-            if joint.slides:
-                farthest += max(abs(position - joint.home) for position in (joint.before, joint.beyond))
-            levers.append(1.0 if joint.slides else farthest)
-            beyond = joint.point
-        return levers[::-1]
-
     def curvatures(self) -> Array:
         """Bound on the second derivative by two joints' positions (j, j) [m]; 0 for those of two drivers."""
-        joints, levers = self.joints, self.levers()
-        bounds = np.zeros((len(joints), len(joints)))
-        for i, inner in enumerate(joints):
-            for k in range(i, len(joints)):
-                if inner.driver == joints[k].driver and not inner.slides:
-                    bounds[i, k] = bounds[k, i] = levers[k]
+        bounds = np.zeros((len(self.joints), len(self.joints)))
+        farthest, beyond = 0.0, self.ends  # from a point on the joint's axis to the ends, at most [m]
+        for k, outer in reversed(list(enumerate(self.joints))):
+            farthest += float(np.linalg.norm(beyond - outer.point, axis=1).max())
+            if outer.slides:
+                farthest += max(abs(position - outer.home) for position in (outer.before, outer.beyond))
+            for i, inner in enumerate(self.joints[: k + 1]):
+                if inner.driver == outer.driver and not inner.slides:
+                    bounds[i, k] = bounds[k, i] = 1.0 if outer.slides else farthest
+            beyond = outer.point[None]
         return bounds
 
     @cached_property
@@ -117,12 +105,11 @@ class TurningBody:
     @cached_property
     def way(self) -> float:
         """How far an end is from where it was when the closed gripper has opened, at most [m]."""
-        sweeps = TurningSweeps((self,))
-        closed, opened = (sweeps.ends_at(opening)[0] for opening in (0.0, 1.0))
-        return float(np.linalg.norm(opened - closed, axis=1).max())
+        closed, opened = map(TurningSweeps((self,)).ends_at, (0.0, 1.0))
+        return float(np.linalg.norm(opened[0] - closed[0], axis=1).max())
 
     def capsule(self, interval: Interval) -> tuple[Array, Array, float]:
-        """Both ends (3,) of the segment and the radius [m] of what encloses the shape at openings in ``interval``."""
+        """Both ends (3,) of the segment and the radius [m] of the capsule around the shape in ``interval``."""
         capsules = TurningSweeps((self,)).capsules(interval)
         return capsules.start[0], capsules.end[0], float(capsules.radius[0])
 

@@ -59,30 +59,20 @@ def fixed_joint(name: str, parent: str, child: str, pose: PoseConfig) -> ET.Elem
 
 
 def obstacle_link(name: str, config: ObstacleConfig) -> ET.Element:
-    """An obstacle as a link."""
-    link = ET.Element("link", name=name)
-    for tag in ("visual", "collision"):
-        shape = ET.SubElement(link, tag, name=f"{name}_{tag}")
-        shape.append(_shape(config))
-        if tag == "visual":
-            material = ET.SubElement(shape, "material", name=f"{name}_colour")
-            ET.SubElement(material, "color", rgba=numbers(config.colour))
-    if config.shape == "capsule":
-        checking = ET.SubElement(link, "collision_checking")
-        ET.SubElement(checking, "capsule", name=f"{name}_collision")
-    return link
-
-
-def _shape(config: ObstacleConfig) -> ET.Element:
-    geometry = ET.Element("geometry")
+    """An obstacle as a link; its name has letters, digits and _ only."""
     if config.shape == "box":
-        ET.SubElement(geometry, "box", size=numbers(config.size))
+        shape = f'<box size="{numbers(config.size)}"/>'
     elif config.shape == "sphere":
-        ET.SubElement(geometry, "sphere", radius=numbers(config.size))
+        shape = f'<sphere radius="{config.size[0]}"/>'
     else:
-        radius, length = config.size
-        ET.SubElement(geometry, "cylinder", radius=numbers([radius]), length=numbers([length]))
-    return geometry
+        shape = f'<cylinder radius="{config.size[0]}" length="{config.size[1]}"/>'
+    colour = f'<material name="{name}_colour"><color rgba="{numbers(config.colour)}"/></material>'
+    capsule = f'<collision_checking><capsule name="{name}_collision"/></collision_checking>'
+    return ET.fromstring(
+        f"""<link name="{name}"><visual name="{name}_visual"><geometry>{shape}</geometry>{colour}</visual>
+        <collision name="{name}_collision"><geometry>{shape}</geometry></collision>
+        {capsule if config.shape == "capsule" else ""}</link>"""
+    )
 
 
 def numbers(values: Sequence[float]) -> str:
@@ -93,11 +83,17 @@ ACCELERATION = "acceleration"
 ATTRIBUTES = (ACCELERATION, "deceleration", "{http://drake.mit.edu}acceleration")  # of limit
 
 
+def mimic_of(joint: ET.Element) -> tuple[str, float, float] | None:
+    """The joint that this one follows, multiplier and offset; None where it follows none."""
+    if (mimic := joint.find("mimic")) is None:
+        return None
+    return mimic.get("joint", ""), float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+
+
 def acceleration_limit(joint: ET.Element) -> float:
     """The least of a joint's limits [rad/s^2, m/s^2 of a sliding joint]; infinity where it has none.
 
-    One number for both directions of both: to speed up as fast as the joint may brake costs little, and nothing here
-    knows of two.
+    One number for both directions, and for speeding up and braking.
     """
     limit = joint.find("limit")
     written = [] if limit is None else [limit.get(attribute) for attribute in ATTRIBUTES]

@@ -53,8 +53,6 @@ def test_the_help_lists_every_command_whose_own_has_an_example(command: str) -> 
         (("headset-check", "--host", "no such host"), "no such host"),
         (("headset-check", "--duration", "inf"), "--duration inf"),
         (("check", "pyproject.toml"), "pyproject.toml"),
-        (("check", CELL, "--pairs", "a.srdf", "--model-pairs", "."), "exclude each other"),
-        (("check", CELL, "--model-pairs", "nowhere"), "nowhere: no such folder"),
         (("bench", "--work", "--motion", "dance"), "motion 'dance': allowed: carry-"),
         (("bench", "--motion", "meet"), "needs --work"),
         (("soak", "--ticks", "99"), "'--ticks'"),

@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.cli.cell_report import check_cell
-from q2r2_control.cli.check import write_model_pairs
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.errors import ConfigError
 from q2r2_control.verification.fault_injection import FINGERS, with_contact
 from tests.cli.command import CELL, changed_cell, external_cell, one_object, q2r2
 from tests.robot.conftest import one_arm
@@ -126,15 +124,3 @@ def test_pairs_that_can_never_meet_are_written_to_new_files(tmp_path: Path) -> N
     assert q2r2(*arguments).exit_code == 0
     assert "disable_collisions" in (tmp_path / "cell.srdf").read_text(encoding="utf-8")
     assert "exists; give the name of a new file" in q2r2(*arguments).stderr
-
-
-def test_model_pairs_are_written_once_and_nothing_else_is_replaced(tmp_path: Path) -> None:
-    file = tmp_path / "iiwa7.srdf"
-    assert write_model_pairs(ARM, tmp_path, 100, 0.05) == {str(file): True}
-    assert write_model_pairs(ARM, tmp_path, 100, 0.05) == {str(file): False}
-    file.write_text("mine")
-    with pytest.raises(ConfigError, match=r"iiwa7\.srdf: exists and says something else; remove it"):
-        write_model_pairs(ARM, tmp_path, 100, 0.05)
-    assert file.read_text() == "mine"
-    with pytest.raises(ConfigError, match=r"clearance = 0\.02 m: allowed: above control\.min_distance"):
-        write_model_pairs(ARM, tmp_path, 100, 0.02)

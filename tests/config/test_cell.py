@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.errors import Q2R2Error
-from q2r2_control.robot.robot import Robot
 from tests.config.cell_files import CELL, changed, fault, loaded, shipped
+
+ARM = {"model": "iiwa7", "home": [0] * 7, "tip": "link_ee"}
 
 
 @pytest.mark.parametrize(
@@ -47,18 +47,24 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         # degrees, millimetres, milliseconds, percent
         ("arms.left.mount.rpy", [0, 0, 90], "less than or equal to 6.28"),
         ("arms.left.mount.position", [0, 400, 0], "less than or equal to 20"),
-        ("obstacles.table.size", [800, 1600, 40], "less than or equal to 20"),
         ("obstacles.table.size", [0.8, 1.6], "a box takes 3 size value(s)"),
         ("teleop.stance", "behind", "'side_by_side', 'mirror' or 'mirror_reflected'"),
         ("teleop.axes", ["+x", "+x", "+z"], "once each"),
-        ("control.acceleration_limit", -10, "greater than 0"),
         ("arms.left.flange", {"thickness": 0.03}, "give both"),
         ("arms.left.flange", {"model": "disc", "thickness": 0.03, "radius": 0.05}, "give the model or those"),
         ("arms.left.flange", {"mass": 0.3}, "give its thickness and radius as well"),
         ("arms.left.flange", {"frame": "end"}, "are those of a model: give it as well"),
+        (
+            "arms.left",
+            ARM | {"tool": {"model": "hand_e", "link": "link_7"}},
+            "and tool.link = 'link_7' mean the same",
+        ),
+        (
+            "arms.left",
+            ARM | {"tool": {"frame": "link_7"}},
+            "and tool.frame = 'link_7' mean the same link",
+        ),
         ("arms.left.acceleration_limit", 5.0, "allowed: limits by joint, such as {A2: 5.4}"),
-        ("arms.left.acceleration_limit", {"A1": -8}, "greater than 0"),
-        ("control.distances.arm_arm", -0.01, "greater than or equal to 0"),
         ("arms.left.gripper.object", {"box": [0.04, 0.04, 0.06], "sphere": 0.03}, "two shapes: give one"),
         ("control.pairs", [{"pair": ["a", ""], "distance": 0.01}], "at least 1 character"),
         ("impedance.translational_stiffness", -1, "greater than 0"),
@@ -67,30 +73,22 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("cameras.front", {"width": 640}, "allowed: position, or topic of a real camera"),
         ("cameras.front", {"topic": "/front", "position": [1, 0, 1]}, "position: allowed: without topic"),
         ("cameras.front", {"position": [1, 0, 1], "look_at": [1, 0, 1]}, "allowed: another point"),
-        ("cameras.front", {"position": [1, 0, 1], "rpy": [0, 0, 0], "width": 641}, "a multiple of 2"),
         ("cameras", {"front/left": {"position": [1, 0, 1], "rpy": [0, 0, 0]}}, "should match pattern"),
         ("loop_rate_hz", 10**400, "finite number"),
-        ("headset.port", 10.5, "valid integer"),
         ("headset.allow", ["192.168.1.7/24"], "write 192.168.1.0/24, or 192.168.1.7 alone"),
         ("headset.allow", ["10.0.0.7", "the lab"], "'the lab' is neither an address nor a network such as"),
         ("headset.allow", [], "at least 1"),
         ("arms.left.gripper.closed_position", 0.025, "have to differ"),
         # not numbers, or not the ones meant
         ("control.acceleration_limit", math.nan, "finite number"),
-        ("arms.left.mount.position", [0, math.nan, 0], "finite number"),
         ("control.position_margin", "0.01 rad", "valid number"),
         ("floor", False, "valid number"),
         ("control.priority", "middle", "allowed here: equal, left, right"),
         ("arms.left.mount.position", [0, 0], "missing"),
-        ("arms.middle", {"model": "iiwa7", "home": [0] * 7}, "'left' or 'right'"),
-        ("arms", {}, "at least 1"),
-        ("name", "", "at least 1 character"),
     ],
     ids=lambda value: value if isinstance(value, str) else f"{value!r:.24}",
 )
-def test_a_value_out_of_range_or_of_the_wrong_kind_is_named_with_what_is_allowed(
-    tmp_path: Path, path: str, value: object, allowed: str
-) -> None:
+def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, value: object, allowed: str) -> None:
     message = fault(tmp_path, changed(path, value))
     # What concerns two keys together is told of the mapping that has both.
     assert message.startswith((path, path.rpartition(".")[0] + " = "))
@@ -120,29 +118,6 @@ def test_a_value_out_of_range_or_of_the_wrong_kind_is_named_with_what_is_allowed
 )
 def test_what_is_no_cell_at_all_ends_in_one_line(tmp_path: Path, text: str | bytes, says: str) -> None:
     assert re.search(says, fault(tmp_path, text))
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "says"),
-    [
-        ("arms.left.model", "iiwa8", "arms.left.model = 'iiwa8': .*robots/iiwa14.urdf, robots/iiwa7.urdf"),
-        ("arms.left.model", "example-robot-data:nobody", "no such robot; allowed: .*panda"),
-        ("arms.left.tool.model", "hand_f", "arms.left.tool.model = 'hand_f'"),
-        ("arms.left.tool.link", "elbow", "no such link; allowed: link_0"),
-        ("arms.left.tool.frame", "tip", "no such link; allowed: .*tool_frame"),
-        ("arms.left.gripper.joints", ["thumb"], "no such finger joint; allowed: finger_joint_1"),
-        ("arms.left.home", [90, 0, 0, 0, 0, 0, 0], r"arms.left.home\[0\] = 90: joint A1 allows -2.96"),
-        ("arms.left.home", [0, 0], "2 value.s., expected 7: A1"),
-        ("arms.left.acceleration_limit", {"A9": 5.0}, r"arms.left.acceleration_limit.A9: no joint .* allowed: A1, A2"),
-    ],
-)
-def test_what_only_the_robot_can_tell_is_named_when_it_is_composed(
-    tmp_path: Path, path: str, value: object, says: str
-) -> None:
-    config = loaded(tmp_path, changed(path, value))
-    with pytest.raises(Q2R2Error, match=says) as caught:
-        Robot.from_config(config)
-    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_the_number_of_further_faults_is_told(tmp_path: Path) -> None:
@@ -176,20 +151,11 @@ def test_a_mapping_may_be_merged_into_another_and_changed_there(tmp_path: Path) 
         ("arms.left.tool", {}, None),
     ],
 )
-def test_the_tool_frame_is_called_by_side_where_the_file_names_it(
+def test_a_tool_frame_that_is_named_is_called_by_side(
     tmp_path: Path, path: str, value: object, frame: str | None
 ) -> None:
     config = loaded(tmp_path, changed(path, value))
     assert config.named_tool_frame("left") == frame
-
-
-@pytest.mark.parametrize(
-    ("key", "tool"), [("tool.link", {"model": "hand_e", "link": "link_7"}), ("tool.frame", {"frame": "link_7"})]
-)
-def test_two_different_links_for_the_end_of_one_arm_are_refused(tmp_path: Path, key: str, tool: dict[str, str]) -> None:
-    arm = {"model": "iiwa7", "home": [0] * 7, "tip": "link_ee", "tool": tool}
-    message = fault(tmp_path, changed("arms.left", arm))
-    assert f"tip = 'link_ee' and {key} = 'link_7' mean the same link: give one" in message
 
 
 def test_networks_that_may_connect_are_read_as_such(tmp_path: Path) -> None:

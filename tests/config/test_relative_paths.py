@@ -55,13 +55,6 @@ class TestRelativePathsAreLookedUp:
         assert (config.model_of("left"), config.srdf) == (model, "pairs.srdf")
         assert Robot.from_config(config).joint_names == ("left_hinge",)
 
-    def test_then_among_what_ships(self, folders: tuple[Path, Path]) -> None:
-        cell, work = folders
-        for folder in (cell, work):
-            (folder / "pairs.srdf").unlink()
-        (cell / "cell.yaml").write_text("name: x\narms: {left: {model: iiwa7, home: [0, 0, 0, 0, 0, 0, 0]}}\n")
-        assert Robot.from_config(load_config(cell / "cell.yaml")).model.nv == 7
-
     def test_of_a_robot_that_arms_share_and_of_tools_too(self, folders: tuple[Path, Path]) -> None:
         cell, _ = folders
         (cell / "cell.yaml").write_text(

@@ -49,7 +49,7 @@ def test_every_file_of_config_and_robots_is_part_of_the_installation() -> None:
     patterns = project["tool"]["setuptools"]["data-files"]
     for folder in ("config", "robots"):
         shipped = {file for pattern in patterns[f"share/q2r2_control/{folder}"] for file in CHECKOUT.glob(pattern)}
-        assert shipped == {file for file in (CHECKOUT / folder).iterdir() if file.is_file()}
+        assert shipped == {file for file in (CHECKOUT / folder).iterdir() if file.suffix in (".yaml", ".urdf", ".srdf")}
 
 
 def test_installed_beside_the_package_they_are_found_without_the_checkout(tmp_path: Path) -> None:

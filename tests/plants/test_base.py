@@ -41,7 +41,7 @@ def any_plant(request: pytest.FixtureRequest, robot: Robot, config: Config, plan
 
 
 @pytest.mark.parametrize(("spoil", "message"), BAD_COMMANDS.values(), ids=BAD_COMMANDS)
-def test_a_bad_command_is_refused_whole_and_the_previous_one_stays_in_force(
+def test_a_bad_command_changes_nothing(
     any_plant: Plant, robot: Robot, spoil: Callable[[Command], Command], message: str
 ) -> None:
     any_plant.apply(hold(robot.home + 0.005, left=0.5))

@@ -29,26 +29,12 @@ def test_it_stands_at_home_with_open_grippers_until_told_otherwise(plant: Kinema
 def test_it_is_exactly_where_the_command_says_at_the_end_of_the_tick(plant: KinematicPlant, robot: Robot) -> None:
     command = replace(hold(robot.home + 0.1), v=np.full(14, 0.3))
     plant.apply(command)
+    command.q[:], command.v[:] = 99, 99  # others may write into their arrays
     np.testing.assert_array_equal(plant.state().q, robot.home)
-    plant.advance(0.001)
-    np.testing.assert_array_equal(plant.state().q, command.q)
-    np.testing.assert_array_equal(plant.state().v, command.v)
-
-
-def test_without_a_newer_command_it_rests_where_it_is(plant: KinematicPlant, robot: Robot) -> None:
-    plant.apply(replace(hold(robot.home + 0.1), v=np.full(14, 0.3)))
-    plant.advance(0.001)
-    plant.advance(0.001)
-    np.testing.assert_array_equal(plant.state().q, robot.home + 0.1)
-    np.testing.assert_array_equal(plant.state().v, 0)
-
-
-def test_changing_the_array_of_a_command_afterwards_changes_nothing(plant: KinematicPlant, robot: Robot) -> None:
-    q = robot.home + 0.1
-    plant.apply(hold(q))
-    q[:] = 99
-    plant.advance(0.001)
-    np.testing.assert_array_equal(plant.state().q, robot.home + 0.1)
+    for v in (0.3, 0.0):
+        plant.advance(0.001)
+        np.testing.assert_array_equal(plant.state().q, robot.home + 0.1)
+        np.testing.assert_array_equal(plant.state().v, v)
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.0037, 0.02])

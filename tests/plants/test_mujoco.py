@@ -46,32 +46,22 @@ def _same(first: RobotState, second: RobotState) -> bool:
 
 
 class TestPositionMode:
-    def test_it_holds_home_against_gravity_at_every_tick_before_any_command(
-        self, plant: MujocoPlant, robot: Robot
-    ) -> None:
+    def test_it_holds_home_against_gravity_before_any_command(self, plant: MujocoPlant, robot: Robot) -> None:
         for _ in range(1000):
+            np.testing.assert_allclose(plant.state().tau, _gravity(robot, robot.home), atol=0.01)
             plant.advance(DT)
             np.testing.assert_allclose(plant.state().q, robot.home, atol=1e-3)
         np.testing.assert_allclose(plant.state().v, 0, atol=1e-6)
 
-    def test_the_torque_at_rest_is_gravitys_from_the_start(self, plant: MujocoPlant, robot: Robot) -> None:
-        np.testing.assert_allclose(plant.state().tau, _gravity(robot, robot.home), atol=0.01)
-        plant.advance(0.5)
-        np.testing.assert_allclose(plant.state().tau, _gravity(robot, robot.home), atol=0.01)
-
     @pytest.mark.parametrize("dt", [0.001, 0.0013, 0.004, 0.01])
-    def test_the_tool_follows_a_motion_of_0_3_metres_a_second_within_a_millimetre_at_every_tick(
-        self, plant: MujocoPlant, robot: Robot, dt: float
-    ) -> None:
+    def test_the_tool_follows_at_0_3_m_s_within_a_millimetre(self, plant: MujocoPlant, robot: Robot, dt: float) -> None:
         for command in tool_motion(robot, "left", np.array([0.2, -0.1, 0.2]), 0.8, dt, robot.home):
             plant.apply(command)
             plant.advance(dt)
             reached, due = (robot.tool_pose(q, "left").translation for q in (plant.state().q, command.q))
             assert np.linalg.norm(reached - due) < 1e-3
 
-    def test_torque_stays_inside_the_limits_at_every_step_of_a_leaping_reference(
-        self, plant: MujocoPlant, robot: Robot
-    ) -> None:
+    def test_torque_stays_inside_the_limits_of_a_leaping_reference(self, plant: MujocoPlant, robot: Robot) -> None:
         rng = np.random.default_rng(3)
         saturated = np.zeros(14, dtype=bool)
         for _ in range(60):
@@ -103,15 +93,7 @@ class TestTorqueMode:
             plant.advance(DT)
         np.testing.assert_allclose(plant.state().q, robot.home, atol=1e-3)
 
-    def test_torque_is_clipped_at_the_limits(self, plant: MujocoPlant, robot: Robot) -> None:
-        plant.apply(_torque_command(np.where(np.arange(14) % 2, 1e9, -1e9)))
-        plant.advance(DT)
-        expected = np.where(np.arange(14) % 2, 1, -1) * robot.torque_limit
-        np.testing.assert_allclose(plant.state().tau, expected)
-
-    def test_changing_to_position_mode_at_the_measured_posture_stops_the_arm_there(
-        self, plant: MujocoPlant, robot: Robot
-    ) -> None:
+    def test_position_mode_at_the_measured_posture_stops_the_arm(self, plant: MujocoPlant, robot: Robot) -> None:
         plant.apply(_torque_command(np.zeros(14)))
         plant.advance(0.05)
         measured = plant.state().q
@@ -141,15 +123,6 @@ class TestPush:
             felt.append(bool(np.abs(_external(plant.state())).max() > 1))
         assert felt == [True, True, True, False, False]
 
-    def test_contact_with_the_table_is_external_torque(self, plant: MujocoPlant, robot: Robot) -> None:
-        for command in tool_motion(robot, "left", np.array([0.0, 0.0, -0.2]), 1.1, DT, robot.home):
-            plant.apply(command)
-            plant.advance(DT)
-        plant.advance(0.3)
-        external = _external(plant.state())
-        assert np.abs(external[:7]).max() > 5
-        np.testing.assert_allclose(external[7:], 0, atol=1e-6)
-
     @pytest.mark.parametrize(
         ("arm", "wrench", "duration"),
         [
@@ -177,10 +150,13 @@ class TestGripper:
         assert plant.gripper_openings()["left"] == pytest.approx(0, abs=0.01)
         assert plant.gripper_openings()["right"] == pytest.approx(1, abs=0.01)
 
-    def test_it_grasps_lifts_and_drops_a_block(self, grasping_plant: MujocoPlant, robot: Robot) -> None:
+    def test_it_grasps_as_configured_lifts_and_drops_a_block(self, grasping_plant: MujocoPlant, robot: Robot) -> None:
         plant = grasping_plant
         plant.apply(hold(robot.home, left=0.0))
-        plant.advance(0.5)
+        for _ in range(500):
+            plant.advance(DT)
+            for joint in ("left_finger_joint_1", "left_finger_joint_2"):
+                assert abs(plant.data.joint(joint).qfrc_actuator[0]) <= 60.0 + 1e-9
         # A block of 40 mm leaves a part of the stroke of 50 mm.
         assert plant.gripper_openings()["left"] == pytest.approx(0.8, abs=0.03)
         resting = _block_height(plant)
@@ -196,14 +172,6 @@ class TestGripper:
         plant.advance(0.8)
         assert _block_height(plant) < resting + 0.01
 
-    def test_the_squeeze_is_no_stronger_than_configured(self, grasping_plant: MujocoPlant, robot: Robot) -> None:
-        plant = grasping_plant
-        plant.apply(hold(robot.home, left=0.0))
-        for _ in range(500):
-            plant.advance(DT)
-            for joint in ("left_finger_joint_1", "left_finger_joint_2"):
-                assert abs(plant.data.joint(joint).qfrc_actuator[0]) <= 60.0 + 1e-9
-
 
 class TestTime:
     @pytest.mark.parametrize("dt", [0.0001, 0.00037, 0.001, 0.0013, 1 / 60, 1 / 72])
@@ -212,15 +180,11 @@ class TestTime:
             plant.advance(dt)
             assert -1e-8 < tick * dt - plant.state().stamp < DT
 
-    def test_a_time_of_zero_changes_nothing(self, plant: MujocoPlant, robot: Robot) -> None:
-        plant.apply(hold(robot.home + 0.1))
-        before = plant.state()
-        plant.advance(0.0)
-        assert _same(plant.state(), before)
-
     @pytest.mark.parametrize("dt", [float("nan"), float("inf"), -DT, 3600.0])
-    def test_an_impossible_time_is_refused_and_nothing_moves(self, plant: MujocoPlant, dt: float) -> None:
+    def test_no_time_or_an_impossible_one_moves_nothing(self, plant: MujocoPlant, robot: Robot, dt: float) -> None:
         before = plant.state()
+        plant.apply(hold(robot.home + 0.1))
+        plant.advance(0.0)
         with pytest.raises(PlantError, match=r"allowed: 0 \.\. 1 s"):
             plant.advance(dt)
         assert _same(plant.state(), before)
@@ -239,7 +203,7 @@ class TestRepeatability:
             states.append(plant.state())
         return states
 
-    def test_a_second_run_after_reset_and_one_in_a_new_plant_are_equal_to_the_bit(
+    def test_runs_after_reset_and_in_a_new_plant_are_equal(
         self, plant: MujocoPlant, robot: Robot, config: Config
     ) -> None:
         first = self._run(plant, robot)
@@ -249,9 +213,7 @@ class TestRepeatability:
         assert all(map(_same, first, again))
         assert all(map(_same, first, elsewhere))
 
-    def test_reset_restores_posture_blocks_grippers_clock_and_ends_pushes(
-        self, plant: MujocoPlant, robot: Robot, config: Config
-    ) -> None:
+    def test_reset_restores_all_and_ends_pushes(self, plant: MujocoPlant, robot: Robot, config: Config) -> None:
         plant.apply(_torque_command(np.zeros(14)))
         plant.push("left", np.array([50.0, 0, 0, 0, 0, 0]), 10.0)
         plant.advance(0.7)
@@ -276,9 +238,7 @@ def test_a_state_that_was_handed_out_does_not_change_later(plant: MujocoPlant, r
     np.testing.assert_array_equal(state.q, robot.home)
 
 
-def test_a_block_that_has_lain_still_for_long_moves_when_an_arm_runs_into_it(
-    grasping_plant: MujocoPlant, robot: Robot
-) -> None:
+def test_a_block_that_has_lain_still_moves_when_an_arm_pushes_it(grasping_plant: MujocoPlant, robot: Robot) -> None:
     plant = grasping_plant
     plant.advance(1.0)
     before = float(plant.data.body("block").xpos[1])
@@ -288,9 +248,7 @@ def test_a_block_that_has_lain_still_for_long_moves_when_an_arm_runs_into_it(
     assert float(plant.data.body("block").xpos[1]) > before + 0.02
 
 
-def test_a_diverged_simulation_is_an_error_until_reset_and_never_a_silent_jump(
-    plant: MujocoPlant, robot: Robot
-) -> None:
+def test_a_diverged_simulation_is_an_error_until_reset(plant: MujocoPlant, robot: Robot) -> None:
     plant.data.qvel[3] = np.nan
     with pytest.raises(PlantError, match="diverged"):
         plant.advance(DT)

@@ -27,9 +27,7 @@ def push(cell: SimulatedCell, now: float) -> None:
 
 
 @pytest.mark.parametrize("late", [0.02, 0.05, 0.09])
-def test_a_torque_that_is_not_renewed_acts_for_some_milliseconds_while_its_sender_is_waited_for(
-    cell: SimulatedCell, late: float
-) -> None:
+def test_a_torque_that_is_not_renewed_acts_for_some_milliseconds(cell: SimulatedCell, late: float) -> None:
     cell.advance(0.0)
     push(cell, 0.0)
     for now in np.arange(0.004, late, 0.004):

@@ -16,7 +16,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.compose import ComposedCell, compose
 from tests.robot.conftest import one_arm
 
-HAND = {"model": "hand_e", "frame": "tool_frame"}
+HAND, TOUCH = {"model": "hand_e", "frame": "tool_frame"}, "media_flange_touch_pneumatic"
 FINGERS = {"joints": ["finger_joint_1", "finger_joint_2"], "open_position": 0.025}
 
 
@@ -29,41 +29,22 @@ def test_the_cell_names_its_parts_by_side(dual_iiwa7_cell: ComposedCell) -> None
     assert cell.obstacles == ("table",)
 
 
-def test_every_name_in_the_urdf_is_unique_of_its_kind(dual_iiwa7_cell: ComposedCell) -> None:
-    root = ET.fromstring(dual_iiwa7_cell.urdf)
+def test_every_name_is_unique_of_its_kind_even_of_shapes_that_share_one(tmp_path: Path) -> None:
+    text = find_resource("robots/iiwa7.urdf").read_text()
+    file = tmp_path / "arm.urdf"
+    file.write_text(re.sub(r'<(visual|collision) name="[^"]*"', r'<\1 name="shape"', text))
+    root = ET.fromstring(compose(one_arm(model=str(file), tool=HAND)).urdf)
     for path in ("link", "joint", "link/visual", "link/collision", "material"):
         names = [element.get("name") for element in root.findall(path)]
         assert None not in names
         assert len(names) == len(set(names)) > 0, path
 
 
-def test_shapes_that_share_a_name_are_told_apart(tmp_path: Path) -> None:
-    text = find_resource("robots/iiwa7.urdf").read_text()
-    file = tmp_path / "arm.urdf"
-    file.write_text(re.sub(r'<(visual|collision) name="[^"]*"', r'<\1 name="shape"', text))
-    root = ET.fromstring(compose(one_arm(model=str(file))).urdf)
-    for path in ("link/visual", "link/collision"):
-        names = [element.get("name") for element in root.findall(path)]
-        assert len(names) == len(set(names)) > 0
-
-
 def test_mounts_and_obstacles_stand_where_the_config_puts_them() -> None:
-    cell = compose(
-        Config.model_validate(
-            {
-                "name": "cell",
-                "arms": {
-                    "left": {
-                        "model": "iiwa7",
-                        "mount": {"position": [1, 2, 3], "rpy": [0, math.pi, 0]},
-                        "tool": HAND | {"mount": {"position": [0, 0, 0.1]}},
-                        "home": [0] * 7,
-                    }
-                },
-                "obstacles": {"post": {"shape": "cylinder", "size": [0.1, 2], "position": [4, 5, 6]}},
-            }
-        )
-    )
+    mount, tool = {"position": [1, 2, 3], "rpy": [0, math.pi, 0]}, HAND | {"mount": {"position": [0, 0, 0.1]}}
+    post = {"shape": "cylinder", "size": [0.1, 2], "position": [4, 5, 6]}
+    data = one_arm(mount=mount, tool=tool).model_dump() | {"obstacles": {"post": post}}
+    cell = compose(Config.model_validate(data))
     model = pin.buildModelFromXML(cell.urdf)
     data = model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))
@@ -72,30 +53,15 @@ def test_mounts_and_obstacles_stand_where_the_config_puts_them() -> None:
     np.testing.assert_allclose(data.oMf[model.getFrameId("post", pin.FrameType.BODY)].translation, [4, 5, 6])
 
 
-@pytest.mark.parametrize(
-    ("arm", "frame"),
-    [
-        pytest.param({"model": "iiwa7"}, "left_link_ee", id="of a bare arm its last link"),
-        pytest.param({"model": "example-robot-data:panda", "home": [0, 0, 0, -1, 0, 1, 0]}, "left_panda_hand_tcp",
-                     id="of an arm with fingers the link before they branch"),
-    ],
-)  # fmt: skip
-def test_the_tool_frame_is_by_default(arm: dict[str, Any], frame: str) -> None:
-    assert compose(one_arm(**arm)).tool_frames == {"left": frame}
-
-
-def test_joints_that_nobody_drives_are_fixed_as_near_zero_as_they_can() -> None:
-    cell = compose(one_arm(model="example-robot-data:panda", home=[0, 0, 0, -1, 0, 1, 0]))
-    assert cell.parts.finger_joints == {"left": ()}
+def test_joints_that_nobody_drives_are_fixed_and_a_finger_that_mimics_a_driven_one_moves_with_it() -> None:
+    panda = {"model": "example-robot-data:panda", "home": [0, 0, 0, -1, 0, 1, 0]}
+    cell = compose(one_arm(**panda))
+    assert cell.tool_frames == {"left": "left_panda_hand_tcp"}
     arm = [f"left_panda_joint{number}" for number in range(1, 8)]
     assert list(cell.home) == list(pin.buildModelFromXML(cell.urdf).names)[1:] == arm
-
-
-def test_a_finger_that_mimics_a_driven_one_moves_with_it() -> None:
-    gripper = {"joints": ["panda_finger_joint1"], "open_position": 0.04}
-    cell = compose(one_arm(model="example-robot-data:panda", home=[0, 0, 0, -1, 0, 1, 0], gripper=gripper))
-    assert cell.parts.finger_joints == {"left": ("left_panda_finger_joint1",)}
-    assert cell.home["left_panda_finger_joint2"] == 0.04
+    moved = compose(one_arm(**panda, gripper={"joints": ["panda_finger_joint1"], "open_position": 0.04}))
+    assert moved.parts.finger_joints == {"left": ("left_panda_finger_joint1",)}
+    assert moved.home["left_panda_finger_joint2"] == 0.04
 
 
 def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the_flange() -> None:
@@ -111,6 +77,10 @@ def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the
     [
         pytest.param({"model": "iiwa9"}, "arms.left.model = 'iiwa9': robots/iiwa9.urdf: no such file", id="no model"),
         pytest.param({"tool": HAND | {"frame": "tcp"}}, "arms.left.tool.frame = 'tcp'", id="no such tool frame"),
+        pytest.param({"tool": HAND | {"link": "elbow"}}, "no such link; allowed: link_0", id="no such carrier"),
+        pytest.param({"flange": {"model": "touch"}}, "flange.model = 'touch': robots/touch.urdf: no such", id="flange"),
+        pytest.param({"flange": {"model": TOUCH, "frame": "tip"}}, "no such link; allowed: media", id="its frame"),
+        pytest.param({"flange": {"model": "iiwa7"}}, "occur in the arm as well", id="a flange with the arm's names"),
         pytest.param({"tool": {"frame": "link_0"}}, "no movable joint", id="a tool frame that nothing moves"),
         pytest.param({"tool": {"model": "iiwa7"}}, "occur in the arm as well", id="a tool with the arm's names"),
         pytest.param({"home": [0] * 6}, "6 value(s), expected 7: A1, A2, A3", id="too few home values"),
@@ -135,15 +105,9 @@ def test_a_bad_arm_ends_in_one_line_that_names_key_value_and_what_is_allowed(arm
     "name", ["world", "universe", "left_post", "right_", "", "two words", 'a"><link name="b', "ä", "1st", "a\n"]
 )
 def test_obstacle_names_that_clash_or_break_out_are_refused(name: str) -> None:
-    config = Config.model_validate(
-        {
-            "name": "cell",
-            "arms": {"left": {"model": "iiwa7", "home": [0] * 7}},
-            "obstacles": {name: {"shape": "sphere", "size": [0.1]}},
-        }
-    )
+    data = one_arm().model_dump() | {"obstacles": {name: {"shape": "sphere", "size": [0.1]}}}
     with pytest.raises(ConfigError, match=r"obstacles\..*allowed: letters") as error:
-        compose(config)
+        compose(Config.model_validate(data))
     assert "\n" not in str(error.value)
 
 

@@ -21,48 +21,31 @@ GOOD = """<robot name="two">
   </joint>
 </robot>"""
 
+ENDS = '<parent link="base"/><child link="tip"/>'
+
 
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        pytest.param(GOOD, "", "not XML", id="nothing at all"),
-        pytest.param(GOOD, "<sdf/>", "<sdf>", id="another format"),
-        pytest.param("</robot>", "", "not XML", id="cut off"),
-        pytest.param('radius="0.1"', 'radius="nan"', "radius = 'nan'", id="not a number"),
-        pytest.param('radius="0.1"', 'radius="0,1"', "radius = '0,1'", id="a comma for the decimal point"),
-        pytest.param('radius="0.1"', 'radius="1_0"', "radius = '1_0'", id="a number to Python only"),
-        pytest.param('radius="0.1"', 'radius="-0.1"', "more than 0", id="a negative radius"),
-        pytest.param('xyz="0 0 1"', 'xyz="0 1"', "3 finite number", id="a vector of two"),
-        pytest.param('xyz="0 0 1"', 'xyz="0 0 0"', "axis", id="an axis without direction"),
-        pytest.param('value="1"', 'value="-1"', "0 or more", id="a negative mass"),
-        pytest.param(
-            "<axis", '<mimic joint="turn" multiplier="twice"/><axis', "multiplier = 'twice'", id="a mimic of no number"
-        ),
-        pytest.param("<sphere", "<ball", "ball", id="a collision shape that no reader knows"),
-        pytest.param('<sphere radius="0.1"/>', "", "shapes []", id="a collision without shape"),
-        pytest.param('link="tip"', 'link="top"', "no child link", id="a child that does not exist"),
-        pytest.param('link="base"', 'link="tip"', "loop", id="a link that hangs on itself"),
-        pytest.param('name="tip"', 'name="base"', "given twice", id="two links of one name"),
-        pytest.param('type="revolute"', 'type="hinge"', "'hinge'", id="a joint type that does not exist"),
-        pytest.param("</robot>", '<link name="loose"/></robot>', "one root link", id="a link that hangs on nothing"),
-        pytest.param(
-            "</robot>",
-            '<joint name="again" type="fixed"><parent link="base"/><child link="tip"/></joint></robot>',
-            "hangs on two joints",
-            id="a link with two parents",
-        ),
-        pytest.param(
-            '<sphere radius="0.1"/>',
-            '<mesh filename="package://nowhere/a.stl"/>',
-            "package://nowhere",
-            id="a lost mesh",
-        ),
-        pytest.param(
-            "<robot name",
-            '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]><robot x="&c;" name',
-            "not XML",
-            id="entities that are not declared",
-        ),
+        (GOOD, "", "not XML"),
+        (GOOD, "<sdf/>", "<sdf>"),
+        ('radius="0.1"', 'radius="nan"', "radius = 'nan'"),
+        ('radius="0.1"', 'radius="1_0"', "radius = '1_0'"),  # a number to Python only
+        ('radius="0.1"', 'radius="-0.1"', "more than 0"),
+        ('xyz="0 0 1"', 'xyz="0 1"', "3 finite number"),
+        ('xyz="0 0 1"', 'xyz="0 0 0"', "axis"),
+        ('value="1"', 'value="-1"', "0 or more"),
+        ("<axis", '<mimic joint="turn" multiplier="twice"/><axis', "multiplier = 'twice'"),
+        ("<sphere", "<ball", "ball"),
+        ('<sphere radius="0.1"/>', "", "shapes []"),
+        ('link="tip"', 'link="top"', "no child link"),
+        ('link="base"', 'link="tip"', "loop"),
+        ('name="tip"', 'name="base"', "given twice"),
+        ('type="revolute"', 'type="hinge"', "'hinge'"),
+        ("</robot>", '<link name="loose"/></robot>', "one root link"),
+        ("</robot>", f'<joint name="again" type="fixed">{ENDS}</joint></robot>', "hangs on two joints"),
+        ('<sphere radius="0.1"/>', '<mesh filename="package://nowhere/a.stl"/>', "package://nowhere"),
+        ("<robot name", '<!DOCTYPE r [<!ENTITY a "aa">]><robot x="&c;" name', "not XML"),
     ],
 )
 def test_a_description_that_cannot_be_trusted_is_refused_in_one_line(old: str, new: str, complaint: str) -> None:
@@ -92,13 +75,11 @@ def test_a_joint_without_end_gets_two_turns_each_way() -> None:
 @pytest.mark.parametrize(
     ("model", "complaint"),
     [
-        pytest.param("iiwa9", "robots/iiwa7.urdf", id="a name that robots/ does not have lists those it has"),
-        pytest.param("no/such.urdf", "no such file", id="a path to nothing"),
-        pytest.param("example-robot-data:pandda", "panda", id="an unknown example robot lists the known ones"),
-        pytest.param("example-robot-data:cassie", "no URDF", id="an example robot that is no URDF"),
-        pytest.param("package://lbr/urdf/iiwa7.urdf", "AMENT_PREFIX_PATH", id="a ROS package that is not there"),
-        pytest.param("iiwa7.urdf.xacro", "no such file", id="a xacro file that is not there"),
-        pytest.param("../../../etc/passwd", "no such file", id="a path out of robots/"),
+        ("iiwa9", "robots/iiwa7.urdf"),
+        ("no/such.urdf", "no such file"),
+        ("example-robot-data:pandda", "panda"),
+        ("example-robot-data:cassie", "no URDF"),
+        ("package://lbr/urdf/iiwa7.urdf", "AMENT_PREFIX_PATH"),
     ],
 )
 def test_a_model_that_is_not_there_says_what_is(model: str, complaint: str) -> None:
@@ -106,9 +87,7 @@ def test_a_model_that_is_not_there_says_what_is(model: str, complaint: str) -> N
         load_description(model)
 
 
-def test_a_model_of_a_ros_package_and_its_meshes_are_found_through_the_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_of_a_ros_package_and_its_meshes_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     share = tmp_path / "share" / "my_arm"
     share.mkdir(parents=True)
     mesh = share / "tip.stl"

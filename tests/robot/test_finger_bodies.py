@@ -71,14 +71,9 @@ def test_the_body_holds_the_finger_wherever_it_is(shape: str) -> None:
     for position in np.linspace(-0.01, 0.04, 11):
         for point in points:
             assert beyond(finger_at(position).act(point), body) <= 1e-9, position
-
-
-@pytest.mark.parametrize("shape", ["sphere", "capsule along"])
-def test_the_body_is_no_thicker_and_no_longer_than_the_way(shape: str) -> None:
-    (body,) = bodies(robot_with(shape), "finger")
-    assert isinstance(body.geometry, coal.Capsule)
-    assert body.geometry.radius == pytest.approx(0.01)
-    assert 2 * body.geometry.halfLength == pytest.approx(0.05 + (0.02 if shape == "capsule along" else 0.0))
+    if shape in ("sphere", "capsule along"):
+        assert body.geometry.radius == pytest.approx(0.01)
+        assert 2 * body.geometry.halfLength == pytest.approx(0.05 if shape == "sphere" else 0.07)
 
 
 def test_a_finger_that_turns_is_all_that_it_sweeps_too_and_one_that_does_neither_stays_as_it_is() -> None:

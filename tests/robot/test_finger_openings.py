@@ -79,9 +79,7 @@ def test_the_hand_e_holds_both_fingers_at_each_opening_of_the_interval() -> None
 
 
 @pytest.mark.parametrize("positions", [(0.03, 0.0), (0.0, 0.03)], ids=["opens outwards", "opens inwards"])
-def test_fingers_on_lines_of_their_own_are_their_own_way_in_the_interval(
-    positions: tuple[float, float], tmp_path: object
-) -> None:
+def test_fingers_on_two_lines_are_their_own_way(positions: tuple[float, float], tmp_path: object) -> None:
     robot = cell(hand(), ("slide", "other"), str(tmp_path), positions)
     assert {body.name for body in robot.finger_bodies if body.arm == "left"} == {"left_one_0", "left_two_0"}
     opened, closed = positions

@@ -35,14 +35,19 @@ def watched(robot: Robot) -> set[frozenset[str]]:
     return {frozenset(map(link_of, pair)) for pair in pair_names(robot.collision_model)}
 
 
-@pytest.mark.parametrize(("flange", "thickness"), [(TOUCH, 0.026), (CYLINDER, 0.03)], ids=["a model", "sizes"])
+@pytest.mark.parametrize(
+    ("flange", "thickness", "mass"),
+    [(TOUCH, 0.026, 0.13), (CYLINDER, 0.03, 0.4), (CYLINDER | {"mass": 0.0}, 0.03, 0.0)],
+    ids=["a model", "sizes", "sizes without mass"],
+)
 @pytest.mark.parametrize("tool", [HAND, {}], ids=["with a hand", "bare"])
-def test_the_tool_is_moved_outwards_by_the_thickness_and_not_turned(
-    flange: dict[str, Any], thickness: float, tool: dict[str, Any]
+def test_the_tool_is_moved_outwards_by_the_thickness_and_the_arm_carries_the_mass(
+    flange: dict[str, Any], thickness: float, mass: float, tool: dict[str, Any]
 ) -> None:
     plain, moved = (Robot.from_config(one_arm(tool=tool, flange=given)) for given in ({}, flange))
     expected = plain.tool_pose(POSTURE, "left") * pin.SE3(np.eye(3), np.array([0.0, 0.0, thickness]))
     np.testing.assert_allclose(moved.tool_pose(POSTURE, "left").homogeneous, expected.homogeneous, atol=1e-12)
+    assert moved.model.inertias[7].mass - plain.model.inertias[7].mass == pytest.approx(mass)
 
 
 def test_the_body_of_each_flange_is_watched_against_all_that_its_arm_can_meet() -> None:
@@ -72,12 +77,6 @@ def test_the_sphere_of_the_touch_flange_encloses_its_drawing_and_what_link_7_doe
     assert link_7 == pytest.approx(0.019, abs=5e-4)
 
 
-@pytest.mark.parametrize(("flange", "mass"), [(TOUCH, 0.13), (CYLINDER, 0.4), ({**CYLINDER, "mass": 0.0}, 0.0)])
-def test_the_arm_carries_the_flange_s_mass(flange: dict[str, Any], mass: float) -> None:
-    plain, heavier = (Robot.from_config(one_arm(flange=given)).model for given in ({}, flange))
-    assert heavier.inertias[7].mass - plain.inertias[7].mass == pytest.approx(mass)
-
-
 def test_pairs_known_of_tool_and_arm_are_not_believed_with_a_flange_between_them_that_no_file_knows() -> None:
     far = '"left_link_4" link2="left_hand_e_envelope"'
     assert far in compose(one_arm(tool=HAND)).srdf
@@ -100,25 +99,3 @@ def test_a_flange_of_one_s_own_is_a_urdf_whose_last_link_or_frame_carries_the_to
     plain = Robot.from_config(one_arm(tool=HAND))
     way = plain.tool_pose(POSTURE, "left").actInv(robot.tool_pose(POSTURE, "left"))
     np.testing.assert_allclose(way.translation, [0.0, 0.0, 0.04], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("arm", "line"),
-    [
-        pytest.param(
-            {"flange": {"model": "media_touch"}},
-            "arms.left.flange.model = 'media_touch': robots/media_touch.urdf: no such file here, nor among the shipped",
-            id="an unknown name",
-        ),
-        pytest.param(
-            {"flange": TOUCH | {"frame": "tip"}}, "no such link; allowed: media_flange", id="an unknown frame"
-        ),
-        pytest.param({"flange": {"model": "iiwa7"}}, "occur in the arm as well", id="a flange with the arm's names"),
-    ],
-)
-def test_a_bad_flange_ends_in_one_line_that_names_key_value_and_what_is_allowed(arm: dict[str, Any], line: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        compose(one_arm(**arm))
-    assert line in str(error.value)
-    assert "arms.left.flange" in str(error.value)
-    assert "\n" not in str(error.value)

@@ -12,7 +12,6 @@ import pytest
 
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import load_description
-from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.robot.conftest import one_arm
@@ -150,35 +149,3 @@ def test_capsule_runs_between_the_ends_that_enclose_the_mesh(
     np.testing.assert_allclose(in_link.act(-half), start, atol=1e-6)
     np.testing.assert_allclose(in_link.act(half), end, atol=1e-6)
     assert radius < item.geometry.radius < radius + 0.0015
-
-
-def test_links_that_no_pair_watches_never_meet(name: str) -> None:
-    """Every pair that the SRDF calls Never stays 50 mm apart in random and in extreme postures, with a Hand-E."""
-    robot = Robot.from_config(one_arm(model=name, tool={"model": "hand_e", "frame": "tool_frame"}))
-    geometry = robot.collision_model
-    watched = {frozenset(map(link_of, names)) for names in pair_names(geometry)}
-    geometry = geometry.copy()
-    geometry.removeAllCollisionPairs()
-    items = [
-        (index, item)
-        for index, item in enumerate(geometry.geometryObjects)
-        if item.name != "floor_0" and ("hand_e" not in item.name or "envelope" in item.name)
-    ]
-    for number, (first, a) in enumerate(items):
-        for second, b in items[:number]:
-            apart = abs(a.parentJoint - b.parentJoint) > 1  # neighbours and one body touch by construction
-            if apart and frozenset((link_of(a.name), link_of(b.name))) not in watched:
-                geometry.addCollisionPair(pin.CollisionPair(second, first))
-    overlapping = {("left_link_5_0", "left_link_7_0")}
-    assert len(pair_names(geometry)) > 12
-
-    data, geometry_data = robot.model.createData(), geometry.createData()
-    random = np.random.default_rng(0)
-    for tick in range(1500):
-        q = random.uniform(robot.position_lower, robot.position_upper)
-        if tick % 2:
-            extreme = np.where(random.random(7) < 0.5, robot.position_lower, robot.position_upper)
-            q = np.where(random.random(7) < 0.6, extreme, q)
-        pin.computeDistances(robot.model, data, geometry, geometry_data, q)
-        for names, result in zip(pair_names(geometry), geometry_data.distanceResults, strict=True):
-            assert names in overlapping or result.min_distance > 0.05, (names, q)

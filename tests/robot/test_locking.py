@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.robot.description import load_description
-from q2r2_control.robot.locking import lock_joints, resting_position
+from q2r2_control.robot.pinocchio_models import lock_joints, resting_position
 
 
 @pytest.mark.parametrize("model", ["iiwa7", "example-robot-data:tiago_dual", "example-robot-data:talos"])

@@ -79,9 +79,7 @@ def test_arguments_have_the_defaults_of_the_file_and_an_srdf_beside_it_belongs_t
         ("hinge.xacro", 'lower="-1"', 'lower="${reach}m"', "<limit> has lower = '0.30000000000000004m'"),
     ],
 )
-def test_what_xacro_cannot_expand_ends_in_one_line_that_names_the_file(
-    package: Path, file: str, old: str, new: str, says: str
-) -> None:
+def test_what_xacro_cannot_expand_is_named_in_one_line(package: Path, file: str, old: str, new: str, says: str) -> None:
     broken = package / "urdf" / file
     broken.write_text(broken.read_text().replace(old, new, 1))
     with pytest.raises(Q2R2Error) as error:

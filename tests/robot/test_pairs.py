@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -11,12 +10,11 @@ import pytest
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.errors import ConfigError
 from q2r2_control.robot.compose import compose
-from q2r2_control.robot.model_srdf import model_srdfs
 from q2r2_control.robot.pairs import CLEARANCE, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from tests.robot.conftest import one_arm
+from tests.support.modules import load_script
 
 FINGERS = "hand_e_finger_1_envelope"  # of both: they lie on the same lines
 MOVING = [*(f"link_{index}" for index in range(1, 8)), "hand_e_envelope", FINGERS]
@@ -26,18 +24,17 @@ def _links(robot: Robot) -> set[frozenset[str]]:
     return {frozenset(map(link_of, names)) for names in pair_names(robot.collision_model)}
 
 
-def test_every_moving_link_is_watched_against_every_link_of_the_other_arm_and_its_base(dual_iiwa: Robot) -> None:
+def test_every_moving_link_and_no_bare_hand_is_watched_against_the_other_arm_and_the_table(dual_iiwa: Robot) -> None:
     watched = _links(dual_iiwa)
     for one, other in (("left", "right"), ("right", "left")):
         for a in MOVING:
             for b in ["link_0", *MOVING]:
                 assert frozenset((f"{one}_{a}", f"{other}_{b}")) in watched
-
-
-def test_every_moving_link_is_watched_against_the_table(dual_iiwa: Robot) -> None:
-    for side in ("left", "right"):
-        for link in MOVING:
-            assert frozenset((f"{side}_{link}", "table")) in _links(dual_iiwa)
+            assert frozenset((f"{one}_{a}", "table")) in watched
+    for fixed in ("table", "right_link_0"):
+        assert frozenset(("left_link_0", fixed)) not in watched, "neither can move"
+    hands = {link for pair in watched for link in pair if "hand_e" in link}
+    assert hands == {f"{side}_{link}" for side in ("left", "right") for link in ("hand_e_envelope", FINGERS)}
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -56,9 +53,7 @@ def test_own_links_that_can_meet_are_watched_and_no_others(dual_iiwa: Robot, sid
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_the_floor_is_watched_against_the_links_that_can_come_near_it_and_no_others(
-    dual_iiwa: Robot, side: str
-) -> None:
+def test_the_floor_is_watched_against_the_links_that_can_come_near_it(dual_iiwa: Robot, side: str) -> None:
     """Link 1 turns about the vertical alone, and link 2 is too short."""
     reach_it = {f"{side}_link_{index}" for index in range(3, 8)} | {f"{side}_hand_e_envelope", f"{side}_{FINGERS}"}
     with_floor = {link for pair in _links(dual_iiwa) if "floor" in pair for link in pair if link.startswith(side)}
@@ -69,9 +64,7 @@ def test_the_floor_is_watched_against_the_links_that_can_come_near_it_and_no_oth
 @pytest.mark.parametrize(
     "rpy", [(0.0, 0.0, 0.7), (0.0, 0.5, 0.0), (3.1416, 0.0, 0.0)], ids=["upright", "tilted", "hung"]
 )
-def test_a_link_that_is_not_watched_against_the_floor_cannot_come_within_50_mm_or_never_moves_towards_it(
-    rpy: tuple[float, ...], height: float
-) -> None:
+def test_links_that_are_not_watched_against_the_floor_stay_away(rpy: tuple[float, ...], height: float) -> None:
     mount = {"position": (0.0, 0.0, 0.0), "rpy": rpy}
     robot = Robot.from_config(one_arm(mount=mount).model_copy(update={"floor": height}))
     geometry = robot.collision_model.copy()
@@ -97,25 +90,6 @@ def test_a_link_named_floor_that_is_no_level_surface_is_a_link_like_any_other() 
     assert frozenset(("left_link_1", "floor")) in _links(robot)
 
 
-@pytest.mark.parametrize(
-    ("a", "b"),
-    [
-        ("left_link_0", "right_link_0"),
-        ("left_link_0", "table"),
-        ("left_link_1", "left_link_0"),
-        ("left_link_7", "left_hand_e_envelope"),
-        ("left_link_6", "left_hand_e_envelope"),
-    ],
-)
-def test_pairs_that_cannot_move_or_are_neighbours_are_not_watched(dual_iiwa: Robot, a: str, b: str) -> None:
-    assert frozenset((a, b)) not in _links(dual_iiwa)
-
-
-def test_neither_bare_fingers_nor_the_bare_hand_are_watched_because_their_envelopes_are(dual_iiwa: Robot) -> None:
-    hands = {link for pair in _links(dual_iiwa) for link in pair if "hand_e" in link}
-    assert hands == {f"{side}_{link}" for side in ("left", "right") for link in ("hand_e_envelope", FINGERS)}
-
-
 @pytest.mark.parametrize("cell", ["dual_iiwa7", "dual_panda"])
 def test_nothing_overlaps_at_home_and_nothing_had_to_be_ignored(cell: str, request: pytest.FixtureRequest) -> None:
     robot: Robot = request.getfixturevalue(cell)
@@ -124,6 +98,7 @@ def test_nothing_overlaps_at_home_and_nothing_had_to_be_ignored(cell: str, reque
 
 
 SAMPLES = 2000
+model_srdfs = load_script("robots/make_srdf.py").model_srdfs
 TOUCH, HAND = "media_flange_touch_pneumatic", {"model": "hand_e"}
 
 
@@ -132,32 +107,11 @@ def _disabled(text: str) -> set[tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
-def test_every_shipped_file_lists_what_the_program_finds(arm: str) -> None:
-    made = model_srdfs(load_config(f"config/dual_{arm}.yaml"), CLEARANCE, SAMPLES)
-    assert made.keys() == {f"{arm}.srdf", "hand_e.srdf", f"hand_e_on_{arm}.srdf"}
-    for name, text in made.items():
-        assert _disabled(text) == _disabled(find_resource(f"robots/{name}").read_text(encoding="utf-8"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
-def test_every_shipped_file_about_a_flange_lists_what_the_program_finds(arm: str) -> None:
+@pytest.mark.parametrize("flange", [None, pytest.param(TOUCH, marks=pytest.mark.slow)])
+def test_every_shipped_file_lists_what_the_program_finds(arm: str, flange: str | None) -> None:
     gripper = load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()  # whose fingers are one body
-    cell = one_arm(model=arm, flange={"model": TOUCH}, tool=HAND, gripper=gripper)
-    made = model_srdfs(cell, CLEARANCE, SAMPLES)
-    assert made.keys() == {f"{arm}.srdf", f"{TOUCH}_on_{arm}.srdf", f"hand_e_on_{TOUCH}_on_{arm}.srdf", "hand_e.srdf"}
+    made = model_srdfs(one_arm(model=arm, flange={"model": flange}, tool=HAND, gripper=gripper), SAMPLES)
+    on = f"{TOUCH}_on_{arm}" if flange else arm
+    assert made.keys() == {f"{arm}.srdf", "hand_e.srdf", f"{on}.srdf", f"hand_e_on_{on}.srdf"}
     for name, text in made.items():
         assert _disabled(text) == _disabled(find_resource(f"robots/{name}").read_text(encoding="utf-8"))
-
-
-def test_of_a_flange_without_a_model_no_file_can_speak() -> None:
-    with pytest.raises(ConfigError, match=r"arms\.left\.flange: has no model that a file could speak of; --pairs"):
-        model_srdfs(one_arm(flange={"thickness": 0.02, "radius": 0.05}), CLEARANCE, SAMPLES)
-
-
-def test_what_a_file_beside_the_model_says_now_is_not_believed(tmp_path: Path) -> None:
-    (tmp_path / "arm.urdf").write_bytes(find_resource("robots/iiwa7.urdf").read_bytes())
-    (tmp_path / "arm.srdf").write_text('<robot><disable_default_collisions link="link_0"/></robot>')
-    made = model_srdfs(one_arm(model=str(tmp_path / "arm.urdf")), CLEARANCE, SAMPLES)
-    assert made.keys() == {"arm.srdf"}
-    assert _disabled(made["arm.srdf"]) == _disabled(find_resource("robots/iiwa7.srdf").read_text(encoding="utf-8"))

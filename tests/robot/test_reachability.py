@@ -32,26 +32,15 @@ def test_what_is_written_leaves_only_pairs_unwatched_that_no_posture_brings_near
     never = {frozenset((pair.link_a, pair.link_b)) for pair in found.never}
     monitored = {frozenset((link_of(pair.name_a), link_of(pair.name_b))) for pair in pruned.distances(pruned.home)}
     assert not never & monitored
+    assert {
+        frozenset(("left_link_4", f"right_{other}")) for other in ("link_3", "link_7", "hand_e_envelope")
+    } <= monitored
     random = np.random.default_rng(99)
     for _ in range(500):
         q = random.uniform(robot.position_lower, robot.position_upper)
         for pair in robot.distances(q):
             if frozenset((link_of(pair.name_a), link_of(pair.name_b))) in never:
                 assert pair.distance > 0.05
-
-
-def test_the_elbow_of_one_arm_stays_watched_against_the_other_arm(found: PairsWritten) -> None:
-    watched = {frozenset((pair.link_a, pair.link_b)) for pair in found.watched}
-    for other in ("link_3", "link_4", "link_5", "link_6", "link_7", "hand_e_envelope"):
-        assert frozenset(("left_link_4", f"right_{other}")) in watched
-
-
-def test_a_file_that_exists_is_not_replaced(tmp_path: Path) -> None:
-    file = tmp_path / "cell.srdf"
-    file.write_text("mine")
-    with pytest.raises(ConfigError, match="exists; give the name of a new file"):
-        write_pairs(CONFIG, file, 200, 0.05)
-    assert file.read_text() == "mine"
 
 
 @pytest.mark.parametrize("clearance", [0.0, 0.02, -1.0, 2.0, float("nan")])
@@ -63,12 +52,9 @@ def test_a_clearance_that_is_no_more_than_what_is_kept_is_refused(tmp_path: Path
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        pytest.param(
-            '<robot><disable_collisions link1="left_link_1" link2="elbow"/></robot>', "no link 'elbow'", id="link"
-        ),
-        pytest.param("<robot>", "cannot be read", id="no XML"),
+        ('<robot><disable_collisions link1="table" link2="elbow"/></robot>', "no link 'elbow'"),
+        ("<robot>", "cannot be read"),
     ],
-    ids=["a link of another cell", "no XML"],
 )
 def test_a_cells_srdf_that_does_not_fit_it_is_refused(tmp_path: Path, text: str, fault: str) -> None:
     file = tmp_path / "cell.srdf"

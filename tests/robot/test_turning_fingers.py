@@ -27,6 +27,7 @@ from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 from tests.support.turning_hand import RealHands, turning_cell
 
 OPENINGS = 200
+Hand = tuple[Robot, RealHands, dict[str, TurningBody]]
 
 
 def outside(points: Array, body: tuple[Array, Array, float], radius: float) -> float:
@@ -38,15 +39,13 @@ def outside(points: Array, body: tuple[Array, Array, float], radius: float) -> f
 
 
 @pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> tuple[Robot, RealHands, dict[str, TurningBody]]:
+def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
     robot = Robot.from_config(turning_cell(tmp_path_factory.mktemp("hand")))
     bodies = {body.name: body for body in robot.finger_bodies if isinstance(body, TurningBody)}
     return robot, RealHands(robot), bodies
 
 
-def test_every_moving_link_of_the_hand_has_a_body_and_holds_its_shape_at_200_openings(
-    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
-) -> None:
+def test_every_moving_link_of_the_hand_has_a_body_that_holds_its_shape(hand: Hand) -> None:
     _, real, bodies = hand
     assert {name for name in bodies if name.startswith("left_")} == set(real.fingers)
     random = np.random.default_rng(0)
@@ -62,9 +61,7 @@ def test_every_moving_link_of_the_hand_has_a_body_and_holds_its_shape_at_200_ope
             assert -0.05 < beyond <= 0.0, (name, interval)
 
 
-def test_at_one_opening_a_body_is_its_shape_and_a_narrow_interval_adds_little(
-    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
-) -> None:
+def test_at_one_opening_a_body_is_its_shape_and_a_narrow_interval_adds_little(hand: Hand) -> None:
     _, real, bodies = hand
     for name in real.fingers:
         body = bodies[name]
@@ -77,9 +74,7 @@ def test_at_one_opening_a_body_is_its_shape_and_a_narrow_interval_adds_little(
         assert body.capsule((0.5, 0.55))[2] - drawn < 0.0013
 
 
-def test_what_the_controller_and_coal_see_are_the_same_bodies(
-    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
-) -> None:
+def test_what_the_controller_and_coal_see_are_the_same_bodies(hand: Hand) -> None:
     robot, _, bodies = hand
     kernels = collision_model_of(robot).bodies
     fingers = FingerOpenings(robot, kernels)
@@ -96,9 +91,7 @@ def test_what_the_controller_and_coal_see_are_the_same_bodies(
             assert kernels.size[number] == pytest.approx(item.geometry.halfLength + item.geometry.radius, abs=1e-12)
 
 
-def test_no_interval_reaches_farther_from_a_joint_than_the_kernels_bounds_know(
-    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
-) -> None:
+def test_no_interval_reaches_farther_from_a_joint_than_the_kernels_bounds_know(hand: Hand) -> None:
     robot, _, bodies = hand
     model, random = collision_model_of(robot), np.random.default_rng(1)
     names = [item.name for item in robot.collision_model.geometryObjects]
@@ -145,7 +138,7 @@ def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], trave
 @pytest.mark.slow
 @given(st.lists(joints(), min_size=1, max_size=4), _VECTORS, _VECTORS, st.tuples(st.floats(0, 1), st.floats(0, 1)))
 @settings(max_examples=150, deadline=None)
-def test_any_chain_of_fingers_is_in_its_body_wherever_its_drivers_are(
+def test_any_chain_of_fingers_is_in_its_body(
     chain: list[FingerJoint], first: Array, second: Array, between: tuple[float, float]
 ) -> None:
     body = TurningBody("left", "finger_0", np.array([first, second]), 0.01, tuple(chain))
@@ -181,9 +174,7 @@ def test_a_capsule_is_within_another_one_where_both_of_its_ends_are() -> None:
     assert sticks_out(inside._replace(radius=np.array([0.016])), outer).all()
 
 
-def test_several_bodies_at_once_are_what_each_is_alone_within_what_the_samples_leave(
-    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
-) -> None:
+def test_several_bodies_at_once_are_what_each_is_alone_within_what_the_samples_leave(hand: Hand) -> None:
     _, _, bodies = hand
     together = TurningSweeps(list(bodies.values())).capsules((0.1, 0.4))
     for row, body in enumerate(bodies.values()):

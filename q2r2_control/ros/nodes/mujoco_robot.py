@@ -28,7 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.strict import STREAM_TIMEOUT
-from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
+from q2r2_control.plants.simulated_cell import SimulatedCell
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, STEADY, WARN, BaseNode
 from q2r2_control.ros.bridge.frames import link_transforms
@@ -203,9 +203,7 @@ class MujocoRobot(BaseNode):
 
     def _follow(self, names: Any, positions: Any, velocities: Any, delay: float = 0.0) -> str | None:
         v = np.asarray(velocities, float) if len(velocities) else None
-        return self._cell.command_positions(
-            JointSetpoint(names, np.asarray(positions, float), v, delay), self._received
-        )
+        return self._cell.command_positions(names, np.asarray(positions, float), v, self._received, delay)
 
     def _note(self, topic: str, fault: str | None) -> None:
         if fault is None:

@@ -1,61 +1,59 @@
-"""The SRDF files that lie beside the models of arms and tools: which pairs of their links need no watching.
+"""Write the SRDF files that lie beside the models of arms and tools: which pairs of their links need no watching.
+
+    python robots/make_srdf.py config/dual_iiwa7.yaml FOLDER
 
 ``ARM.srdf`` speaks of an arm's own links, ``TOOL.srdf`` of a tool's, ``TOOL_on_ARM.srdf`` of both, with the tool flat
 on the arm's last link. With a flange between them there are ``FLANGE_on_ARM.srdf`` and ``TOOL_on_FLANGE_on_ARM.srdf``.
-The files of robots/ are made here, and a test makes them again.
 """
 
 from __future__ import annotations
 
+import argparse
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from itertools import combinations
+from pathlib import Path
 
 from q2r2_control.config.arms import ArmConfig, PoseConfig
-from q2r2_control.config.cell import Config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import load_flange, load_model, name_of_stack
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import Description, parse_urdf
-from q2r2_control.robot.pairs import link_of
-from q2r2_control.robot.reachability import Progress, nearest_approaches, srdf_text
+from q2r2_control.robot.pairs import CLEARANCE, ENVELOPE, link_of
+from q2r2_control.robot.reachability import nearest_approaches, srdf_text
 from q2r2_control.robot.robot import Robot
-
-# Links and shapes of this name ending stand for a whole tool at every opening: watched from afar, never touched.
-ENVELOPE = "_envelope"
 
 _SIDE = "left"
 
 Disabled = tuple[str, str, str]  # two links, and why they need no watching
 
 
-def model_srdfs(
-    config: Config, clearance: float, samples: int, seed: int = 0, progress: Progress | None = None
-) -> dict[str, str]:
+def model_srdfs(config: Config, samples: int) -> dict[str, str]:
     """Text of every such file by file name, for all models of ``config``'s arms.
 
-    What these files say now is not used. Listed are neighbours, pairs that overlap at every posture, and pairs that
-    stay more than ``clearance`` [m] apart, as far as ``samples`` postures and the way downhill from them show.
+    The present files are not used. Listed are neighbours, pairs that overlap at every posture, and pairs that
+    stay more than :data:`CLEARANCE` apart, as far as ``samples`` postures and the way downhill from them show.
     Raises :class:`ConfigError` for arms of one ``robot``, and for a flange without a model.
     """
     files: dict[str, str] = {}
     if config.robot is not None:
-        raise ConfigError("robot: its arms have no models of their own; --pairs looks at the cell as a whole")
+        raise ConfigError("robot: its arms have no models of their own; q2r2 check --pairs looks at the whole cell")
     for side, arm in config.arms.items():
         model = load_model(arm, config.packages, f"arms.{side}")
         if arm.flange.thickness is not None:
-            raise ConfigError(f"arms.{side}.flange: has no model that a file could speak of; --pairs looks at the cell")
+            raise ConfigError(f"arms.{side}.flange: has no model; q2r2 check --pairs looks at the whole cell")
         flange = load_flange(arm.flange, config.packages, f"arms.{side}.flange")
         tool = None if arm.tool.model is None else load_model(arm.tool, config.packages, f"arms.{side}.tool")
         stack = [part for part in (model, flange, tool) if part is not None]
         if f"{name_of_stack(stack)}.srdf" in files:
             continue
         layers = {link.get("name", ""): i for i, part in enumerate(stack) for link in part.urdf.findall("link")}
-        disabled = _disabled(_alone(config, arm), _enveloped(tool), clearance, samples, seed, progress)
+        disabled = _disabled(_alone(config, arm), _enveloped(tool), samples)
         comment = (
-            f"Made by q2r2 check with its option model-pairs from {samples} random postures inside the joint limits. "
+            f"Made by robots/make_srdf.py from {samples} random postures inside the joint limits. "
             f"Always: the shapes overlap at every posture, by construction. "
-            f"Never: more than {1e3 * clearance:g} mm apart at every posture."
+            f"Never: more than {1e3 * CLEARANCE:g} mm apart at every posture."
         )
         files[f"{model.stem}.srdf"] = srdf_text(model.name, comment, _of_layers(disabled, layers, {0}, 0))
         for i in range(1, len(stack)):
@@ -86,16 +84,14 @@ def _alone(config: Config, arm: ArmConfig) -> Config:
     return config.model_copy(update={"arms": {_SIDE: alone}, "obstacles": {}, "floor": None, "srdf": None})
 
 
-def _disabled(
-    config: Config, hidden: tuple[str, ...], clearance: float, samples: int, seed: int, progress: Progress | None
-) -> list[Disabled]:
+def _disabled(config: Config, hidden: tuple[str, ...], samples: int) -> list[Disabled]:
     """Pairs of links of one arm with its tool that need no watching, in the order of the chain, by reason."""
     cell, prefix = compose(config), f"{_SIDE}_"
     exclusions = [ET.Element("disable_default_collisions", link=prefix + link) for link in hidden]
     robot = Robot(parse_urdf(cell.urdf, cell.name), exclusions, cell.tool_frames, cell.home, cell.name, cell.parts)
     reasons = {frozenset(map(link_of, pair)): "Always" for pair in robot.ignored_pairs}
-    for pair in nearest_approaches(robot, samples, seed, progress):
-        reasons[frozenset((pair.link_a, pair.link_b))] = "Never" if pair.nearest > clearance else "watched"
+    for pair in nearest_approaches(robot, samples, 0):
+        reasons[frozenset((pair.link_a, pair.link_b))] = "Never" if pair.nearest > CLEARANCE else "watched"
     links = dict.fromkeys(link_of(item.name) for item in robot.collision_model.geometryObjects)
     found = [
         (a.removeprefix(prefix), b.removeprefix(prefix), reasons.get(frozenset((a, b)), "Adjacent"))
@@ -115,7 +111,23 @@ def _enveloped(tool: Description | None) -> tuple[str, ...]:
 
 
 def _tool_srdf(tool: Description, disabled: list[Disabled]) -> str:
-    comment = "Made by q2r2 check with its option model-pairs."
+    comment = "Made by robots/make_srdf.py."
     if hidden := _enveloped(tool):
         comment += " The envelopes stand for hand and fingers, so that no distance depends on where the fingers are."
     return srdf_text(tool.name, comment, disabled, hidden)
+
+
+def main() -> None:
+    """Write the files of a cell's models, in place of those that there are."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("config", help="a cell's YAML")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--samples", type=int, default=20_000, help="random postures")
+    options = parser.parse_args()
+    for name, text in model_srdfs(load_config(options.config), options.samples).items():
+        (options.folder / name).write_text(text, encoding="utf-8")
+        print(options.folder / name)
+
+
+if __name__ == "__main__":
+    main()
