@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 from q2r2_control.cli.bench import bench
 from q2r2_control.cli.check import check
 from q2r2_control.cli.demo import demo
-from q2r2_control.cli.export import app as export_app
+from q2r2_control.cli.export import export
 from q2r2_control.cli.headset_check import headset_check
 from q2r2_control.cli.judge import judge, report
 from q2r2_control.cli.replay import replay
@@ -70,7 +70,7 @@ app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa
 app.command("headset-check", epilog="Example: q2r2 headset-check --host 0.0.0.0")(headset_check)
 app.command(epilog="Example: q2r2 bench --ticks 20000, or --work --motion meet")(bench)
 app.command(epilog="Example: q2r2 soak --ticks 100000 --contact")(soak)
-app.add_typer(export_app, name="export")
+app.command(epilog="Example: q2r2 export lerobot recordings --output datasets/circle --fps 30")(export)
 app.add_typer(ros_app, name="ros")
 
 

@@ -49,7 +49,6 @@ class EpisodeVectors:
 
     @property
     def frames(self) -> int:
-        """Their number."""
         return len(next(iter(self.vectors.values())))
 
     def outcome(self) -> dict[str, npt.NDArray[np.bool_]]:
@@ -58,26 +57,14 @@ class EpisodeVectors:
         return {"next.done": done, "next.success": done & bool(self.success)}
 
 
-@dataclass(frozen=True)
-class EpisodePart:
-    """An episode in a recording that has several; number 0: the whole."""
-
-    number: int = 0  # from 1 on
-    span: EpisodeSpan = WHOLE
-
-    def name_in(self, file: Path) -> str:
-        """The name of an episode of this recording."""
-        return file.stem + (f"-{self.number}" if self.number else "")
-
-
-def make_episode(file: Path, sampling: FrameSampling, part: EpisodePart | None = None) -> EpisodeVectors:
-    """An episode of a recording; its pictures are read when they are asked for.
+def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None = None) -> EpisodeVectors:
+    """An episode of a recording, or the whole; its pictures are read when they are asked for.
 
     Raises :class:`RecordingError` that names the file and what is wrong.
     """
     recording = open_recording(file)
-    part = part or EpisodePart(0, replace(WHOLE, success=recording.conclusion.success))
-    frames = sample(recording, sampling.fps, sampling.trim, part.span)
+    span = span or replace(WHOLE, success=recording.conclusion.success)
+    frames = sample(recording, sampling.fps, sampling.trim, span)
     cell, robot = cell_and_robot_of(recording)
     try:
         vectors, labels = features(frames, robot)
@@ -94,18 +81,15 @@ def make_episode(file: Path, sampling: FrameSampling, part: EpisodePart | None =
         names=labels,
         notes=notes,
         vectors=vectors,
-        success=part.span.success,
-        part=part.number,
+        success=span.success,
+        part=span.number,
         cameras={name: CameraFrames(recording, name, cell.cameras[name], stamps) for name in cameras},
     )
 
 
-def parts_to_export(file: Path) -> list[EpisodePart]:
+def spans_to_export(file: Path) -> list[EpisodeSpan]:
     """The episodes of a recording but those that its operator discarded; of a file that cannot be read the whole."""
     try:
-        spans = read_spans(open_recording(file))
+        return [span for span in read_spans(open_recording(file)) if not span.discarded]
     except RecordingError:
-        return [EpisodePart()]  # whoever makes an episode of it finds out
-    if spans[0].whole:
-        return [EpisodePart(0, spans[0])]
-    return [EpisodePart(number, span) for number, span in enumerate(spans, 1) if not span.discarded]
+        return [WHOLE]  # make_episode says what is wrong with it

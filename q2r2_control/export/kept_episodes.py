@@ -16,10 +16,11 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.episodes import EpisodePart, EpisodeVectors, FrameSampling, make_episode, parts_to_export
+from q2r2_control.export.episodes import EpisodeVectors, FrameSampling, make_episode, spans_to_export
+from q2r2_control.recording.episode_spans import EpisodeSpan
 
 Write = Callable[[EpisodeVectors, Path], None]  # an episode as a new file or folder; importable, for other processes
-_Job = tuple[Path, FrameSampling, EpisodePart, Write, Path]
+_Job = tuple[Path, FrameSampling, EpisodeSpan, Write, Path]
 _FORMAT = 5  # of kept episodes; those of another one are made again
 
 
@@ -48,9 +49,9 @@ def keep_episodes(
     unless ``skip_bad``, and :class:`ConfigError` where nothing can be written or a worker was killed.
     """
     jobs: list[_Job] = [
-        (file, sampling, part, write, folder / f"{part.name_in(file)}.{_key(file, sampling, part, write)}")
+        (file, sampling, span, write, folder / _name(file, sampling, span, write))
         for file in files
-        for part in parts_to_export(file)
+        for span in spans_to_export(file)
     ]
     exported = Exported([], [])
     with closing(_results(jobs, min(workers, len(jobs)))) as results:
@@ -85,13 +86,16 @@ def _results(jobs: Sequence[_Job], workers: int) -> Generator[str | None]:
 
 def _keep(job: _Job) -> str | None:
     """Write one episode unless it is there, where a whole one only ever is; returns what was wrong."""
-    file, sampling, part, write, target = job
+    file, sampling, span, write, target = job
     if target.exists():
         return None
     unfinished = target.with_name(f"{target.name}.unfinished")
     try:
-        write(make_episode(file, sampling, part), unfinished)
-        _flush(unfinished)
+        write(make_episode(file, sampling, span), unfinished)
+        for path in (unfinished, *unfinished.rglob("*")):
+            if path.is_file():
+                with path.open("rb") as stream:
+                    os.fsync(stream.fileno())  # no half of it is kept where power fails
         unfinished.replace(target)
     except RecordingError as error:
         return str(error)
@@ -100,36 +104,29 @@ def _keep(job: _Job) -> str | None:
     return None
 
 
-def _flush(written: Path) -> None:
-    """Bring what was written to the disk, so that no half of it is kept where power fails."""
-    for path in (written, *written.rglob("*")):
-        if path.is_file():
-            with path.open("rb") as stream:
-                os.fsync(stream.fileno())
-
-
-def _key(file: Path, sampling: FrameSampling, part: EpisodePart, write: Write) -> str:
-    """Another one after any change of the recording or of what is asked for."""
+def _name(file: Path, sampling: FrameSampling, span: EpisodeSpan, write: Write) -> str:
+    """Of a kept episode; another one after any change of the recording or of what is asked for."""
     try:
         status = file.stat()
     except OSError as error:
         raise RecordingError(f"{file}: cannot be read: {error.strerror}") from error
-    made_of = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), part.number]
-    identity = json.dumps([*made_of, write.__module__, _FORMAT])
-    return hashlib.sha256(identity.encode()).hexdigest()[:24]
+    made_of = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), span.number]
+    identity = json.dumps([*made_of, write.__module__, write.__name__, _FORMAT])
+    key = hashlib.sha256(identity.encode()).hexdigest()[:24]
+    return f"{file.stem}-{span.number}.{key}" if span.number else f"{file.stem}.{key}"
 
 
 class Output:
-    """A file or folder that a command makes.
+    """A folder that a command makes.
 
-    What an export that was interrupted had made so far stays in ``OUT.partial``, and the next one goes on with it.
-    Raises :class:`ConfigError` for an output that exists and one that cannot be written.
+    Episodes that an interrupted export has made stay in ``OUT.partial``, and the next one goes on with them. Raises
+    :class:`ConfigError` for an output that exists and one that cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._partial = path.with_name(f"{path.name}.partial")
         self._refuse_existing()
+        self._partial = path.with_name(f"{path.name}.partial")
 
     def episodes(self) -> Path:
         """The folder in which episodes are kept until the output is whole."""
@@ -147,10 +144,10 @@ class Output:
             self._partial.rmdir()
 
     def write(self, write: Callable[[Path], None]) -> None:
-        """Let ``write`` make the file or folder, and put it into its place."""
+        """Let ``write`` make the folder, and put it into its place."""
         made = self._partial / "output"
         try:
-            _remove(made)
+            shutil.rmtree(made, ignore_errors=True)
             write(made)
             self._refuse_existing()
             made.rename(self._path)
@@ -159,14 +156,5 @@ class Output:
             raise ConfigError(f"--output {self._path}: {error.strerror or error}") from error
 
     def _refuse_existing(self) -> None:
-        if not self._path.name:
-            raise ConfigError(f"--output {self._path}: allowed: a name that does not exist yet")
         if self._path.exists() or self._path.is_symlink():
             raise ConfigError(f"--output {self._path}: exists; allowed: a name that does not exist yet")
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

@@ -25,10 +25,12 @@ from q2r2_control.recording.tick_rows import targets_or_tools
 from q2r2_control.types import Array
 
 Columns = dict[str, npt.NDArray[Any]]
+Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b
 
 OBSERVED = ("position", "velocity", "effort", "opening")
 COMMANDED = ("reference", "gripper", "target", "reference_tool")
 _MOVING = 0.01  # fastest joint of a reference that moves [rad/s]
+_OLDEST = 2  # periods of the camera: one picture may be lost
 
 
 def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan = WHOLE) -> dict[str, Array]:
@@ -44,43 +46,37 @@ def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan
     :class:`RecordingError` for a damaged file, one without a tick to take, and one in which ticks were lost for longer
     than a frame.
     """
-    picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("time", *OBSERVED, *COMMANDED)}
+    picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("stamp", *OBSERVED, *COMMANDED)}
     start, end, count = None, 0, 0
-    previous: Columns | None = None
+    known: Columns = {}
     for columns in _ticks(recording, fps):
-        known = columns
-        if previous is not None:
-            known = {name: np.concatenate((previous[name], columns[name])) for name in columns}
-        previous = {name: values[-1:] for name, values in columns.items()}
+        # With the last tick of the chunk before, which may be the newest one of a frame in this chunk.
+        known = {name: np.concatenate((known.get(name, values[:0])[-1:], values)) for name, values in columns.items()}
         passed = (columns["time"] - recording.about.epoch) / NANOSECONDS
         inside = (span.start <= passed) & (passed <= span.end)
-        counting = np.flatnonzero(inside & columns["active"] if trim else inside)
+        counting = columns["time"][inside & columns["active"] if trim else inside]
         if len(counting):
-            start = int(columns["time"][counting[0]]) if start is None else start
-            end = int(columns["time"][counting[-1]])
+            start = int(counting[0]) if start is None else start
+            end = int(counting[-1])
         if start is None:
             continue
         times = known["time"]
         due = _times_until(int(times[-1]), start, fps, count)
         count += len(due)
+        picked["stamp"].append(due)
         observed = np.searchsorted(times, due, side="right") - 1
         commanded = np.searchsorted(times, due, side="left")
-        picked["time"].append(due)
-        for name in OBSERVED:
-            picked[name].append(known[name][observed])
-        for name in COMMANDED:
-            picked[name].append(known[name][commanded])
-    if previous is None:
+        for name in (*OBSERVED, *COMMANDED):
+            picked[name].append(known[name][observed if name in OBSERVED else commanded])
+    if not known:
         raise RecordingError(f"{recording.file}: no tick was recorded")
     if start is None:
         why = "no arm was ever engaged or moved, so --trim leaves nothing" if trim else "no tick is in the episode"
         raise RecordingError(f"{recording.file}: {why}")
     frames = {name: np.concatenate(values) for name, values in picked.items()}
-    kept = frames["time"] <= end
+    kept = frames["stamp"] <= end
     frames = {name: values[kept] for name, values in frames.items()}
-    frames["stamp"] = frames["time"]
-    frames["time"] = (frames["stamp"] - start) / NANOSECONDS
-    return frames
+    return frames | {"time": (frames["stamp"] - start) / NANOSECONDS}
 
 
 def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArray[np.int64]:
@@ -126,12 +122,6 @@ def _columns(chunk: TickChunk) -> Columns:
     }
 
 
-Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b
-
-_OLDEST = 2  # periods of the camera: one picture may be lost
-_NANOSECONDS = 1_000_000_000
-
-
 @dataclass(frozen=True)
 class CameraFrames:
     """Pictures of one camera, one for each frame of an episode."""
@@ -148,34 +138,30 @@ class CameraFrames:
 
     def __iter__(self) -> Iterator[Pixels]:
         """Raises :class:`RecordingError` for a frame whose newest picture is older than two of the camera's periods."""
-        return _pictures_at(self.recording, self.name, self.config, self.stamps)
+        pictures = self.recording.pictures(self.name)
+        newest, coming = None, next(pictures, None)
+        pixels: Pixels | None = None
+        for stamp in self.stamps:
+            while coming is not None and coming.time <= stamp:
+                newest, coming, pixels = coming, next(pictures, None), None
+            age = None if newest is None else (stamp - newest.time) / NANOSECONDS
+            if newest is None or age is None or age * self.config.rate > _OLDEST:
+                what = "no picture yet" if age is None else f"a picture {age:.3f} s old"
+                raise RecordingError(
+                    f"{self.recording.file}: camera {self.name} has {what} at "
+                    f"{(stamp - self.recording.about.epoch) / NANOSECONDS:.3f} s; allowed: at most two of its periods, "
+                    f"{_OLDEST / self.config.rate:.3f} s; --no-pictures leaves them out"
+                )
+            if pixels is None:
+                pixels = self._decoded(newest)
+            yield pixels
 
-
-def _pictures_at(recording: Recording, name: str, camera: CameraConfig, stamps: Sequence[int]) -> Iterator[Pixels]:
-    pictures = recording.pictures(name)
-    newest: Picture | None = None
-    coming = next(pictures, None)
-    pixels: Pixels | None = None
-    for stamp in stamps:
-        while coming is not None and coming.time <= stamp:
-            newest, coming, pixels = coming, next(pictures, None), None
-        if newest is None or (stamp - newest.time) * camera.rate > _OLDEST * _NANOSECONDS:
-            when = (stamp - recording.about.epoch) / _NANOSECONDS
-            age = "no picture yet" if newest is None else f"a picture {(stamp - newest.time) / _NANOSECONDS:.3f} s old"
-            raise RecordingError(
-                f"{recording.file}: camera {name} has {age} at {when:.3f} s; allowed: at most two of its periods, "
-                f"{_OLDEST / camera.rate:.3f} s; --no-pictures leaves them out"
-            )
-        if pixels is None:
-            pixels = _decoded(recording, name, camera, newest)
-        yield pixels
-
-
-def _decoded(recording: Recording, name: str, camera: CameraConfig, picture: Picture) -> Pixels:
-    try:
-        pixels = np.asarray(Image.open(io.BytesIO(picture.jpeg)).convert("RGB"))
-    except (UnidentifiedImageError, OSError) as error:
-        raise RecordingError(f"{recording.file}: damaged: a picture of camera {name} is no JPEG") from error
-    if pixels.shape != (camera.height, camera.width, 3):
-        raise RecordingError(f"{recording.file}: damaged: a picture of camera {name} has a size that the cell has not")
-    return pixels
+    def _decoded(self, picture: Picture) -> Pixels:
+        damaged = f"{self.recording.file}: damaged: a picture of camera {self.name}"
+        try:
+            pixels = np.asarray(Image.open(io.BytesIO(picture.jpeg)).convert("RGB"))
+        except (UnidentifiedImageError, OSError) as error:
+            raise RecordingError(f"{damaged} is no JPEG") from error
+        if pixels.shape != self.size:
+            raise RecordingError(f"{damaged} has a size that the cell has not")
+        return pixels

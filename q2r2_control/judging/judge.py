@@ -1,4 +1,4 @@
-"""Judges recordings, and keeps verdicts beside them."""
+"""Judges the episodes of recordings, and keeps verdicts beside them."""
 
 from __future__ import annotations
 
@@ -21,25 +21,30 @@ from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.ros_recording import open_recording
 
+VERDICT_FILE = "verdict.json"
+_FORMAT = 2
+
 
 def parts_of(episode: Episode) -> list[Episode]:
     """The episodes of a recording in their order; where the operator told of none, the whole."""
     spans = spans_of(episode.events, episode.success)
-    if len(spans) == 1 and spans[0].whole:
-        return [replace(episode, success=spans[0].success)]
-    return [part_of(episode, span, number) for number, span in enumerate(spans, 1)]
+    return [part_of(episode, span) if span.number else replace(episode, success=span.success) for span in spans]
 
 
-def part_of(episode: Episode, span: EpisodeSpan, number: int) -> Episode:
-    """The ``number``-th episode of a recording. Times are since it began, and its first tick is number 0."""
+def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
+    """An episode of a recording. Times are since it began, and its first tick is number 0."""
     ticks, frames = episode.ticks, episode.frames
     first, end = np.searchsorted(ticks.t, span.start), np.searchsorted(ticks.t, span.end, side="right")
-    inside = slice(first, end)
-    cut = {name: values[inside] for name, values in vars(ticks).items()}
+    cut = {name: values[first:end] for name, values in vars(ticks).items()}
     began = float(cut["t"][0] - cut["dt"][0]) if len(cut["t"]) else 0.0
     if len(cut["t"]):
         cut |= {"t": cut["t"] - began, "number": cut["number"] - cut["number"][0]}
     shown = (first <= frames.at) & (frames.at < end)
+    hands = {}
+    for name, hand in episode.hands.items():
+        inside = (span.start <= hand.polled) & (hand.polled <= span.end)
+        received, polled = hand.received[inside] - began, hand.polled[inside] - began
+        hands[name] = Hand(hand.arm, received, polled, hand.position[inside])
     told = span.end < math.inf
     return replace(
         episode,
@@ -48,25 +53,15 @@ def part_of(episode: Episode, span: EpisodeSpan, number: int) -> Episode:
             **{name: values[shown] for name, values in vars(frames).items()} | {"at": frames.at[shown] - first}
         ),
         tools=episode.tools[shown],
-        hands={name: _hand(hand, span, began) for name, hand in episode.hands.items()},
+        hands=hands,
         events=[replace(event, t=event.t - began) for event in episode.events if span.start <= event.t <= span.end],
         damage=None if told else episode.damage,
         ended_by=None if told else episode.ended_by,
         success=span.success,
-        part=number,
+        part=span.number,
         discarded=span.discarded,
         ended_by_operator=told,
     )
-
-
-def _hand(hand: Hand, span: EpisodeSpan, began: float) -> Hand:
-    inside = (span.start <= hand.polled) & (hand.polled <= span.end)
-    received, polled = hand.received[inside] - began, hand.polled[inside] - began
-    return Hand(hand.arm, received, polled, hand.position[inside])
-
-
-VERDICT_FILE = "verdict.json"
-_FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -81,9 +76,7 @@ class Judged:
     def as_json(self) -> dict[str, Any]:
         """Plain data; what is not finite is None."""
         reasons = [asdict(reason) for reason in self.verdict.reasons]
-        data = {"verdict": self.verdict.word, "reasons": reasons, "figures": asdict(self.figures)}
-        found: dict[str, Any] = _plain(data)
-        return found
+        return dict(_plain({"verdict": self.verdict.word, "reasons": reasons, "figures": asdict(self.figures)}))
 
 
 def judge(recording: Recording, settings: JudgeSettings | None = None) -> list[Judged]:

@@ -20,13 +20,8 @@ class EpisodeSpan:
     start: float = -math.inf
     end: float = math.inf  # inf: the run's
     discarded: bool = False  # by its operator
-    marks: tuple[float, ...] = ()
     success: bool | None = None  # None: nobody said
-
-    @property
-    def whole(self) -> bool:
-        """Whether it is the whole run."""
-        return self.start == -math.inf
+    number: int = 0  # from 1 on; 0: the whole run
 
 
 WHOLE = EpisodeSpan()
@@ -40,7 +35,6 @@ def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list
     """
     whole = replace(WHOLE, success=run_succeeded)
     spans: list[EpisodeSpan] = []
-    marks: list[float] = []  # outside of episodes too, since a run without any is one
     for event in events:
         is_open = bool(spans) and spans[-1].end == math.inf
         if event.kind is ReasonKind.EPISODE_BEGINS and not is_open:
@@ -55,9 +49,7 @@ def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list
                 spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), success=success)
             else:
                 whole = replace(whole, success=success)
-        elif event.kind is ReasonKind.MARK:
-            marks.append(event.t)
-    return [replace(span, marks=tuple(t for t in marks if span.start <= t <= span.end)) for span in spans or [whole]]
+    return [replace(span, number=number) for number, span in enumerate(spans, 1)] or [whole]
 
 
 def read_spans(recording: Recording) -> list[EpisodeSpan]:

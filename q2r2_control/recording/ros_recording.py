@@ -26,7 +26,8 @@ from q2r2_control.recording.about import ROS, About
 from q2r2_control.recording.messages import NANOSECONDS, STORE, Message, pose_of
 from q2r2_control.recording.reader import Picture, Recording, TickChunk
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, tool_poses
-from q2r2_control.recording.ros_topics import (
+from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
+from q2r2_control.recording.topics import (
     ARM_FIELDS,
     CONTROLLER_TICK,
     RECORDER_EVENTS,
@@ -36,7 +37,6 @@ from q2r2_control.recording.ros_topics import (
     ros_topics,
     tick_fields,
 )
-from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array
 

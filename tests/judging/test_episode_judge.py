@@ -15,6 +15,7 @@ from q2r2_control.events import ReasonKind as K
 from q2r2_control.judging.episode_judge import EpisodeJudge, Question, written_episode
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording.about import About
+from q2r2_control.recording.episode_spans import EpisodeSpan
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
@@ -30,6 +31,7 @@ pytestmark = pytest.mark.slow
 TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7
 VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # [s]
 DURATION = 7.0
+FIRST = EpisodeSpan(1.0, 2.5, number=1)
 BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
 RESTS = 3.6  # the hands, from then on [s]
 
@@ -99,8 +101,8 @@ def test_both_hands_feel_it_and_the_run_is_replayed_with_it(run: PatientRun) -> 
 
 def test_none_is_judged_before_all_of_it_is_written(run: PatientRun, tmp_path: Path) -> None:
     written = killed(run.file, tmp_path / "part.mcap", round(2.45 * RATE))
-    assert written_episode(Question(str(written), 1, 1.0, 2.5)) is None
-    whole = written_episode(Question(str(run.file), 1, 1.0, 2.5))
+    assert written_episode(Question(str(written), FIRST, timed=True)) is None
+    whole = written_episode(Question(str(run.file), FIRST, timed=True))
     assert whole is not None
     assert len(whole.ticks.t) == pytest.approx(1.5 * RATE, abs=2)
 

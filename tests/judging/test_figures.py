@@ -116,9 +116,9 @@ class TestDelays:
 
     def test_a_hand_that_rests_a_tool_that_is_held_and_a_hand_of_one_pose_have_none(self) -> None:
         stamps = np.arange(0.0, 4.0, 1.0 / 75.0)
-        assert delays(episode(received=stamps, hand_path=wander(stamps)), "left") == (None, None)
-        assert delays(episode(path=wander(frame_times())), "left") == (None, None)
-        assert delays(episode(received=[1.0]), "left") == (None, None)
+        assert delays(episode(received=stamps, hand_path=wander(stamps)), "left") == [None, None]
+        assert delays(episode(path=wander(frame_times())), "left") == [None, None]
+        assert delays(episode(received=[1.0]), "left") == [None, None]
 
 
 class TestArms:

@@ -26,7 +26,7 @@ from q2r2_control.recording.messages import (
     pose_stamped,
     serialized,
 )
-from q2r2_control.recording.ros_topics import (
+from q2r2_control.recording.topics import (
     CONTROLLER_TICK,
     RECORDER_EVENTS,
     arm_events,

@@ -8,9 +8,9 @@ import pytest
 
 from q2r2_control.events import Event, Reason
 from q2r2_control.events import ReasonKind as K
-from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
+from q2r2_control.recording.episode_spans import spans_of
 
-BEGINS, ENDS, DISCARDED, MARK = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED, K.MARK
+BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
 SUCCEEDED, FAILED = K.EPISODE_SUCCEEDED, K.EPISODE_FAILED
 
 CASES = {
@@ -25,7 +25,7 @@ CASES = {
         [(1.0, BEGINS), (2.0, ENDS), (2.5, DISCARDED), (3.0, BEGINS), (4.0, ENDS)],
         [(1.0, 2.0, True), (3.0, 4.0, False)],
     ),
-    "other events": ([(0.5, K.PRESSED), (1.0, BEGINS), (1.5, K.POSE_SILENT)], [(1.0, math.inf, False)]),
+    "other events": ([(0.5, K.MARK), (1.0, BEGINS), (1.5, K.POSE_SILENT)], [(1.0, math.inf, False)]),
 }
 
 
@@ -37,13 +37,9 @@ def events(*told: tuple[float, K]) -> list[Event]:
 def test_episodes_are_where_the_operator_says(
     told: list[tuple[float, K]], expected: list[tuple[float, float, bool]]
 ) -> None:
-    assert spans_of(events(*told)) == [EpisodeSpan(*values) for values in expected]
-
-
-def test_marks_are_those_of_the_episode_that_they_are_in() -> None:
-    told = events((0.5, MARK), (1.0, BEGINS), (1.2, MARK), (1.4, MARK), (2.0, ENDS), (3.0, MARK))
-    assert [span.marks for span in spans_of(told)] == [(1.2, 1.4)]
-    assert [span.marks for span in spans_of(events((0.5, MARK)))] == [(0.5,)]
+    spans = spans_of(events(*told))
+    assert [(span.start, span.end, span.discarded) for span in spans] == expected
+    assert [span.number for span in spans] == ([1, 2][: len(expected)] if told else [0])
 
 
 OUTCOMES = {

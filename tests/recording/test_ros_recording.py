@@ -24,7 +24,7 @@ from q2r2_control.recording.episode_spans import read_spans
 from q2r2_control.recording.reader import TickChunk
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.ros_recording import open_recording
-from q2r2_control.recording.ros_topics import arm_flags
+from q2r2_control.recording.topics import arm_flags
 from tests.recording.ros_runs import PERIOD, NodesOnFile
 from tests.recording.runs import read_elsewhere
 from tests.support.external_cell import external
@@ -147,7 +147,6 @@ def test_episodes_are_those_that_arms_and_services_tell_of(nodes: NodesOnFile) -
     recording = open_recording(nodes.close())
     first, second = read_spans(recording)
     assert (first.start, first.end, first.discarded) == (pytest.approx(0.08), pytest.approx(0.32), False)
-    assert first.marks == pytest.approx([0.24])
     assert second.discarded
     kept, discarded = judge(recording)
     assert kept.figures.part == 1

@@ -13,8 +13,15 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.events import Event, Reason
-from q2r2_control.recording.ros_topics import CONTROLLER_TICK, RECORDER, arm_events, arm_flags, asked_target
-from q2r2_control.recording.topics import REFERENCE, WORLD
+from q2r2_control.recording.topics import (
+    CONTROLLER_TICK,
+    RECORDER,
+    REFERENCE,
+    WORLD,
+    arm_events,
+    arm_flags,
+    asked_target,
+)
 from q2r2_control.ros.base_node import RECORDED_QOS
 from q2r2_control.ros.bridge.messages import stamped_pose, time_message
 from q2r2_control.teleop.both_arms import EpisodeMarks

@@ -1,0 +1,121 @@
+"""The formats of ``q2r2 export``; CSV and HDF5 have a file for each episode.
+
+HDF5 files are laid out as trainers of ACT read them: ``record_sim_episodes.py`` in https://github.com/tonyzhaozh/act.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.export.episodes import EpisodeVectors
+from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
+
+_AHEAD = 1  # frames by which actions in HDF5 are
+# Name in the HDF5 file, name of the feature, unit of a joint.
+_DATA = (
+    ("observations/qpos", "observation.state", "rad"),
+    ("observations/qvel", "observation.velocity", "rad/s"),
+    ("action", "action", "rad"),
+)
+_OPENING, _OPENING_UNIT = "_gripper", "0 closed .. 1 open"
+_COMPRESSION = 1  # of gzip's levels, the fastest
+
+
+def write_table(episode: EpisodeVectors, path: Path) -> None:
+    """Write one episode as CSV, a line a frame."""
+    frames = np.arange(episode.frames)
+    columns: dict[str, npt.NDArray[Any]] = {
+        f"{name}.{label}": episode.vectors[name][:, at]
+        for name, labels in episode.names.items()
+        for at, label in enumerate(labels)
+    }
+    columns |= episode.outcome()
+    columns |= {"timestamp": (frames / episode.fps).astype(np.float32), "frame_index": frames}
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*columns, "task"])
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        writer.writerows([*row, episode.task] for row in rows)
+
+
+def gather_tables(files: Sequence[Path], folder: Path) -> None:
+    """Move tables into a ``folder`` that is made, named as their recordings.
+
+    Raises :class:`RecordingError` where two recordings have one name.
+    """
+    folder.mkdir()
+    for file in files:
+        path = folder / f"{file.stem}.csv"
+        if path.exists():
+            raise RecordingError(f"{file.stem}.mcap: two recordings have this name; allowed: each one once")
+        file.replace(path)
+
+
+def require_h5py() -> Any:
+    """The module h5py. Raises :class:`ConfigError` where it is not installed."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise ConfigError("export hdf5 needs h5py: pip install 'q2r2_control[export]'") from error
+    return h5py
+
+
+def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
+    """Write one episode as HDF5."""
+    with require_h5py().File(path, "w") as file:
+        file.attrs["sim"] = True  # trainers take the action of the same row then
+        file.attrs["compress"] = False  # pictures are pixels, however the file packs them
+        file.attrs["fps"] = episode.fps
+        file.attrs["action_ahead_frames"] = _AHEAD
+        for name in ("recording", "cell", "task"):
+            file.attrs[name] = getattr(episode, name)
+        if episode.success is not None:
+            file.attrs["success"] = episode.success
+        for name, text in episode.notes.items():
+            file.attrs[f"note_{name}"] = text
+        for name, feature, unit in _DATA:
+            values, labels = episode.vectors[feature], episode.names[feature]
+            if name == "action":
+                values = np.concatenate((values[_AHEAD:], np.repeat(values[-1:], _AHEAD, axis=0)))[: episode.frames]
+            data = file.create_dataset(name, data=values)
+            data.attrs["names"] = list(labels)
+            data.attrs["units"] = [_OPENING_UNIT if label.endswith(_OPENING) else unit for label in labels]
+        images = file.create_group("observations/images")
+        for camera, pictures in episode.cameras.items():
+            # Each picture is packed by itself, so that one can be read without the others.
+            packing = {"chunks": (1, *pictures.size), "compression": "gzip", "compression_opts": _COMPRESSION}
+            data = images.create_dataset(camera, (episode.frames, *pictures.size), "uint8", **packing)
+            data.attrs["axes"] = ["frame", "row", "column", "r g b"]
+            for number, pixels in enumerate(pictures):
+                data[number] = pixels
+
+
+def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
+    """Move HDF5 files into a ``folder`` that is made, as ``episode_0.hdf5`` and so on."""
+    folder.mkdir()
+    for number, file in enumerate(files):
+        file.replace(folder / f"episode_{number}.hdf5")
+
+
+@dataclass(frozen=True)
+class Format:
+    """How episodes are written one by one, and then joined in the output."""
+
+    write: Callable[[EpisodeVectors, Path], None]
+    join: Callable[[Sequence[Path], Path], None]
+    require: Callable[[], object] = lambda: None  # raises ConfigError where a package is not installed
+
+
+FORMATS = {
+    "lerobot": Format(write_shard, join_shards, require_lerobot),
+    "hdf5": Format(write_hdf5, gather_hdf5, require_h5py),
+    "csv": Format(write_table, gather_tables),
+}
