@@ -9,9 +9,8 @@ import typer
 
 from q2r2_control.cli.output import counting, stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.episodes import FASTEST, FrameSampling
+from q2r2_control.export.episodes import FASTEST, FrameSampling, Output, keep_episodes
 from q2r2_control.export.formats import FORMATS
-from q2r2_control.export.kept_episodes import Output, keep_episodes
 from q2r2_control.recording.reader import recordings_in
 
 _FORMATS = ", ".join(FORMATS)

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.events import Event, ReasonKind
-from q2r2_control.judging.verdict import Verdict
+from q2r2_control.judging.judge import Verdict
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import ArmSummary, Percentiles, RunSummary, TorqueSummary
 from q2r2_control.teleop.arm_states import ArmState, is_fault

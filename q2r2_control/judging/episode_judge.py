@@ -16,8 +16,8 @@ from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode import Episode, read_episode
 from q2r2_control.judging.judge import judge_episode, part_of, parts_of
-from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
 from q2r2_control.recording.helper_process import HelperProcess, reason_of
+from q2r2_control.recording.reader import EpisodeSpan, spans_of
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.summary.tick import Tick
 from q2r2_control.wording import sentence
@@ -45,16 +45,7 @@ class Question:
     timed: bool
 
 
-@dataclass(frozen=True)
-class Answer:
-    """What became of it."""
-
-    number: int  # of the episode
-    keep: bool | None  # None: it could not be judged
-    line: str  # keep, discard and why, or why it could not be judged
-
-
-def main(requests: Iterator[Question], answer: Callable[[Answer], None]) -> None:
+def main(requests: Iterator[Question], answer: Callable[[Reason], None]) -> None:
     """Answer each question with the verdict on its episode."""
     run = os.getppid()
     with suppress(OSError):
@@ -64,7 +55,8 @@ def main(requests: Iterator[Question], answer: Callable[[Answer], None]) -> None
             keep, line = _verdict(question, run)
         except (Q2R2Error, OSError) as error:
             keep, line = None, f"not judged: {reason_of(error)}"
-        answer(Answer(question.span.number, keep, line[:LONGEST_LINE]))
+        number = question.span.number
+        answer(Reason.of(ReasonKind.VERDICT, episode=number, keep=keep, line=line[:LONGEST_LINE]))
 
 
 def _verdict(question: Question, run: int) -> tuple[bool | None, str]:
@@ -100,15 +92,12 @@ class EpisodeJudge:
     """
 
     def __init__(self, file: Callable[[], Path | None], tell: Callable[[Reason], None], *, timed: bool = True) -> None:
-        """``file``: what is recorded to; ``tell``: is given each verdict.
-
-        ``timed``: times of events are those of ticks in the file, so only those of an episode have to be read.
-        """
+        """``timed``: times of events are those of ticks in the ``file``, so only an episode's have to be read."""
         self._file, self._tell, self._timed = file, tell, timed
         self._events: list[Event] = []
         self._asked: Question | None = None
         self._count = 0
-        self._answers: deque[Answer] = deque()
+        self._answers: deque[Reason] = deque()
         self._process: HelperProcess | None = None
         self._started = False
 
@@ -123,7 +112,6 @@ class EpisodeJudge:
 
     @property
     def pid(self) -> int | None:
-        """Number of its process; None where that has ended."""
         return None if self._process is None else self._process.pid
 
     def __call__(self, tick: Tick) -> None:
@@ -150,12 +138,10 @@ class EpisodeJudge:
         self._asked = question
 
     def look(self) -> None:
-        """Tell the verdicts that are there."""
         while self._answers:
-            answer = self._answers.popleft()
-            if spans_of(self._events)[answer.number - 1].discarded:
+            verdict = self._answers.popleft()
+            if spans_of(self._events)[verdict.detail["episode"] - 1].discarded:
                 continue  # its operator has been faster
-            verdict = Reason.of(ReasonKind.VERDICT, episode=answer.number, keep=answer.keep, line=answer.line)
             _logger.info(sentence(verdict))
             self._tell(verdict)
         if self._process is not None and self._process.fault is not None:

@@ -34,8 +34,7 @@ class HandFigures:
 def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
     """Figures of a hand's samples; ``dropout`` [s] is the longest time between poses that is none.
 
-    A time between poses counts as far as its arm is engaged in it. The time from the last pose to the end of the run is
-    one as well; one in which ticks were lost is none, since samples are lost with them.
+    A time between poses, or from the last one to the end, counts as far as its arm is engaged and no tick was lost.
     """
     ticks, samples = episode.ticks, episode.hands[hand]
     engaged = ticks.engaged[:, episode.arms.index(samples.arm)] & ticks.following
@@ -130,7 +129,6 @@ class EpisodeFigures:
 
     @property
     def name(self) -> str:
-        """Of the file, and which of its episodes."""
         return Path(self.file).stem + ("" if self.part is None else f" #{self.part}")
 
 
@@ -173,11 +171,7 @@ def _least_mm(distances: Array) -> float | None:
 
 
 def timing_figures(episode: Episode) -> TimingFigures:
-    """Figures of an episode's ticks.
-
-    The number of a lost tick is not in the file. Missed ticks are those of the loop, told from the time that each tick
-    says has passed since the one before, which lost ticks do not change.
-    """
+    """Figures of ticks; missed are those between which more time passed, by what each tick says, than a period."""
     ticks, count = episode.ticks, len(episode.ticks.t)
     if not count:
         return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended)

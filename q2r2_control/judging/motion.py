@@ -33,8 +33,7 @@ _MOVED, _TURNED = 2e-3, 0.02  # at least [m, rad]
 def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:
     """Median of :func:`ldlj`, of smoothed positions, over the pieces of a tool's motion.
 
-    ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. None: fewer than eight pieces, 2.75 s in
-    all, move at 20 mm/s on average; the median of so few says little.
+    ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. None: fewer than eight pieces move at 20 mm/s on average.
     """
     moving = []
     for begin, end in stretches(engaged & np.isfinite(position).all(axis=1)):
@@ -83,8 +82,6 @@ def ldlj(position: Array, dt: float) -> float:
 
 
 class Track(NamedTuple):
-    """Where a point is over time."""
-
     t: Array  # (n,) [s], rising
     position: Array  # (n, 3) [m]
 

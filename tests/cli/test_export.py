@@ -11,7 +11,7 @@ import pytest
 
 from q2r2_control.export.formats import FORMATS, Format, write_table
 from tests.cli.command import q2r2
-from tests.export.runs import DURATION, contents, record_two
+from tests.export.files import DURATION, contents, record_two
 
 
 @pytest.fixture(scope="module")

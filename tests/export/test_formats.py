@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from q2r2_control.errors import RecordingError
+from q2r2_control.export import formats
 from q2r2_control.export.episodes import EpisodeVectors
-from q2r2_control.export.formats import FORMATS
-from tests.export.vectors import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
+from q2r2_control.export.formats import FORMATS, SOURCES, join_shards, video_key
+from tests.cli.command import q2r2
+from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
 
 HEAD = [
     *(f"{feature}.{name}" for feature, names in NAMES.items() for name in names),
@@ -30,7 +34,6 @@ def read(file: Path) -> list[dict[str, str]]:
 
 
 def export(name: str, episodes: Sequence[EpisodeVectors], folder: Path, recordings: Sequence[str]) -> Path:
-    """Write episodes of recordings as an export does, and return the folder in which they end."""
     files = [folder / f"{recording}.{number}" for number, recording in enumerate(recordings)]
     for episode, file in zip(episodes, files, strict=False):
         FORMATS[name].write(episode, file)
@@ -82,3 +85,44 @@ def test_each_episode_is_an_hdf5_file_of_what_act_asks_for_with_the_next_action(
             assert (about["fps"], about["task"], about["cell"]) == (30, episode.task, "two_arms")
             assert (about["recording"], about["note_operator"]) == (f"run-{number + 1}.mcap", "Ada")
             assert (about["sim"], about["action_ahead_frames"], about.get("success")) == (1, 1, episode.success)
+
+
+ACTION = {"dtype": "float32", "shape": [2], "names": ["left_A1", "left_A2"]}
+OTHER_ACTION = {**ACTION, "names": ["left_A1", "left_A3"]}
+VIDEO = {"dtype": "video", "shape": [48, 64, 3]}
+
+
+def shard(folder: Path, recording: str, cell: str, features: dict[str, Any]) -> Path:
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps({"robot_type": cell, "features": features}))
+    (folder / SOURCES).write_text(json.dumps([{"recording": recording}]))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("cell", "features", "what"),
+    [
+        pytest.param("one_arm", {"action": ACTION}, r"of cell one_arm, but a\.mcap of two_arms", id="another cell"),
+        pytest.param("two_arms", {"action": OTHER_ACTION}, r"action has not the numbers", id="another joint"),
+        pytest.param("two_arms", {"action": ACTION, video_key(CAMERA): VIDEO}, "has not the cameras", id="a camera"),
+    ],
+)
+def test_episodes_of_different_robots_are_not_one_dataset(
+    cell: str, features: dict[str, Any], what: str, tmp_path: Path
+) -> None:
+    shards = [
+        shard(tmp_path / "a", "a.mcap", "two_arms", {"action": ACTION}),
+        shard(tmp_path / "b", "b.mcap", cell, features),
+    ]
+    with pytest.raises(RecordingError, match=rf"b\.mcap: {what}"):
+        join_shards(shards, tmp_path / "made")
+    assert not (tmp_path / "made").exists()
+
+
+def test_without_lerobot_one_line_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats, "find_spec", lambda name: None)
+    (tmp_path / "a.mcap").touch()
+    result = q2r2("export", "lerobot", str(tmp_path / "a.mcap"), "--output", str(tmp_path / "out"))
+    assert result.exit_code == 2
+    assert result.stderr == "q2r2: export lerobot needs lerobot: pip install 'q2r2_control[lerobot]'\n"
+    assert not list(tmp_path.glob("out*"))

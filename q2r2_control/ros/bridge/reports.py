@@ -13,7 +13,7 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.events import Event, Reason
-from q2r2_control.recording.topics import (
+from q2r2_control.recording.messages import (
     CONTROLLER_TICK,
     RECORDER,
     REFERENCE,
