@@ -152,6 +152,7 @@ def test_a_tick_has_the_reference_of_its_time_and_what_had_been_received_by_then
     targets = ticks.rows["arms"]["target"][:, 0, 0]
     assert targets[engaged].tolist() == list(range(40, 60))
     assert not targets[~engaged].any()
+    assert ticks.samples[:, names.SAMPLE_FIELDS.index("x")].tolist() == list(range(40, 60))
 
 
 def test_a_target_that_ceased_is_none_of_a_later_tick(nodes: NodesOnFile) -> None:
