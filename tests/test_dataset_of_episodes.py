@@ -18,28 +18,22 @@ _ELSEWHERE = ("make ", ".venv-lerobot/")
 _SEEDS, _EPISODES = "1 2 3 4 5 6 7 8 9 10", 2
 
 
-def lines_of_the_readme() -> list[str]:
+def test_each_line_of_the_readme_does_what_is_said_beside_it(tmp_path: Path) -> None:
     section = (ROOT / "README.md").read_text().split("## From ten episodes to a dataset")[1]
     found = re.search(r"```sh\n(.*?)```", section, re.DOTALL)
     assert found is not None
-    return [line for line in found[1].splitlines() if not line.startswith(_ELSEWHERE)]
-
-
-def test_each_line_of_the_readme_does_what_is_said_beside_it(tmp_path: Path) -> None:
-    lines = lines_of_the_readme()
+    lines = [line for line in found[1].splitlines() if not line.startswith(_ELSEWHERE)]
     assert len(lines) == 4
     assert _SEEDS in lines[0]
     script = "\n".join(["set -e", *lines]).replace(_SEEDS, " ".join(map(str, range(1, _EPISODES + 1))))
-    commands = tmp_path / "bin"
-    commands.mkdir()
-    command = commands / "q2r2"
+    command = tmp_path / "bin" / "q2r2"
+    command.parent.mkdir()
     command.write_text(f'#!/bin/sh\nexec {sys.executable} -m q2r2_control "$@"\n')
     command.chmod(0o755)
     (tmp_path / "config").symlink_to(ROOT / "config")
-    environment = {**os.environ, "PATH": os.pathsep.join([str(commands), os.environ["PATH"]])}
-    done = subprocess.run(
-        ["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900
-    )
+    environment = {**os.environ, "PATH": f"{command.parent}{os.pathsep}{os.environ['PATH']}"}
+    shell = ("bash", "-c", script)
+    done = subprocess.run(shell, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("grasp succeeded") == _EPISODES
     assert done.stdout.splitlines().count("identical") == _EPISODES

@@ -21,7 +21,7 @@ from typer import Argument, Option
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import ReasonKind
-from q2r2_control.judging.verdict import Verdict
+from q2r2_control.judging.judge import Verdict
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import ArmSummary, Percentiles, RunSummary, TorqueSummary
 from q2r2_control.teleop.arm_states import ArmState, is_fault

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from enum import StrEnum
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -24,11 +23,8 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.csv_tables import gather_tables, move_table, write_table
-from q2r2_control.export.episodes import FASTEST, FrameSampling
-from q2r2_control.export.hdf5 import gather_files, require_h5py, write_file
-from q2r2_control.export.kept_episodes import Output, Write, keep_episodes
-from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
+from q2r2_control.export.episodes import FASTEST, FrameSampling, Output, keep_episodes
+from q2r2_control.export.formats import FORMATS
 from q2r2_control.judging.judge import Judged, judge_all
 from q2r2_control.judging.page import COLUMNS, page_of
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -138,18 +134,10 @@ def _judged(recordings: Sequence[Path], config: str | None) -> list[Judged]:
     return judged
 
 
-class Format(StrEnum):
-    """What recordings become."""
-
-    LEROBOT = "lerobot"
-    HDF5 = "hdf5"
-    CSV = "csv"
-
-
 def export(
-    format: Annotated[Format, Argument(metavar="[lerobot|hdf5|csv]", help="What to make.")],
+    name: Annotated[str, Argument(metavar="FORMAT", help=f"One of {', '.join(FORMATS)}.")],
     recordings: Recordings,
-    output: Annotated[Path, Option(metavar="OUT", help="A new folder, or for csv of one recording a new .csv file.")],
+    output: Annotated[Path, Option(metavar="OUT", help="A folder that does not exist yet.")],
     fps: Annotated[int, Option(help=f"Frames per second: 1 .. {FASTEST}.")] = 30,
     trim: Annotated[bool, Option("--trim", help="Leave out times before and after motion.")] = False,
     workers: Annotated[int, Option(min=1, help="Processes; the result is the same for any number.")] = 1,
@@ -161,26 +149,17 @@ def export(
     lerobot: a LeRobotDataset, with a video of each camera; needs the extra `lerobot`. hdf5: a file each, for trainers
     of ACT; needs the extra `export`. csv: tables of the same numbers.
     """
-    write: Write = write_table
-    join: Callable[[Sequence[Path], Path], None] = gather_tables
-    if format is Format.LEROBOT:
-        require_lerobot()
-        write, join = write_shard, join_shards
-    elif format is Format.HDF5:
-        require_h5py()
-        write, join = write_file, gather_files
-    elif output.suffix == ".csv":
-        if len(files := recordings_in(recordings)) > 1:
-            raise ConfigError(f"--output {output}: for {len(files)} recordings; allowed: a folder, or one recording")
-        join = move_table
-    sampling = FrameSampling(fps, trim, pictures=not no_pictures and format is not Format.CSV)
+    if (chosen := FORMATS.get(name)) is None:
+        raise ConfigError(f"export {name}: allowed: {', '.join(FORMATS)}")
+    chosen.require()
+    sampling = FrameSampling(fps, trim, pictures=not no_pictures)
     target, files = Output(output), recordings_in(recordings)
     try:
         with counting("recordings") as progress:
             made = keep_episodes(
                 files,
                 sampling,
-                write,
+                chosen.write,
                 target.episodes(),
                 workers=workers,
                 skip_bad=skip_bad,
@@ -192,7 +171,7 @@ def export(
         say(f"skipped: {fault}", style="yellow")
     if not made.kept:
         raise RecordingError("none of the recordings can be exported")
-    target.write(lambda path: join(made.kept, path))
+    target.write(lambda path: chosen.join(made.kept, path))
     whole = len(made.kept) + len(made.skipped) == len(files)
     count = f"{len(made.kept)} of" if whole else f"{len(made.kept)} episodes of"
     print(f"{output}: {count} {len(files)} recordings at {fps} frames per second")

@@ -1,22 +1,31 @@
-"""Episodes of recordings as vectors at a fixed rate, and the pictures that belong to them."""
+"""Episodes of recordings as vectors at a fixed rate and pictures, made by several processes and kept until all are."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+import hashlib
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.features import Names, features
-from q2r2_control.export.sampling import CameraFrames, sample
-from q2r2_control.recording.episode_spans import WHOLE, EpisodeSpan, read_spans
+from q2r2_control.export.sampling import CameraFrames, Names, Vectors, features, sample
+from q2r2_control.recording.reader import WHOLE, EpisodeSpan, read_spans
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
 
 FASTEST = 1000  # [frames/s]
+_FORMAT = 5  # of kept episodes; those of another one are made again
 
 
 @dataclass(frozen=True)
@@ -42,14 +51,13 @@ class EpisodeVectors:
     fps: int
     names: Names  # of the numbers of each feature
     notes: dict[str, str]  # program, machine, operator and the like, as recorded
-    vectors: dict[str, npt.NDArray[np.float32]]
+    vectors: Vectors
     success: bool | None = None  # None: nobody said
     part: int = 0  # which of the episodes in the file, from 1 on; 0: the whole
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # pictures by camera, one a frame
 
     @property
     def frames(self) -> int:
-        """Their number."""
         return len(next(iter(self.vectors.values())))
 
     def outcome(self) -> dict[str, npt.NDArray[np.bool_]]:
@@ -58,26 +66,11 @@ class EpisodeVectors:
         return {"next.done": done, "next.success": done & bool(self.success)}
 
 
-@dataclass(frozen=True)
-class EpisodePart:
-    """An episode in a recording that has several; number 0: the whole."""
-
-    number: int = 0  # from 1 on
-    span: EpisodeSpan = WHOLE
-
-    def name_in(self, file: Path) -> str:
-        """The name of an episode of this recording."""
-        return file.stem + (f"-{self.number}" if self.number else "")
-
-
-def make_episode(file: Path, sampling: FrameSampling, part: EpisodePart | None = None) -> EpisodeVectors:
-    """An episode of a recording; its pictures are read when they are asked for.
-
-    Raises :class:`RecordingError` that names the file and what is wrong.
-    """
+def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None = None) -> EpisodeVectors:
+    """An episode of a recording, or the whole. Raises :class:`RecordingError`, which names the file."""
     recording = open_recording(file)
-    part = part or EpisodePart(0, replace(WHOLE, success=recording.conclusion.success))
-    frames = sample(recording, sampling.fps, sampling.trim, part.span)
+    span = span or replace(WHOLE, success=recording.conclusion.success)
+    frames = sample(recording, sampling.fps, sampling.trim, span)
     cell, robot = cell_and_robot_of(recording)
     try:
         vectors, labels = features(frames, robot)
@@ -94,18 +87,152 @@ def make_episode(file: Path, sampling: FrameSampling, part: EpisodePart | None =
         names=labels,
         notes=notes,
         vectors=vectors,
-        success=part.span.success,
-        part=part.number,
+        success=span.success,
+        part=span.number,
         cameras={name: CameraFrames(recording, name, cell.cameras[name], stamps) for name in cameras},
     )
 
 
-def parts_to_export(file: Path) -> list[EpisodePart]:
+def spans_to_export(file: Path) -> list[EpisodeSpan]:
     """The episodes of a recording but those that its operator discarded; of a file that cannot be read the whole."""
     try:
-        spans = read_spans(open_recording(file))
+        return [span for span in read_spans(open_recording(file)) if not span.discarded]
     except RecordingError:
-        return [EpisodePart()]  # whoever makes an episode of it finds out
-    if spans[0].whole:
-        return [EpisodePart(0, spans[0])]
-    return [EpisodePart(number, span) for number, span in enumerate(spans, 1) if not span.discarded]
+        return [WHOLE]  # make_episode says what is wrong with it
+
+
+Write = Callable[[EpisodeVectors, Path], None]  # an episode as a new file or folder; importable, for other processes
+_Job = tuple[Path, FrameSampling, EpisodeSpan, Write, Path]
+
+
+@dataclass(frozen=True)
+class Exported:
+    kept: list[Path]  # episodes, in the order of their recordings
+    skipped: list[str]  # what was wrong with the others, a line each
+
+
+def keep_episodes(
+    files: Sequence[Path],
+    sampling: FrameSampling,
+    write: Write,
+    folder: Path,
+    *,
+    workers: int = 1,
+    skip_bad: bool = False,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Exported:
+    """``write`` the episodes of recordings into ``folder``; those that are there already are not made again.
+
+    The same comes out for any number of ``workers``. ``progress`` is called with how many are through. Raises the
+    :class:`RecordingError` of the first bad recording unless ``skip_bad``, and :class:`ConfigError` where nothing can
+    be written or a worker was killed.
+    """
+    jobs: list[_Job] = [
+        (file, sampling, span, write, folder / _name(file, sampling, span, write))
+        for file in files
+        for span in spans_to_export(file)
+    ]
+    exported = Exported([], [])
+    with closing(_results(jobs, min(workers, len(jobs)))) as results:
+        for done, (job, fault) in enumerate(zip(jobs, results, strict=True), start=1):
+            if fault is not None and not skip_bad:
+                raise RecordingError(fault)
+            if fault is None:
+                exported.kept.append(job[-1])
+            else:
+                exported.skipped.append(fault)
+            progress(done)
+    return exported
+
+
+def _results(jobs: Sequence[_Job], workers: int) -> Generator[str | None]:
+    """What :func:`_keep` returns of each job, in their order."""
+    if workers <= 1:
+        yield from map(_keep, jobs)
+        return
+    # Spawned, not forked: this process may have threads. Ctrl-C reaches all of them, and this process ends the others.
+    ignored = (signal.SIGINT, signal.SIG_IGN)
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=signal.signal, initargs=ignored)
+    try:
+        yield from pool.map(_keep, jobs)
+    except (BrokenProcessPool, OSError) as error:  # OSError: of a pool that breaks while it is given its jobs
+        raise ConfigError(
+            "a process of --workers was killed, as for want of memory; the same command goes on with what is made"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _keep(job: _Job) -> str | None:
+    """Write one episode unless it is there, where a whole one only ever is; returns what was wrong."""
+    file, sampling, span, write, target = job
+    if target.exists():
+        return None
+    unfinished = target.with_name(f"{target.name}.unfinished")
+    try:
+        write(make_episode(file, sampling, span), unfinished)
+        for path in (unfinished, *unfinished.rglob("*")):
+            if path.is_file():
+                with path.open("rb") as stream:
+                    os.fsync(stream.fileno())  # no half of it is kept where power fails
+        unfinished.replace(target)
+    except RecordingError as error:
+        return str(error)
+    except OSError as error:
+        raise ConfigError(f"--output {target.parent}: {error.strerror or error}") from error
+    return None
+
+
+def _name(file: Path, sampling: FrameSampling, span: EpisodeSpan, write: Write) -> str:
+    """Of a kept episode; another one after any change of the recording or of what is asked for."""
+    try:
+        status = file.stat()
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot be read: {error.strerror}") from error
+    made_of = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), span.number]
+    identity = json.dumps([*made_of, write.__module__, write.__name__, _FORMAT])
+    key = hashlib.sha256(identity.encode()).hexdigest()[:24]
+    return f"{file.stem}-{span.number}.{key}" if span.number else f"{file.stem}.{key}"
+
+
+class Output:
+    """The new folder of an export. Episodes of one that was interrupted stay in ``OUT.partial`` for the next.
+
+    Raises :class:`ConfigError` for an output that exists and one that cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._refuse_existing()
+        self._partial = path.with_name(f"{path.name}.partial")
+
+    def episodes(self) -> Path:
+        """The folder in which episodes are kept until the output is whole."""
+        folder = self._partial / "episodes"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"--output {self._path}: {error.strerror}: {error.filename}") from error
+        return folder
+
+    def tidy(self) -> None:
+        """Remove what is kept for the next export, if that is nothing."""
+        with suppress(OSError):
+            (self._partial / "episodes").rmdir()
+            self._partial.rmdir()
+
+    def write(self, write: Callable[[Path], None]) -> None:
+        """Let ``write`` make the folder, and put it into its place."""
+        made = self._partial / "output"
+        try:
+            shutil.rmtree(made, ignore_errors=True)
+            write(made)
+            self._refuse_existing()
+            made.rename(self._path)
+            shutil.rmtree(self._partial)
+        except OSError as error:
+            raise ConfigError(f"--output {self._path}: {error.strerror or error}") from error
+
+    def _refuse_existing(self) -> None:
+        if self._path.exists() or self._path.is_symlink():
+            raise ConfigError(f"--output {self._path}: exists; allowed: a name that does not exist yet")

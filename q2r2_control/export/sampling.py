@@ -1,86 +1,85 @@
-"""Frames at a fixed rate, out of the ticks of a recording.
+"""Frames at a fixed rate out of the ticks of a recording, and the features that a dataset has of them.
 
-Frame k is at t_k = t_0 + k / fps, to the nanosecond, where t_0 is the time of the first tick. What is observed at it is
-that of the newest tick at or before t_k, what is commanded that of the first tick at or after t_k: so an observation
-never knows the future, and a command was decided on no earlier than what was observed. A tick at t_k gives both.
+Frame k is at t_k = t_0 + k / fps, to the nanosecond, where t_0 is the time of the first tick. Observations are of the
+newest tick at or before t_k, commands of the first tick at or after it: an observation never knows the future, and a
+command was decided on no earlier than what was observed.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pinocchio as pin
 from PIL import Image, UnidentifiedImageError
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import RecordingError
-from q2r2_control.recording.episode_spans import WHOLE, EpisodeSpan
 from q2r2_control.recording.messages import NANOSECONDS
-from q2r2_control.recording.reader import Picture, Recording, TickChunk
-from q2r2_control.recording.tick_rows import targets_or_tools
+from q2r2_control.recording.reader import WHOLE, EpisodeSpan, Picture, Recording
+from q2r2_control.recording.recorded_ticks import check_tools, tool_poses
+from q2r2_control.recording.tick_rows import NOT_MEASURED, POSE_FIELDS, targets_or_tools
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 Columns = dict[str, npt.NDArray[Any]]
+Vectors = dict[str, npt.NDArray[np.float32]]
+Names = dict[str, tuple[str, ...]]
+Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b
 
 OBSERVED = ("position", "velocity", "effort", "opening")
 COMMANDED = ("reference", "gripper", "target", "reference_tool")
+MOTION = ("x", "y", "z", "rx", "ry", "rz")
 _MOVING = 0.01  # fastest joint of a reference that moves [rad/s]
+_OLDEST = 2  # periods of the camera: one picture may be lost
 
 
 def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan = WHOLE) -> dict[str, Array]:
     """What is observed and commanded at each of n frames of the ``span``, whose first tick gives t_0.
 
-    ``position``, ``velocity``, ``effort`` (n, joints) are measured [rad, rad/s, Nm], ``opening`` (n, arms) too, 0
-    closed .. 1 open, -inf where it is not measured. ``reference`` (n, joints) and ``gripper`` (n, arms) are commanded.
-    ``target`` (n, arms, 7), x y z qx qy qz qw in the world, is what the operator asks for, and the tool at the
-    reference (``reference_tool``) while that is nothing. ``time`` (n,) [s] is since t_0, ``stamp`` (n,) the time of day
-    [ns].
-
-    ``trim``: from the first to the last tick at which an arm is engaged or the reference moves. Raises
-    :class:`RecordingError` for a damaged file, one without a tick to take, and one in which ticks were lost for longer
-    than a frame.
+    Measured are ``position``, ``velocity``, ``effort`` (n, joints) [rad, rad/s, Nm] and ``opening`` (n, arms), 0 closed
+    .. 1 open, -inf: not measured. Commanded are ``reference`` (n, joints), ``gripper`` (n, arms), and as poses x y z qx
+    qy qz qw in the world (n, arms, 7) ``reference_tool`` and the operator's ``target``, or else that tool. ``time``
+    (n,) [s] is since t_0, ``stamp`` (n,) the time of day [ns]. ``trim``: from the first to the last tick at which an
+    arm is engaged or the reference moves. Raises :class:`RecordingError` for a damaged file, one without a tick to
+    take, and one in which ticks were lost for longer than a frame.
     """
-    picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("time", *OBSERVED, *COMMANDED)}
+    picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("stamp", *OBSERVED, *COMMANDED)}
     start, end, count = None, 0, 0
-    previous: Columns | None = None
+    known: Columns = {}
     for columns in _ticks(recording, fps):
-        known = columns
-        if previous is not None:
-            known = {name: np.concatenate((previous[name], columns[name])) for name in columns}
-        previous = {name: values[-1:] for name, values in columns.items()}
+        # With the last tick of the chunk before, which may be the newest one of a frame in this chunk.
+        known = {name: np.concatenate((known.get(name, values[:0])[-1:], values)) for name, values in columns.items()}
         passed = (columns["time"] - recording.about.epoch) / NANOSECONDS
         inside = (span.start <= passed) & (passed <= span.end)
-        counting = np.flatnonzero(inside & columns["active"] if trim else inside)
+        counting = columns["time"][inside & columns["active"] if trim else inside]
         if len(counting):
-            start = int(columns["time"][counting[0]]) if start is None else start
-            end = int(columns["time"][counting[-1]])
+            start = int(counting[0]) if start is None else start
+            end = int(counting[-1])
         if start is None:
             continue
         times = known["time"]
         due = _times_until(int(times[-1]), start, fps, count)
         count += len(due)
+        picked["stamp"].append(due)
         observed = np.searchsorted(times, due, side="right") - 1
         commanded = np.searchsorted(times, due, side="left")
-        picked["time"].append(due)
-        for name in OBSERVED:
-            picked[name].append(known[name][observed])
-        for name in COMMANDED:
-            picked[name].append(known[name][commanded])
-    if previous is None:
+        for name in (*OBSERVED, *COMMANDED):
+            picked[name].append(known[name][observed if name in OBSERVED else commanded])
+    if not known:
         raise RecordingError(f"{recording.file}: no tick was recorded")
     if start is None:
         why = "no arm was ever engaged or moved, so --trim leaves nothing" if trim else "no tick is in the episode"
         raise RecordingError(f"{recording.file}: {why}")
     frames = {name: np.concatenate(values) for name, values in picked.items()}
-    kept = frames["time"] <= end
+    kept = frames["stamp"] <= end
     frames = {name: values[kept] for name, values in frames.items()}
-    frames["stamp"] = frames["time"]
-    frames["time"] = (frames["stamp"] - start) / NANOSECONDS
-    return frames
+    return frames | {"time": (frames["stamp"] - start) / NANOSECONDS}
 
 
 def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArray[np.int64]:
@@ -106,30 +105,96 @@ def _ticks(recording: Recording, fps: int) -> Iterator[Columns]:
                 f"{recording.file}: {int(numbers[gap + 1] - numbers[gap]) - 1} ticks were lost after {when:.3f} s when "
                 f"it was recorded; allowed: none for longer than a frame, 1/{fps} s"
             )
-        yield _columns(chunk)
+        rows, arms = chunk.rows, chunk.rows["arms"]
+        yield {
+            "time": chunk.times,
+            "active": (arms["engaged"] > 0.5).any(axis=1) | (np.abs(rows["reference_v"]).max(axis=1) > _MOVING),
+            "position": rows["q"],
+            "velocity": rows["v"],
+            "effort": rows["tau"],
+            "opening": arms["opening"],
+            "reference": rows["reference_q"],
+            "gripper": arms["commanded"],
+            "target": targets_or_tools(rows),
+            "reference_tool": arms["tool"],
+        }
 
 
-def _columns(chunk: TickChunk) -> Columns:
-    """One row of each for every tick of a chunk."""
-    rows, arms = chunk.rows, chunk.rows["arms"]
-    return {
-        "time": chunk.times,
-        "active": (arms["engaged"] > 0.5).any(axis=1) | (np.abs(rows["reference_v"]).max(axis=1) > _MOVING),
-        "position": rows["q"],
-        "velocity": rows["v"],
-        "effort": rows["tau"],
-        "opening": arms["opening"],
-        "reference": rows["reference_q"],
-        "gripper": arms["commanded"],
-        "target": targets_or_tools(rows),
-        "reference_tool": arms["tool"],
+def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]:
+    """The vectors (n, size) of the n ``frames`` of :func:`sample` by feature, and the names of their numbers.
+
+    Grippers that the plant does not measure, or that are not commanded, are left out. Raises :class:`RecordingError`,
+    without the file's name, for what is not a number, and where the robot is not the recorded one.
+    """
+    arms, joints = tuple(robot.arms), robot.joint_names
+    check_tools(frames["reference"][0], frames["reference_tool"][0], robot)
+    measured = _known(frames, "opening", arms)
+    commanded = _known(frames, "gripper", arms)
+    tools = _continuous(tool_poses(frames["position"], robot))
+    targets = _continuous(frames["target"], tools[0])
+    poses = tuple(f"{arm}_{number}" for arm in arms for number in POSE_FIELDS)
+    count = len(tools)
+    made: dict[str, tuple[Array, tuple[str, ...]]] = {
+        "observation.state": (
+            np.hstack((frames["position"], frames["opening"][:, measured])),
+            (*joints, *(f"{arms[index]}_gripper" for index in measured)),
+        ),
+        "observation.velocity": (frames["velocity"], joints),
+        "observation.effort": (frames["effort"], joints),
+        "observation.tool": (tools.reshape(count, -1), poses),
+        "action": (
+            np.hstack((frames["reference"], frames["gripper"][:, commanded])),
+            (*joints, *(f"{arms[index]}_gripper" for index in commanded)),
+        ),
+        "action.tool": (targets.reshape(count, -1), poses),
+        "action.tool_delta": (
+            _to_next(targets).reshape(count, -1),
+            tuple(f"{arm}_{number}" for arm in arms for number in MOTION),
+        ),
+    }
+    for name, (values, labels) in made.items():
+        if not (finite := np.isfinite(values)).all():
+            frame, column = np.argwhere(~finite)[0]
+            raise RecordingError(f"{name}[{labels[column]}] is no finite number at frame {frame}")
+    return {name: values.astype(np.float32) for name, (values, _) in made.items()}, {
+        name: labels for name, (_, labels) in made.items()
     }
 
 
-Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b
+def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> list[int]:
+    """Arms of which there is an opening at every frame; those of which there never is one have no gripper."""
+    unknown = frames[what] == NOT_MEASURED
+    for index, arm in enumerate(arms):
+        if unknown[:, index].any() and not unknown[:, index].all():
+            raise RecordingError(f"the {what} of arm {arm} is not known at frame {np.argmax(unknown[:, index])}")
+    return [index for index in range(len(arms)) if not unknown[:, index].any()]
 
-_OLDEST = 2  # periods of the camera: one picture may be lost
-_NANOSECONDS = 1_000_000_000
+
+def _continuous(poses: Array, first: Array | None = None) -> Array:
+    """Poses (n, arms, 7) whose quaternions do not change sign from frame to frame.
+
+    The first has the sign of ``first`` (arms, 7), or else its largest number is positive.
+    """
+    quaternions = poses[..., 3:]
+    if first is None:
+        largest = np.abs(quaternions[0]).argmax(axis=-1)[..., None]
+        along = np.take_along_axis(quaternions[0], largest, axis=-1)[..., 0]
+    else:
+        along = np.sum(quaternions[0] * first[..., 3:], axis=-1)
+    changes = np.concatenate((along[None], np.sum(quaternions[1:] * quaternions[:-1], axis=-1)))
+    signs = np.cumprod(np.where(changes < 0.0, -1.0, 1.0), axis=0)
+    return np.concatenate((poses[..., :3], quaternions * signs[..., None]), axis=-1)
+
+
+def _to_next(poses: Array) -> Array:
+    """Motion (n, arms, 6) [m, rad] from each pose to that of the next frame, in the former; zeros for the last."""
+    motions = np.zeros((*poses.shape[:2], 6))
+    for index in range(poses.shape[1]):
+        placements = [pin.XYZQUATToSE3(pose) for pose in poses[:, index]]
+        for frame, (now, then) in enumerate(pairwise(placements)):
+            motion = now.actInv(then)
+            motions[frame, index] = *motion.translation, *pin.log3(motion.rotation)
+    return motions
 
 
 @dataclass(frozen=True)
@@ -143,39 +208,34 @@ class CameraFrames:
 
     @property
     def size(self) -> tuple[int, int, int]:
-        """Rows, columns and colours of a picture."""
         return (self.config.height, self.config.width, 3)
 
     def __iter__(self) -> Iterator[Pixels]:
         """Raises :class:`RecordingError` for a frame whose newest picture is older than two of the camera's periods."""
-        return _pictures_at(self.recording, self.name, self.config, self.stamps)
+        pictures = self.recording.pictures(self.name)
+        newest, coming = None, next(pictures, None)
+        pixels: Pixels | None = None
+        for stamp in self.stamps:
+            while coming is not None and coming.time <= stamp:
+                newest, coming, pixels = coming, next(pictures, None), None
+            age = None if newest is None else (stamp - newest.time) / NANOSECONDS
+            if newest is None or age is None or age * self.config.rate > _OLDEST:
+                what = "no picture yet" if age is None else f"a picture {age:.3f} s old"
+                raise RecordingError(
+                    f"{self.recording.file}: camera {self.name} has {what} at "
+                    f"{(stamp - self.recording.about.epoch) / NANOSECONDS:.3f} s; allowed: at most two of its periods, "
+                    f"{_OLDEST / self.config.rate:.3f} s; --no-pictures leaves them out"
+                )
+            if pixels is None:
+                pixels = self._decoded(newest)
+            yield pixels
 
-
-def _pictures_at(recording: Recording, name: str, camera: CameraConfig, stamps: Sequence[int]) -> Iterator[Pixels]:
-    pictures = recording.pictures(name)
-    newest: Picture | None = None
-    coming = next(pictures, None)
-    pixels: Pixels | None = None
-    for stamp in stamps:
-        while coming is not None and coming.time <= stamp:
-            newest, coming, pixels = coming, next(pictures, None), None
-        if newest is None or (stamp - newest.time) * camera.rate > _OLDEST * _NANOSECONDS:
-            when = (stamp - recording.about.epoch) / _NANOSECONDS
-            age = "no picture yet" if newest is None else f"a picture {(stamp - newest.time) / _NANOSECONDS:.3f} s old"
-            raise RecordingError(
-                f"{recording.file}: camera {name} has {age} at {when:.3f} s; allowed: at most two of its periods, "
-                f"{_OLDEST / camera.rate:.3f} s; --no-pictures leaves them out"
-            )
-        if pixels is None:
-            pixels = _decoded(recording, name, camera, newest)
-        yield pixels
-
-
-def _decoded(recording: Recording, name: str, camera: CameraConfig, picture: Picture) -> Pixels:
-    try:
-        pixels = np.asarray(Image.open(io.BytesIO(picture.jpeg)).convert("RGB"))
-    except (UnidentifiedImageError, OSError) as error:
-        raise RecordingError(f"{recording.file}: damaged: a picture of camera {name} is no JPEG") from error
-    if pixels.shape != (camera.height, camera.width, 3):
-        raise RecordingError(f"{recording.file}: damaged: a picture of camera {name} has a size that the cell has not")
-    return pixels
+    def _decoded(self, picture: Picture) -> Pixels:
+        damaged = f"{self.recording.file}: damaged: a picture of camera {self.name}"
+        try:
+            pixels = np.asarray(Image.open(io.BytesIO(picture.jpeg)).convert("RGB"))
+        except (UnidentifiedImageError, OSError) as error:
+            raise RecordingError(f"{damaged} is no JPEG") from error
+        if pixels.shape != self.size:
+            raise RecordingError(f"{damaged} has a size that the cell has not")
+        return pixels

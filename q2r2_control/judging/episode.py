@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from q2r2_control.recording.about import Conclusion
 from q2r2_control.recording.messages import NANOSECONDS
 from q2r2_control.recording.reader import Recording, TickChunk
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, check_tools, tool_poses
-from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, targets_or_tools, tick_type
+from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, targets_or_tools, tick_type
 from q2r2_control.types import SIDES, Array
 
 FRAME = 0.01  # the time between two frames, at least [s]
@@ -84,7 +84,6 @@ class Episode:
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Their names, in the order of columns."""
         return self.recording.about.arms
 
     @property
@@ -107,24 +106,16 @@ class Episode:
 
 
 def read_episode(recording: Recording) -> Episode:
-    """Read a recording, and if it is damaged all before that.
-
-    Raises :class:`RecordingError` where its cell cannot be built.
-    """
+    """Read a recording, up to where it is damaged. Raises :class:`RecordingError` where its cell cannot be built."""
     config, robot = cell_and_robot_of(recording)
     read = _Read(recording)
-    damage, said = read.all_chunks(), Conclusion()
-    ticks, frames = _joined(Ticks, read.ticks), _joined(Frames, read.frames)
-    if damage is None:
-        if len(frames.at):
-            try:
-                check_tools(read.first_reference, frames.reference[0], robot)
-            except RecordingError as error:
-                raise RecordingError(f"{recording.file}: {error}") from error
+    damage = read.all_chunks()
+    ticks, frames, said = _joined(Ticks, read.ticks), _joined(Frames, read.frames), read.said
+    if damage is None and len(frames.at):
         try:
-            said = recording.conclusion
+            check_tools(read.first_reference, frames.reference[0], robot)
         except RecordingError as error:
-            damage = str(error)
+            raise RecordingError(f"{recording.file}: {error}") from error
     swapped = config.teleop.stance is not Stance.SIDE_BY_SIDE
     arms = {SIDES[1 - SIDES.index(arm)] if swapped else arm: arm for arm in recording.about.arms}
     hands = {hand: read.hand(hand, arm, ticks) for hand, arm in arms.items()}
@@ -133,25 +124,26 @@ def read_episode(recording: Recording) -> Episode:
 
 
 class _Read:
-    """What was read so far, chunk by chunk."""
-
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        about = recording.about
-        nothing = np.empty(0, dtype=tick_type(len(about.arms), len(about.joints)))
-        self.ticks = [_ticks(nothing, np.empty(0))]
-        self.frames = [_frames(nothing, np.empty(0, dtype=np.int64))]
+        self.ticks: list[Ticks] = []
+        self.frames: list[Frames] = []
         self.events: list[Event] = []
+        self.said = Conclusion()
         self.first_reference: Array = np.empty(0)
-        self._samples = [np.empty((0, len(SAMPLE_FIELDS)))]
+        self._samples: list[Array] = []
         self._count, self._slot = 0, -1
         self._origin = 0.0  # of the loop's clock [s]
+        about = recording.about
+        rows, times = np.empty(0, tick_type(len(about.arms), len(about.joints))), np.empty(0, np.int64)
+        self._add(TickChunk(rows, times, np.empty((0, len(SAMPLE_FIELDS))), {}))  # for a recording without a tick
 
     def all_chunks(self) -> str | None:
         """All there is; returns what is damaged."""
         try:
             for chunk in self._recording.chunks():
                 self._add(chunk)
+            self.said = self._recording.conclusion
         except RecordingError as error:
             return str(error).removeprefix(f"{self._recording.file}: ")
         except (ValueError, KeyError, IndexError, TypeError) as error:
@@ -161,17 +153,33 @@ class _Read:
     def _add(self, chunk: TickChunk) -> None:
         self.events += [event for events in chunk.events().values() for event in events]
         self._samples.append(chunk.samples)
-        if not len(chunk.rows):
-            return
+        rows, arms = chunk.rows, chunk.rows["arms"]
         t = (chunk.times - self._recording.about.epoch) / NANOSECONDS
-        if not self._count:
-            self._origin = float(chunk.rows["now"][0]) - float(t[0])
-            self.first_reference = chunk.rows["reference_q"][0].copy()
+        if len(t) and not self._count:
+            self._origin = float(rows["now"][0]) - float(t[0])
+            self.first_reference = rows["reference_q"][0].copy()
+        ticks = Ticks(
+            number=chunk.numbers,
+            t=t,
+            dt=rows["dt"],
+            compute_time=rows["compute_time"],
+            following=rows["following"] > 0.5,
+            certified=rows["certified"] > 0.5,
+            fallback=rows["fallback"] > 0.5,
+            distance=rows["closest_distance"],
+            margin=rows["margin"],
+            engaged=arms["engaged"] > 0.5,
+            rejected=arms["rejected"] > 0.5,
+            slip=arms["slip"],
+            slip_angle=arms["slip_angle"],
+            gripper=arms["wanted"],
+        )
         slots = np.floor(t / FRAME).astype(np.int64)
         at = np.flatnonzero(np.diff(slots, prepend=self._slot) > 0)
-        self.ticks.append(_ticks(chunk.rows, t))
-        self.frames.append(_frames(chunk.rows[at], self._count + at))
-        self._count, self._slot = self._count + len(t), int(slots[-1])
+        shown = rows[at]
+        self.ticks.append(ticks)
+        self.frames.append(Frames(self._count + at, shown["q"], targets_or_tools(shown), shown["arms"]["tool"]))
+        self._count, self._slot = self._count + len(t), int(slots.max(initial=self._slot))
 
     def hand(self, hand: str, arm: str, ticks: Ticks) -> Hand:
         rows = np.concatenate(self._samples)
@@ -180,39 +188,12 @@ class _Read:
         return Hand(arm, rows[:, 2] - self._origin, polled, rows[:, 4:7])
 
 
-def _ticks(rows: Rows, t: Array) -> Ticks:
-    arms = rows["arms"]
-    return Ticks(
-        number=rows["index"].astype(np.int64),
-        t=t,
-        dt=rows["dt"],
-        compute_time=rows["compute_time"],
-        following=rows["following"] > 0.5,
-        certified=rows["certified"] > 0.5,
-        fallback=rows["fallback"] > 0.5,
-        distance=rows["closest_distance"],
-        margin=rows["margin"],
-        engaged=arms["engaged"] > 0.5,
-        rejected=arms["rejected"] > 0.5,
-        slip=arms["slip"],
-        slip_angle=arms["slip_angle"],
-        gripper=arms["wanted"],
-    )
-
-
-def _frames(rows: Rows, at: npt.NDArray[np.int64]) -> Frames:
-    return Frames(at, rows["q"], targets_or_tools(rows), rows["arms"]["tool"])
-
-
 _Table = TypeVar("_Table", Ticks, Frames)
 
 
 def _joined(kind: type[_Table], parts: list[_Table]) -> _Table:
-    """All parts one after the other."""
-    columns: dict[str, Any] = {
-        field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind)
-    }
-    return kind(**columns)
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return kind(*map(np.concatenate, columns))
 
 
 def stretches(flags: Flags) -> list[tuple[int, int]]:

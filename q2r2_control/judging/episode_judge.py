@@ -1,4 +1,4 @@
-"""Verdicts on episodes of a recording, as soon as each has ended: whoever makes data learns of a bad one at once."""
+"""Verdicts on episodes of a recording, as soon as each has ended."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode import Episode, read_episode
 from q2r2_control.judging.judge import judge_episode, part_of, parts_of
-from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
 from q2r2_control.recording.helper_process import HelperProcess, reason_of
+from q2r2_control.recording.reader import EpisodeSpan, spans_of
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.summary.tick import Tick
 from q2r2_control.wording import sentence
@@ -28,43 +27,39 @@ _NICENESS = 10  # as the writer: the loop goes first
 _LOOKS = 0.3  # between two looks at the file, which grows twice a second [s]
 _PATIENCE = 30.0  # with a recorder that is behind [s]
 _BEFORE = 1_000_000_000  # of the beginning, where reading begins [ns]
+_TICKS_BETWEEN_LOOKS = 64  # between two looks at whether a verdict is there
+_OF_EPISODES = {
+    *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED),
+    *(ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
+}
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Question:
-    """Which episode is to be judged."""
+    """Which episode of a ``file`` is to be judged; ``timed``: times of its ``span`` are those of ticks in the file."""
 
     file: str
-    number: int  # of the episode, from 1 on
-    # Since the run began [s], so that no more has to be read. None: known to the file alone.
-    start: float | None = None
-    end: float | None = None
-    success: bool | None = None
+    span: EpisodeSpan
+    timed: bool
 
 
-@dataclass(frozen=True)
-class Answer:
-    """What became of it."""
-
-    number: int
-    keep: bool | None  # None: it could not be judged
-    line: str  # keep, discard and why, or why it could not be judged
-
-
-def main(requests: Iterator[Question], answer: Callable[[Answer], None]) -> None:
+def main(requests: Iterator[Question], answer: Callable[[Reason], None]) -> None:
     """Answer each question with the verdict on its episode."""
     run = os.getppid()
     with suppress(OSError):
         os.nice(_NICENESS)
     for question in requests:
         try:
-            found = _answer(question, run)
+            keep, line = _verdict(question, run)
         except (Q2R2Error, OSError) as error:
-            found = _not_judged(question, reason_of(error))
-        answer(found)
+            keep, line = None, f"not judged: {reason_of(error)}"
+        number = question.span.number
+        answer(Reason.of(ReasonKind.VERDICT, episode=number, keep=keep, line=line[:LONGEST_LINE]))
 
 
-def _answer(question: Question, run: int) -> Answer:
+def _verdict(question: Question, run: int) -> tuple[bool | None, str]:
     """``run``: the process that asks, as long as there is somebody to answer."""
     until = time.monotonic() + _PATIENCE
     problem = f"it was not written within {_PATIENCE:g} s"
@@ -72,38 +67,22 @@ def _answer(question: Question, run: int) -> Answer:
         try:
             if (episode := written_episode(question)) is not None:
                 verdict = judge_episode(episode).verdict
-                return Answer(question.number, verdict.keep, verdict.line[:LONGEST_LINE])
+                return verdict.keep, verdict.line
         except RecordingError as error:  # of a file whose beginning is not written yet, too
             problem = str(error)
         time.sleep(_LOOKS)
-    return _not_judged(question, problem)
-
-
-def _not_judged(question: Question, problem: str) -> Answer:
-    return Answer(question.number, None, f"not judged: {problem}"[:LONGEST_LINE])
+    return None, f"not judged: {problem}"
 
 
 def written_episode(question: Question) -> Episode | None:
     """The episode; None where it is not in the file as a whole yet."""
-    recording = open_recording(Path(question.file))
-    if question.start is None or question.end is None:
-        parts = parts_of(read_episode(recording))
-        found = parts[question.number - 1] if len(parts) >= question.number else None
-        return found if found is not None and found.ended_by_operator else None
-    recording.since = recording.about.epoch + round(question.start * 1e9) - _BEFORE
+    recording, span = open_recording(Path(question.file)), question.span
+    if not question.timed:
+        found = parts_of(read_episode(recording))[span.number - 1 : span.number]
+        return found[0] if found and found[0].ended_by_operator else None
+    recording.since = recording.about.epoch + round(span.start * 1e9) - _BEFORE  # no more has to be read
     whole = read_episode(recording)
-    if not len(whole.ticks.t) or whole.ticks.t[-1] <= question.end:
-        return None
-    return part_of(whole, EpisodeSpan(question.start, question.end, success=question.success), question.number)
-
-
-_OF_EPISODES = {
-    *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED),
-    *(ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
-}
-_TICKS_BETWEEN_LOOKS = 64  # ticks between two looks at whether a verdict is there
-
-_logger = logging.getLogger(__name__)
+    return part_of(whole, span) if len(whole.ticks.t) and whole.ticks.t[-1] > span.end else None
 
 
 class EpisodeJudge:
@@ -113,15 +92,12 @@ class EpisodeJudge:
     """
 
     def __init__(self, file: Callable[[], Path | None], tell: Callable[[Reason], None], *, timed: bool = True) -> None:
-        """``file``: what is recorded to; ``tell``: is given each verdict.
-
-        ``timed``: times of events are those of ticks in the file, so only those of an episode have to be read.
-        """
+        """``timed``: times of events are those of ticks in the ``file``, so only an episode's have to be read."""
         self._file, self._tell, self._timed = file, tell, timed
         self._events: list[Event] = []
         self._asked: Question | None = None
         self._count = 0
-        self._answers: deque[Answer] = deque()
+        self._answers: deque[Reason] = deque()
         self._process: HelperProcess | None = None
         self._started = False
 
@@ -136,7 +112,6 @@ class EpisodeJudge:
 
     @property
     def pid(self) -> int | None:
-        """Number of its process; None where that has ended."""
         return None if self._process is None else self._process.pid
 
     def __call__(self, tick: Tick) -> None:
@@ -152,27 +127,21 @@ class EpisodeJudge:
         if event.kind not in _OF_EPISODES:
             return
         self._events.append(event)
-        number, last = len(spans := spans_of(self._events)), spans[-1]
-        file = self._file()
-        if last.whole or last.end == math.inf or last.discarded or file is None:
+        last, file = spans_of(self._events)[-1], self._file()
+        if last.number == 0 or last.end == math.inf or last.discarded or file is None:
             return
         if not self._started:
             self.start()
-        start, end = (last.start, last.end) if self._timed else (None, None)
-        question = Question(str(file.absolute()), number, start, end, last.success)
-        if question == self._asked:
-            return
-        self._asked = question
-        if self._process is not None:
+        question = Question(str(file.absolute()), last, self._timed)
+        if question != self._asked and self._process is not None:
             self._process.send(question)
+        self._asked = question
 
     def look(self) -> None:
-        """Tell the verdicts that are there."""
         while self._answers:
-            answer = self._answers.popleft()
-            if spans_of(self._events)[answer.number - 1].discarded:
+            verdict = self._answers.popleft()
+            if spans_of(self._events)[verdict.detail["episode"] - 1].discarded:
                 continue  # its operator has been faster
-            verdict = Reason.of(ReasonKind.VERDICT, episode=answer.number, keep=answer.keep, line=answer.line)
             _logger.info(sentence(verdict))
             self._tell(verdict)
         if self._process is not None and self._process.fault is not None:
@@ -189,9 +158,7 @@ class EpisodeJudge:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _fail(self, reason: str) -> None:

@@ -34,9 +34,7 @@ class HandFigures:
 def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
     """Figures of a hand's samples; ``dropout`` [s] is the longest time between poses that is none.
 
-    A time between poses counts as far as its arm is engaged in it, so that a headset that rests on the table spoils
-    nothing. The time from the last pose to the end of the run is one as well; one in which ticks were lost is none,
-    since samples are lost with them.
+    A time between poses, or from the last one to the end, counts as far as its arm is engaged and no tick was lost.
     """
     ticks, samples = episode.ticks, episode.hands[hand]
     engaged = ticks.engaged[:, episode.arms.index(samples.arm)] & ticks.following
@@ -131,16 +129,13 @@ class EpisodeFigures:
 
     @property
     def name(self) -> str:
-        """Of the file, and which of its episodes."""
         return Path(self.file).stem + ("" if self.part is None else f" #{self.part}")
 
 
 def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
     """The numbers of an episode; ``dropout`` [s] is the longest time between a hand's poses that is none."""
-    ticks = episode.ticks
-    following = ticks.following
+    ticks, following, count = episode.ticks, episode.ticks.following, len(episode.ticks.t)
     engaged = ticks.engaged.any(axis=1) & following
-    count = len(ticks.t)
     return EpisodeFigures(
         file=str(episode.recording.file),
         part=episode.part,
@@ -150,7 +145,12 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
         idle_share=idle_share(episode),
         hands={hand: hand_figures(episode, hand, dropout) for hand in episode.hands},
         arms={arm: arm_figures(episode, arm) for arm in episode.arms},
-        faults=_faults(episode),
+        # Refused presses are none, since nothing moved; nor is the other arm's pause that follows from a fault.
+        faults=[
+            Fault(event.t, event.arm, str(event.reason.root.kind), sentence(event.reason))
+            for event in episode.events
+            if is_fault(event) and not is_refusal(event) and event.kind is not ReasonKind.LINKED
+        ],
         fallback_ticks=int(ticks.fallback.sum()),
         fallback_share=float(ticks.fallback.mean()) if count else None,
         uncertified_ticks=int((~ticks.certified).sum()),
@@ -165,29 +165,14 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
     )
 
 
-def _faults(episode: Episode) -> list[Fault]:
-    """Refused presses are none, since nothing moved; nor is the pause of the other arm that follows from a fault."""
-    return [
-        Fault(event.t, event.arm, str(event.reason.root.kind), sentence(event.reason))
-        for event in episode.events
-        if is_fault(event) and not is_refusal(event) and event.kind is not ReasonKind.LINKED
-    ]
-
-
-def _least_mm(distances: np.ndarray) -> float | None:
+def _least_mm(distances: Array) -> float | None:
     known = distances[np.isfinite(distances)]
     return 1e3 * float(known.min()) if len(known) else None
 
 
 def timing_figures(episode: Episode) -> TimingFigures:
-    """Figures of an episode's ticks.
-
-    A tick that was lost is one whose number is not in the file; the time of which no tick is in the file is what lies
-    between its neighbours, less a period. Missed ticks are those of the loop, told from the time that each tick says
-    has passed since the one before, which lost ticks do not change.
-    """
-    ticks = episode.ticks
-    count = len(ticks.t)
+    """Figures of ticks; missed are those between which more time passed, by what each tick says, than a period."""
+    ticks, count = episode.ticks, len(episode.ticks.t)
     if not count:
         return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended)
     period = 1.0 / episode.config.loop_rate_hz

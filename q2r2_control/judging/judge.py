@@ -1,14 +1,14 @@
-"""Judges recordings, and keeps verdicts beside them."""
+"""Judges the episodes of recordings, and keeps verdicts beside them."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,30 +16,152 @@ from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.errors import RecordingError
 from q2r2_control.judging.episode import Episode, Hand, read_episode
 from q2r2_control.judging.figures import EpisodeFigures, figures_of
-from q2r2_control.judging.verdict import Verdict, verdict_of
-from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
-from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.reader import EpisodeSpan, Recording, spans_of
 from q2r2_control.recording.ros_recording import open_recording
+
+VERDICT_FILE = "verdict.json"
+_FORMAT = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """Why an episode is discarded."""
+
+    name: str  # of the threshold, or of what no threshold says: never_engaged, damaged, ended_by, operator
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Kept, or discarded for all of the ``reasons``."""
+
+    reasons: tuple[Rejection, ...]
+
+    @property
+    def keep(self) -> bool:
+        return not self.reasons
+
+    @property
+    def word(self) -> str:
+        return "keep" if self.keep else "discard"
+
+    @property
+    def line(self) -> str:
+        reasons = "; ".join(reason.text for reason in self.reasons)
+        return f"{self.word}: {reasons}" if reasons else self.word
+
+
+class _Unit(NamedTuple):
+    name: str = ""
+    scale: float = 1.0  # from the threshold's own unit, of the SI
+
+
+@dataclass(frozen=True, slots=True)
+class _Threshold:
+    """A limit of a number of an episode, or of each of its hands or arms."""
+
+    name: str  # min_...: at least; max_...: at most
+    of: Literal["episode", "hand", "arm", "timing"]
+    figure: str
+    words: str
+    unit: _Unit
+    figure_in_unit: bool = False  # and not in the threshold's
+
+    def reason(self, value: float | None, limit: float | None, whose: str) -> Rejection | None:
+        """Why a value is beyond the limit; what is None is not judged."""
+        if value is None or limit is None:
+            return None
+        scale, at_least = self.unit.scale, self.name.startswith("min_")
+        found = value / scale if self.figure_in_unit else value
+        if found >= limit if at_least else found <= limit:
+            return None
+        shown = f"{whose}{self.words} {scale * found:.1f} {self.unit.name}".strip()
+        return Rejection(self.name, f"{shown} ({'at least' if at_least else 'at most'} {scale * limit:.4g})")
+
+
+_MM, _MS, _DEGREES = _Unit("mm", 1e3), _Unit("ms", 1e3), _Unit("deg", math.degrees(1.0))
+_PERCENT, _OF_TIME, _OF_TICKS = (_Unit(f"%{of}", 1e2) for of in ("", " of the time", " of the ticks"))
+_THRESHOLDS = (
+    _Threshold("min_pose_rate", "hand", "pose_rate_hz", "poses at", _Unit("Hz")),
+    _Threshold("max_dropout_share", "hand", "dropout_share", "dropouts", _OF_TIME),
+    _Threshold("max_pose_gap", "hand", "longest_gap_s", "no pose for", _MS),
+    _Threshold("max_sample_age", "hand", "sample_age_ms_p99", "poses are old when they are used, p99", _MS, True),
+    _Threshold("max_delay", "arm", "hand_to_tool_ms", "moves later than its hand by", _MS, True),
+    _Threshold("max_rejected_share", "arm", "rejected_share", "unusable targets", _PERCENT),
+    _Threshold("max_leashed_share", "arm", "leashed_share", "leash dragged", _OF_TIME),
+    _Threshold("max_position_error_rms", "arm", "position_error_mm_rms", "tracking error RMS", _MM, True),
+    _Threshold("max_position_error_p99", "arm", "position_error_mm_p99", "tracking error p99", _MM, True),
+    _Threshold("max_rotation_error_rms", "arm", "rotation_error_deg_rms", "tracking error RMS", _DEGREES, True),
+    _Threshold("max_rotation_error_p99", "arm", "rotation_error_deg_p99", "tracking error p99", _DEGREES, True),
+    _Threshold("min_ldlj", "arm", "ldlj", "not smooth, LDLJ", _Unit()),
+    _Threshold("max_idle_share", "episode", "idle_share", "idle: no engaged arm moves", _PERCENT),
+    _Threshold("max_fallback_share", "episode", "fallback_share", "certified stops executed", _OF_TICKS),
+    _Threshold("max_uncertified_share", "episode", "uncertified_share", "without a certified stop", _OF_TICKS),
+    _Threshold("min_margin", "episode", "min_margin_mm", "nearer than a pair may be: margin", _MM, True),
+    _Threshold("max_lost_share", "timing", "lost_share", "ticks lost in the recording", _OF_TICKS),
+    _Threshold("max_lost_gap", "timing", "longest_lost_s", "ticks lost in the recording, at once", _MS),
+    _Threshold("max_missed_share", "timing", "missed_share", "loop was late: missed", _OF_TICKS),
+    _Threshold("max_tick_gap", "timing", "longest_tick_s", "loop stood still for", _MS),
+)
+
+
+def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
+    """Hold an episode's numbers to thresholds; a number that is None is not judged."""
+    reasons = list(_unreadable(figures, settings))
+    if not figures.engaged_s > 0.0:
+        return Verdict((*reasons, Rejection("never_engaged", "no arm was ever engaged")))
+    groups: dict[str, dict[str, Any]] = {
+        "hand": {f"{name} hand: ": hand for name, hand in figures.hands.items()},
+        "arm": {f"{name} arm: ": arm for name, arm in figures.arms.items()},
+        "episode": {"": figures},
+        "timing": {"": figures.timing},
+    }
+    for threshold in _THRESHOLDS:
+        limit = getattr(settings, threshold.name)
+        for whose, found in groups[threshold.of].items():
+            if (reason := threshold.reason(getattr(found, threshold.figure), limit, whose)) is not None:
+                reasons.append(reason)
+    if settings.max_faults is not None and len(figures.faults) > settings.max_faults:
+        first = figures.faults[0]
+        also = f", and {len(figures.faults) - 1} more" if len(figures.faults) > 1 else ""
+        what = f"fault: {first.arm} arm at {first.t:.2f} s: {first.reason}{also} (at most {settings.max_faults})"
+        reasons.append(Rejection("max_faults", what))
+    return Verdict(tuple(reasons))
+
+
+def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
+    if figures.discarded:
+        yield Rejection("operator", "its operator discarded it")
+    if figures.success is False and not settings.keep_failed:
+        yield Rejection("keep_failed", "it failed, as its operator or task says")
+    if figures.ended_by is not None:
+        yield Rejection("ended_by", f"a fault ended the run: {figures.ended_by}")
+    if figures.damage is not None:
+        yield Rejection("damaged", f"after {figures.duration_s:.2f} s {figures.damage}")
+    elif settings.needs_end and not figures.timing.ended:
+        yield Rejection("needs_end", "the recording has no end: its process was killed, or the disk was full")
 
 
 def parts_of(episode: Episode) -> list[Episode]:
     """The episodes of a recording in their order; where the operator told of none, the whole."""
     spans = spans_of(episode.events, episode.success)
-    if len(spans) == 1 and spans[0].whole:
-        return [replace(episode, success=spans[0].success)]
-    return [part_of(episode, span, number) for number, span in enumerate(spans, 1)]
+    return [part_of(episode, span) if span.number else replace(episode, success=span.success) for span in spans]
 
 
-def part_of(episode: Episode, span: EpisodeSpan, number: int) -> Episode:
-    """The ``number``-th episode of a recording. Times are since it began, and its first tick is number 0."""
+def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
+    """An episode of a recording. Times are since it began, and its first tick is number 0."""
     ticks, frames = episode.ticks, episode.frames
     first, end = np.searchsorted(ticks.t, span.start), np.searchsorted(ticks.t, span.end, side="right")
-    inside = slice(first, end)
-    cut = {name: values[inside] for name, values in vars(ticks).items()}
+    cut = {name: values[first:end] for name, values in vars(ticks).items()}
     began = float(cut["t"][0] - cut["dt"][0]) if len(cut["t"]) else 0.0
     if len(cut["t"]):
         cut |= {"t": cut["t"] - began, "number": cut["number"] - cut["number"][0]}
     shown = (first <= frames.at) & (frames.at < end)
+    hands = {}
+    for name, hand in episode.hands.items():
+        inside = (span.start <= hand.polled) & (hand.polled <= span.end)
+        received, polled = hand.received[inside] - began, hand.polled[inside] - began
+        hands[name] = Hand(hand.arm, received, polled, hand.position[inside])
     told = span.end < math.inf
     return replace(
         episode,
@@ -48,31 +170,19 @@ def part_of(episode: Episode, span: EpisodeSpan, number: int) -> Episode:
             **{name: values[shown] for name, values in vars(frames).items()} | {"at": frames.at[shown] - first}
         ),
         tools=episode.tools[shown],
-        hands={name: _hand(hand, span, began) for name, hand in episode.hands.items()},
+        hands=hands,
         events=[replace(event, t=event.t - began) for event in episode.events if span.start <= event.t <= span.end],
         damage=None if told else episode.damage,
         ended_by=None if told else episode.ended_by,
         success=span.success,
-        part=number,
+        part=span.number,
         discarded=span.discarded,
         ended_by_operator=told,
     )
 
 
-def _hand(hand: Hand, span: EpisodeSpan, began: float) -> Hand:
-    inside = (span.start <= hand.polled) & (hand.polled <= span.end)
-    received, polled = hand.received[inside] - began, hand.polled[inside] - began
-    return Hand(hand.arm, received, polled, hand.position[inside])
-
-
-VERDICT_FILE = "verdict.json"
-_FORMAT = 2
-
-
 @dataclass(frozen=True)
 class Judged:
-    """One episode, its numbers, and what became of them."""
-
     episode: Episode
     figures: EpisodeFigures
     verdict: Verdict
@@ -82,15 +192,11 @@ class Judged:
         """Plain data; what is not finite is None."""
         reasons = [asdict(reason) for reason in self.verdict.reasons]
         data = {"verdict": self.verdict.word, "reasons": reasons, "figures": asdict(self.figures)}
-        found: dict[str, Any] = _plain(data)
-        return found
+        return dict(json.loads(json.dumps(data), parse_constant=lambda name: None))
 
 
 def judge(recording: Recording, settings: JudgeSettings | None = None) -> list[Judged]:
-    """Judge the episodes of a recording by these thresholds, or by those of the cell that it was recorded with.
-
-    Raises :class:`RecordingError` where that cell cannot be built.
-    """
+    """Judge a recording's episodes, by its cell's thresholds or these. Raises as :func:`read_episode` does."""
     return [judge_episode(episode, settings) for episode in parts_of(read_episode(recording))]
 
 
@@ -102,10 +208,7 @@ def judge_episode(episode: Episode, settings: JudgeSettings | None = None) -> Ju
 
 
 def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> Iterator[Judged]:
-    """Judge recordings one after the other.
-
-    Raises :class:`RecordingError` for a file that is none, before the first is judged.
-    """
+    """Judge recordings. Raises :class:`RecordingError` for a file that is none, before the first is judged."""
     for recording in [open_recording(file) for file in files]:
         yield from judge(recording, settings)
 
@@ -124,11 +227,3 @@ def keep_verdicts(judged: Sequence[Judged]) -> Path:
     except OSError as error:
         raise RecordingError(f"{target}: {error.strerror}") from error
     return target
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

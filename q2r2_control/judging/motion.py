@@ -15,36 +15,36 @@ from q2r2_control.judging.episode import FRAME, Episode, Flags, stretches
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array
 
-PIECE = 1.0  # [s]
+PIECE = 1.0  # of a motion, for its smoothness [s]
 _HOP = 0.25  # from one piece to the next [s]
 _FEWEST = 8  # pieces
 _SLOWEST = 0.02  # mean speed of a piece that counts [m/s]
 _LONGEST_GAP = 0.05  # between two frames [s]
 _SMOOTHING = 0.02  # standard deviation of the Gaussian before jerk is taken, which halves the power at 6.6 Hz [s]
+LONGEST = 0.5  # delay that is looked for [s]
+_STEP = 0.005  # of delays, and of the times that are compared [s]
+_DIFFERENCE = 0.025  # to either side, over which a motion is a difference [s]
+_LEAST_MOTION = 0.01  # a hand that moves less has no delay [m/s], RMS
+_LEAST_FIT = 0.5  # of the tool's motion that the hand's explains
+_LOOK = 0.5  # what moves is elsewhere so much earlier or later [s]
+_MOVED, _TURNED = 2e-3, 0.02  # at least [m, rad]
 
 
 def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:
     """Median of :func:`ldlj`, of smoothed positions, over the pieces of a tool's motion.
 
-    ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. None: fewer than eight pieces, 2.75 s in
-    all, move at 20 mm/s on average; the median of so few says little.
+    ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. None: fewer than eight pieces move at 20 mm/s on average.
     """
     moving = []
     for begin, end in stretches(engaged & np.isfinite(position).all(axis=1)):
         moving += _pieces(t[begin:end], position[begin:end])
     if len(moving) < _FEWEST:
         return None
-    return float(np.median([ldlj(_smoothed(piece), FRAME) for piece in moving]))
-
-
-def _smoothed(position: Array) -> Array:
-    """A piece without what its ends make of the smoothing.
-
-    A tick that comes a millisecond late measures a tool at 0.3 m/s 0.3 mm off, and in real time there are many: three
-    derivatives of that would be more than those of the motion.
-    """
+    # A tick that comes a millisecond late measures a tool at 0.3 m/s 0.3 mm off, and in real time there are many: three
+    # derivatives of that would be more than those of the motion. The ends, which the smoothing changes, are cut off.
     cut = round(2.0 * _SMOOTHING / FRAME)
-    return np.asarray(gaussian_filter1d(position, _SMOOTHING / FRAME, axis=0))[cut:-cut]
+    smoothed = [gaussian_filter1d(piece, _SMOOTHING / FRAME, axis=0)[cut:-cut] for piece in moving]
+    return float(np.median([ldlj(piece, FRAME) for piece in smoothed]))
 
 
 def _pieces(t: Array, position: Array) -> list[Array]:
@@ -81,16 +81,7 @@ def ldlj(position: Array, dt: float) -> float:
     return -float(np.log(max(total, np.finfo(float).tiny)))
 
 
-LONGEST = 0.5  # delay that is looked for [s]
-_STEP = 0.005  # of delays, and of the times that are compared [s]
-_DIFFERENCE = 0.025  # to either side, over which a motion is a difference [s]
-_LEAST_MOTION = 0.01  # a hand that moves less has no delay [m/s], RMS
-_LEAST_FIT = 0.5  # of the tool's motion that the hand's explains
-
-
 class Track(NamedTuple):
-    """Where a point is over time."""
-
     t: Array  # (n,) [s], rising
     position: Array  # (n, 3) [m]
 
@@ -103,23 +94,24 @@ class Track(NamedTuple):
         return (ahead - behind) / (2.0 * _DIFFERENCE)
 
 
-def delays(episode: Episode, hand: str) -> tuple[float | None, float | None]:
-    """Delay [s] of the target, and of the measured tool, behind a hand's poses as they were received.
+def delays(episode: Episode, hand: str) -> list[float | None]:
+    """Delays [s] of the target, and of the measured tool, behind a hand's poses as they were received.
 
-    It is the tau that maximises the squared correlation of v(t) with M v_hand(t - tau) over all times t at which the
-    arm is engaged: v is the velocity of target or tool, M how the teleoperation maps the hand's axes to the world. So
-    neither anchors nor the scale matter, nor for how long the hand rests. None: the hand moves less than 10 mm/s RMS,
-    only turns, or explains less than half of that motion, as where the tool is held up; or there is no such maximum
-    within (0, 0.5) s.
+    A delay is the tau that maximises the squared correlation of v(t) with M v_hand(t - tau) over all times t at which
+    the arm is engaged: v is the velocity of target or tool, M (3, 3) how the teleoperation maps the hand's axes to the
+    world. Neither anchors nor the scale matter, nor for how long the hand rests. None: the hand moves less than
+    10 mm/s RMS, only turns, or explains less than half of that motion; or no maximum is within (0, 0.5) s.
     """
     samples = episode.hands[hand]
     arm = episode.arms.index(samples.arm)
     usable = np.isfinite(samples.position).all(axis=1) & np.isfinite(samples.received)
     received, first = np.unique(samples.received[usable], return_index=True)
     if len(received) < 2:
-        return None, None
-    teleop = episode.config.teleop
-    position = samples.position[usable][first] @ _axes_of(teleop.stance, teleop.axes).T
+        return [None, None]
+    motion = RelativeMotion(episode.config.teleop.stance, axes=episode.config.teleop.axes)
+    motion.anchor(pin.SE3.Identity(), pin.SE3.Identity())
+    axes = np.array([motion.target(pin.SE3(np.eye(3), axis)).translation for axis in np.eye(3)])  # M, transposed
+    position = samples.position[usable][first] @ axes
     t = episode.frame_t
     times = [
         np.arange(t[begin] + LONGEST + _DIFFERENCE, t[end - 1] - _DIFFERENCE, _STEP)
@@ -127,10 +119,9 @@ def delays(episode: Episode, hand: str) -> tuple[float | None, float | None]:
         if t[end - 1] - t[begin] > LONGEST + 0.1
     ]
     if not times:
-        return None, None
+        return [None, None]
     followers = [Track(t, np.nan_to_num(poses[:, arm, :3])) for poses in (episode.frames.target, episode.tools)]
-    target, tool = delays_behind(Track(received, position), followers, np.concatenate(times))
-    return target, tool
+    return delays_behind(Track(received, position), followers, np.concatenate(times))
 
 
 def delays_behind(hand: Track, followers: Sequence[Track], when: Array) -> list[float | None]:
@@ -138,13 +129,6 @@ def delays_behind(hand: Track, followers: Sequence[Track], when: Array) -> list[
     lags = np.arange(0.0, LONGEST + _STEP, _STEP)
     by_hand = [hand.velocity(when - lag) for lag in lags]
     return [_best(lags, by_hand, follower.velocity(when)) for follower in followers]
-
-
-def _axes_of(stance: str, axes: tuple[str, str, str]) -> Array:
-    """M (3, 3)."""
-    motion = RelativeMotion(stance, axes=axes)
-    motion.anchor(pin.SE3.Identity(), pin.SE3.Identity())
-    return np.stack([motion.target(pin.SE3(np.eye(3), axis)).translation for axis in np.eye(3)], axis=1)
 
 
 def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:
@@ -161,10 +145,6 @@ def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:
     before, peak, after = fits[best - 1 : best + 2]
     bend = before - 2.0 * peak + after
     return float(lags[best] + (0.5 * _STEP * (before - after) / bend if bend < 0.0 else 0.0))
-
-
-_LOOK = 0.5  # what moves is elsewhere so much earlier or later [s]
-_MOVED, _TURNED = 2e-3, 0.02  # at least [m, rad]
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,12 +171,10 @@ def arm_figures(episode: Episode, arm: str) -> ArmFigures:
     index = episode.arms.index(arm)
     ticks = episode.ticks
     engaged = ticks.engaged[:, index] & ticks.following
-    errors = tracking_errors(episode, index)
-    position, rotation = (error[np.isfinite(error)] for error in errors)
+    position, rotation = (error[np.isfinite(error)] for error in tracking_errors(episode, index))
     hand = next(hand for hand, samples in episode.hands.items() if samples.arm == arm)
     to_target, to_tool = delays(episode, hand)
     slips = [_rise(slip[:, index], engaged) for slip in (ticks.slip, ticks.slip_angle)]
-    ldlj = smoothness(episode.frame_t, episode.tools[:, index, :3], episode.engaged[:, index])
     return ArmFigures(
         engaged_s=float(ticks.dt[engaged].sum()),
         position_error_mm_rms=_rms(1e3 * position),
@@ -209,17 +187,16 @@ def arm_figures(episode: Episode, arm: str) -> ArmFigures:
         leashed_share=_share((slips[0] > 0.0) | (slips[1] > 0.0), engaged),
         slip_mm=1e3 * float(slips[0].sum()),
         slip_deg=float(np.degrees(slips[1].sum())),
-        ldlj=ldlj,
+        ldlj=smoothness(episode.frame_t, episode.tools[:, index, :3], episode.engaged[:, index]),
         gripper_changes=int((np.diff(ticks.gripper[ticks.following, index]) != 0.0).sum()),
     )
 
 
 def tracking_errors(episode: Episode, arm: int) -> tuple[Array, Array]:
     """(m,) distance [m] and angle [rad] of the measured tool from the target at the frames; NaN while not engaged."""
-    tools, targets = episode.tools[:, arm], episode.frames.target[:, arm]
+    tools, targets, engaged = episode.tools[:, arm], episode.frames.target[:, arm], episode.engaged[:, arm]
     position = np.linalg.norm(tools[:, :3] - targets[:, :3], axis=1)
     rotation = _angles(tools[:, 3:], targets[:, 3:])
-    engaged = episode.engaged[:, arm]
     return np.where(engaged, position, np.nan), np.where(engaged, rotation, np.nan)
 
 
@@ -227,28 +204,20 @@ def idle_share(episode: Episode) -> float | None:
     """Share of the run, until it begins to end, in which no arm is engaged or none of those moves.
 
     An arm moves where its tool, at the controller's reference, is more than 2 mm or 0.02 rad from where it was half a
-    second earlier or is half a second later, or its gripper is told to open or close in that time. So neither a hand
-    that trembles nor a stop between two motions counts. None: no tick is in the file.
+    second earlier or is half a second later, or its gripper is told to open or close in that time. A hand that trembles
+    does not move, a stop between two motions is not idle. None: no tick is in the file.
     """
-    moving = np.zeros(len(episode.frame_t), dtype=bool)
+    t, at = episode.frame_t, episode.frames.at
+    moving = np.zeros(len(t), dtype=bool)
     for arm in range(len(episode.arms)):
-        moving |= episode.engaged[:, arm] & _moves(episode, arm)
-    following = episode.ticks.following[episode.frames.at]
-    if not following.any():
-        return None
-    return float(1.0 - moving[following].mean())
-
-
-def _moves(episode: Episode, arm: int) -> Flags:
-    t, poses = episode.frame_t, episode.frames.reference[:, arm]
-    gripper = episode.ticks.gripper[episode.frames.at, arm]
-    moves = np.zeros(len(t), dtype=bool)
-    for shift in (-_LOOK, _LOOK):
-        other = np.clip(np.searchsorted(t, t + shift), 0, max(len(t) - 1, 0))
-        moves |= np.linalg.norm(poses[other, :3] - poses[:, :3], axis=1) > _MOVED
-        moves |= _angles(poses[other, 3:], poses[:, 3:]) > _TURNED
-        moves |= gripper[other] != gripper
-    return moves
+        poses, gripper = episode.frames.reference[:, arm], episode.ticks.gripper[at, arm]
+        for shift in (-_LOOK, _LOOK):
+            other = np.clip(np.searchsorted(t, t + shift), 0, max(len(t) - 1, 0))
+            moves = np.linalg.norm(poses[other, :3] - poses[:, :3], axis=1) > _MOVED
+            moves |= (_angles(poses[other, 3:], poses[:, 3:]) > _TURNED) | (gripper[other] != gripper)
+            moving |= episode.engaged[:, arm] & moves
+    following = episode.ticks.following[at]
+    return float(1.0 - moving[following].mean()) if following.any() else None
 
 
 def _angles(a: Array, b: Array) -> Array:

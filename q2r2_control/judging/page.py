@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
+import io
 from base64 import b64encode
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from q2r2_control.judging.episode import stretches
 from q2r2_control.judging.figures import EpisodeFigures
 from q2r2_control.judging.judge import Judged
-from q2r2_control.judging.plots import draw_episode
+from q2r2_control.judging.motion import tracking_errors
+from q2r2_control.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_COLOURS = {"left": "#1f6fb2", "right": "#d9722b"}
+_LINE_STYLES: dict[str, Any] = {"left": "-", "right": (0, (4, 3))}  # where both share a plot, the right lies on top
+_POINTS = 500  # of a line, at most
+_SPEED_OVER = 5  # frames
+_SHADE: dict[str, Any] = {"color": "#b0b0b0", "alpha": 0.35, "linewidth": 0.0}
+_LOST: dict[str, Any] = {"color": "#b3202c", "alpha": 0.4, "linewidth": 0.0}
+_FAULT: dict[str, Any] = {"color": "#6a4c93", "linestyle": "-.", "linewidth": 1.4}
+_LIMIT: dict[str, Any] = {"color": "#b3202c", "linestyle": "--", "linewidth": 1.2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,20 +37,17 @@ class FigureColumn:
     name: str
     unit: str
     digits: int
-    value: Callable[[EpisodeFigures], float | None]
-    words: tuple[str, ...] = ()  # in place of the numbers 0, 1 and so on
+    value: Callable[[EpisodeFigures], float | str | None]
 
     @property
     def heading(self) -> str:
-        """With the unit."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     def text(self, figures: EpisodeFigures) -> str:
-        """The number, or a dash where there is nothing to tell it by."""
         value = self.value(figures)
         if value is None:
             return "-"
-        return self.words[int(value)] if self.words else f"{value:.{self.digits}f}"
+        return value if isinstance(value, str) else f"{value:.{self.digits}f}"
 
 
 def _worst(values: Sequence[float | None], worst: Callable[..., float] = max) -> float | None:
@@ -45,7 +60,7 @@ def _percent(share: float | None) -> float | None:
 
 
 COLUMNS = (
-    FigureColumn("success", "", 0, lambda of: None if of.success is None else float(of.success), ("no", "yes")),
+    FigureColumn("success", "", 0, lambda of: None if of.success is None else "yes" if of.success else "no"),
     FigureColumn("time", "s", 1, lambda of: of.duration_s),
     FigureColumn("engaged", "s", 1, lambda of: of.engaged_s),
     FigureColumn("idle", "%", 0, lambda of: _percent(of.idle_share)),
@@ -66,12 +81,18 @@ def page_of(episodes: Sequence[Judged], title: str, progress: Callable[[int], No
     """The page; ``progress`` is told how many episodes are drawn."""
     rows, sections = [], []
     for number, judged in enumerate(episodes, 1):
-        name, badge = f"{number}. {escape(judged.figures.name)}", _badge(judged)
+        plain, word = escape(judged.figures.name), judged.verdict.word
+        name, mark = f"{number}. {plain}", "&#10003;" if judged.verdict.keep else "&#10007;"
+        badge = f'<b class="{word}">{mark} {word}</b>'
         cells = "".join(f"<td>{column.text(judged.figures)}</td>" for column in COLUMNS)
         rows.append(f'<tr><th><a href="#episode-{number}">{name}</a></th><td>{badge}</td>{cells}</tr>')
         reasons = "".join(f"<li>{escape(reason.text)}</li>" for reason in judged.verdict.reasons)
         about = f"<p>{escape(judged.figures.task)}</p><ul>{reasons}</ul>"
-        sections.append(f'<section id="episode-{number}"><h2>{name} {badge}</h2>{about}{_picture(judged)}</section>')
+        # Each picture is an image of its own, since names of elements are the same in all of them.
+        data = b64encode(draw_episode(judged).encode()).decode()
+        size = 'width="1248" height="806"'
+        picture = f'<img alt="plots of {plain}" {size} src="data:image/svg+xml;base64,{data}">'
+        sections.append(f'<section id="episode-{number}"><h2>{name} {badge}</h2>{about}{picture}</section>')
         progress(number)
     kept = sum(judged.verdict.keep for judged in episodes)
     return _PAGE.format(
@@ -84,17 +105,128 @@ def page_of(episodes: Sequence[Judged], title: str, progress: Callable[[int], No
     )
 
 
-def _picture(judged: Judged) -> str:
-    """As an image of its own, since names of elements are the same in all of them."""
-    data = b64encode(draw_episode(judged).encode()).decode()
-    alt = escape(f"plots of {judged.figures.name}")
-    return f'<img alt="{alt}" width="1248" height="806" src="data:image/svg+xml;base64,{data}">'
+def draw_episode(judged: Judged) -> str:
+    """Plots over time as the text of an SVG file, which does not grow with the episode."""
+    # Imported here, since it takes longer than all else that a command without plots needs.
+    import matplotlib as mpl
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13.0, 8.4), layout="constrained")
+    canvas = FigureCanvasSVG(figure)
+    grid = figure.subplots(3, 2, sharex=True)
+    end = float(judged.episode.ticks.t[-1]) if len(judged.episode.ticks.t) else 1.0
+    for axes, (draw, title, unit) in zip(grid.flat, _PLOTS, strict=True):
+        draw(axes, judged)
+        axes.set_title(title)
+        axes.set_ylabel(unit)
+        axes.grid(alpha=0.3)
+        axes.set_xlim(0.0, max(end, 1e-3))
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False)
+    for axes in grid[2]:
+        axes.set_xlabel("time [s]")
+    picture = io.StringIO()
+    with mpl.rc_context({"svg.hashsalt": "q2r2_control", "path.simplify_threshold": 0.3}):
+        canvas.print_svg(picture, metadata={"Date": None, "Creator": None})
+    return picture.getvalue()
 
 
-def _badge(judged: Judged) -> str:
-    word = judged.verdict.word
-    return f'<b class="{word}">{"&#10003;" if judged.verdict.keep else "&#10007;"} {word}</b>'
+def thinned(t: Array, values: Array, extreme: np.ufunc) -> tuple[Array, Array]:
+    """At most 500 points of a line: of pieces of equal length the ``extreme``, ``np.fmax`` or ``np.fmin``."""
+    if len(t) <= _POINTS:
+        return t, values
+    starts = np.unique(np.linspace(0, len(t), _POINTS, endpoint=False).astype(int))
+    return t[starts], extreme.reduceat(values, starts)
 
+
+def _draw_speed(axes: Axes, judged: Judged) -> None:
+    """Measured tools, and while no arm is engaged a grey ground."""
+    episode, t = judged.episode, judged.episode.frame_t
+    for index, arm in enumerate(episode.arms):
+        position = episode.tools[:, index, :3]
+        if len(t) > _SPEED_OVER:
+            passed = np.maximum(t[_SPEED_OVER:] - t[:-_SPEED_OVER], 1e-6)
+            speed = np.linalg.norm(position[_SPEED_OVER:] - position[:-_SPEED_OVER], axis=1) / passed
+            _draw(axes, arm, 0.5 * (t[_SPEED_OVER:] + t[:-_SPEED_OVER]), 1e3 * speed)
+    for number, (begin, stop) in enumerate(stretches(np.asarray(~episode.engaged.any(axis=1)))):
+        axes.axvspan(t[begin], t[min(stop, len(t) - 1)], label=None if number else "no arm engaged", **_SHADE)
+    for number, fault in enumerate(judged.figures.faults):
+        axes.axvline(fault.t, label=None if number else "fault", **_FAULT)
+    axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))  # of arms at rest not the rounding
+
+
+def _draw_errors(axes: Axes, judged: Judged) -> None:
+    for index, arm in enumerate(judged.episode.arms):
+        _draw(axes, arm, judged.episode.frame_t, 1e3 * tracking_errors(judged.episode, index)[0])
+    if (limit := judged.settings.max_position_error_p99) is not None:
+        axes.axhline(1e3 * limit, label="p99 at most", **_LIMIT)
+    axes.set_ylim(bottom=0.0)
+
+
+def _draw_hands(axes: Axes, judged: Judged) -> None:
+    """Each time between two poses at its end, so that a dropout is as high as it is long."""
+    for name, hand in judged.episode.hands.items():
+        received = np.unique(hand.received[np.isfinite(hand.received)])
+        if len(received) > 1:
+            t, gaps = thinned(received[1:], 1e3 * np.diff(received), np.fmax)
+            axes.plot(t, gaps, color=_COLOURS[name], linestyle=_LINE_STYLES[name], linewidth=1.0, label=f"{name} hand")
+    axes.axhline(1e3 * judged.settings.dropout, color="black", linestyle=":", linewidth=1.2, label="dropout")
+    if judged.settings.max_pose_gap is not None:
+        axes.axhline(1e3 * judged.settings.max_pose_gap, label="at most", **_LIMIT)
+    axes.set_ylim(bottom=0.0)
+
+
+def _draw_margin(axes: Axes, judged: Judged) -> None:
+    ticks = judged.episode.ticks
+    margin = np.where(np.isfinite(ticks.margin), 1e3 * ticks.margin, np.nan)
+    axes.plot(*thinned(ticks.t, margin, np.fmin), color="#3b7d3b", label="tightest pair")
+    axes.axhline(0.0, label="limit", **_LIMIT)
+    axes.set_ylim(bottom=min(-2.0, float(np.nanmin(margin, initial=0.0))))
+
+
+def _draw_leash(axes: Axes, judged: Judged) -> None:
+    """What the leash dragged, and the ticks at which the controller did not do as it was asked."""
+    ticks = judged.episode.ticks
+    for index, arm in enumerate(judged.episode.arms):
+        _draw(axes, arm, ticks.t, 1e3 * ticks.slip[:, index])
+    highest = max(1.0, 1.1e3 * float(ticks.slip.max(initial=0.0)))
+    for flags, label, colour, height in (
+        (ticks.fallback, "stop executed", "#6a4c93", 0.06),
+        (ticks.rejected.any(axis=1), "target rejected", "black", 0.12),
+        (~ticks.certified, "no certified stop", "#b3202c", 0.18),
+    ):
+        if flags.any():
+            t, some = thinned(ticks.t, np.where(flags, height * highest, np.nan), np.fmax)
+            axes.plot(t, some, linestyle="none", marker="|", markersize=6, color=colour, label=label)
+    axes.set_ylim(-0.03 * highest, highest)
+
+
+def _draw_timing(axes: Axes, judged: Judged) -> None:
+    """Time between ticks, and where some are not in the file a red ground."""
+    ticks = judged.episode.ticks
+    axes.plot(*thinned(ticks.t, 1e3 * ticks.dt, np.fmax), color="#555555", linewidth=1.0, label="between ticks")
+    if judged.episode.recording.about.realtime:  # in simulated time it is nobody's matter
+        compute = thinned(ticks.t, 1e3 * ticks.compute_time, np.fmax)
+        axes.plot(*compute, color=_COLOURS["left"], linewidth=0.8, alpha=0.7, label="computing")
+    for number, at in enumerate(np.flatnonzero(np.diff(ticks.number) > 1)[:_POINTS]):
+        axes.axvspan(ticks.t[at], ticks.t[at + 1], label=None if number else "lost ticks", **_LOST)
+    axes.set_ylim(bottom=0.0)
+
+
+def _draw(axes: Axes, arm: str, t: Array, values: Array) -> None:
+    style = {"color": _COLOURS[arm], "linestyle": _LINE_STYLES[arm], "linewidth": 1.4, "label": f"{arm} arm"}
+    axes.plot(*thinned(t, values, np.fmax), **style)
+
+
+_PLOTS = (
+    (_draw_speed, "speed of the measured tools", "speed [mm/s]"),
+    (_draw_errors, "tracking: measured tool from target, while engaged", "error [mm]"),
+    (_draw_hands, "hands: time between two poses", "time [ms]"),
+    (_draw_margin, "distance of monitored pairs beyond what they keep", "to spare [mm]"),
+    (_draw_leash, "limits: how far the leash has dragged the targets", "slip [mm]"),
+    (_draw_timing, "timing of the loop", "time [ms]"),
+)
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1280px; margin: 1.5rem auto; padding: 0 1rem; }

@@ -1,4 +1,4 @@
-"""What is said once in a recording: the cell, the robot, the program, the machine, and how the run was asked for."""
+"""Facts that a recording states once: cell, robot, program, machine, and how the run was asked for."""
 
 from __future__ import annotations
 
@@ -6,19 +6,21 @@ import json
 import platform
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from q2r2_control.recording.topics import Topic, run_topics
+from q2r2_control.recording.messages import Topic, run_topics
 
 if TYPE_CHECKING:  # the writer's process does without them
     from q2r2_control.config.cell import Config
     from q2r2_control.pipeline.pipeline import Pipeline
+    from q2r2_control.robot.robot import Robot
 
 FORMAT = "3"  # of topics and fields; another one cannot be replayed
 LOOP, ROS = "loop", "ros"  # sources: one loop's ticks, or what nodes published
@@ -29,7 +31,7 @@ _GIT_TIME = 2.0  # [s]
 
 @dataclass(frozen=True)
 class About:
-    """Read from, and written to, a metadata record of texts."""
+    """Facts that a run states at its beginning, in a metadata record of texts."""
 
     arms: tuple[str, ...]
     joints: tuple[str, ...]
@@ -60,7 +62,6 @@ class About:
         )
 
     def texts(self) -> dict[str, str]:
-        """For the metadata record; cell and robot are attachments."""
         run = {name: value for name, value in vars(self).items() if name not in ("cell", "robot", "notes")}
         return {"format": FORMAT, "run": json.dumps(run), **self.notes}
 
@@ -76,19 +77,17 @@ class About:
         return cls(**run, cell=cell, robot=robot, notes=notes)
 
     def topics(self) -> dict[str, Topic]:
-        """All that is in the file of a loop's run, by name."""
         return run_topics(self.arms, self.joints, self.cameras)
 
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What is said of a run at its end; nothing of one that was killed."""
+    """Facts that a run states at its end; none of one that was killed."""
 
     success: bool | None = None  # by the task's own check; None: there was none
     ended_by: str | None = None  # the fault that ended it
 
     def texts(self) -> dict[str, str]:
-        """For a metadata record."""
         success = {} if self.success is None else {"success": json.dumps(self.success)}
         return success if self.ended_by is None else {**success, "ended_by": self.ended_by}
 
@@ -105,12 +104,42 @@ def as_yaml(config: Config) -> str:
 
 
 def program() -> dict[str, str]:
-    """Version, git revision where there is one, and machine."""
+    """Version, machine, and of a checkout the git revision, with a mark where it was changed."""
     notes = {"version": _version("q2r2_control"), "machine": f"{platform.node()}, {platform.platform()}"}
     notes["libraries"] = ", ".join(f"{name} {_version(name)}" for name in ("numpy", "pin", "numba", "daqp", "mujoco"))
-    if revision := _revision():
-        notes["revision"] = revision
+    checkout = Path(__file__).resolve().parents[2]
+    if (checkout / ".git").exists():
+        command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40"]
+        with suppress(OSError, subprocess.SubprocessError):
+            done = subprocess.run(command, capture_output=True, text=True, timeout=_GIT_TIME, check=True)
+            notes["revision"] = done.stdout.strip()
     return notes
+
+
+def changes(about: About, config: Config, robot: Robot) -> list[str]:
+    """What is not as it was when a run was recorded: program, libraries, cell, robot; a line each."""
+    now = program()
+    found = [
+        f"{name}: {about.notes[name]} when recorded, now {now.get(name, 'unknown')}"
+        for name in ("version", "revision", "libraries")
+        if name in about.notes and about.notes[name] != now.get(name)
+    ]
+    if about.cell != as_yaml(config):
+        old, new = dict(_flat(yaml.safe_load(about.cell))), dict(_flat(yaml.safe_load(as_yaml(config))))
+        for key in dict.fromkeys((*old, *new)):
+            if old.get(key) != new.get(key):
+                found.append(f"cell: {key}: {old.get(key, 'nothing')} when recorded, now {new.get(key, 'nothing')}")
+    if about.robot != robot.urdf:
+        found.append("the robot's description is not the recorded one")
+    return found
+
+
+def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(data, Mapping) and data:
+        for name, value in data.items():
+            yield from _flat(value, f"{key}.{name}" if key else str(name))
+    else:
+        yield key, data
 
 
 def _version(package: str) -> str:
@@ -118,15 +147,3 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "unknown"
-
-
-def _revision() -> str:
-    """Of the checkout that this module is in, with a mark where it was changed; empty for an installed package."""
-    checkout = Path(__file__).resolve().parents[2]
-    if not (checkout / ".git").exists():
-        return ""
-    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=_GIT_TIME, check=True).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return ""

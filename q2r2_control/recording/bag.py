@@ -1,7 +1,6 @@
 """A bag of rosbag2: an MCAP file, written by the package ``mcap``, and the ``metadata.yaml`` beside it, version 9.
 
-The metadata are written here, since the package is to run without ROS; the rules are those of rosbag2_storage in ROS 2
-Jazzy (https://github.com/ros2/rosbag2, metadata_io.cpp). Types and their hashes are from rosbags.
+ROS is not needed; the rules are those of metadata_io.cpp in https://github.com/ros2/rosbag2. Types are from rosbags.
 """
 
 from __future__ import annotations
@@ -11,9 +10,8 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import yaml
@@ -22,8 +20,7 @@ from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, FIELDS, ROBOT, About, Conclusion
-from q2r2_control.recording.messages import STORE, Message
-from q2r2_control.recording.topics import Topic
+from q2r2_control.recording.messages import STORE, Message, Topic
 
 METADATA_FILE = "metadata.yaml"
 _LARGEST_CHUNK = 4 << 20  # [bytes]
@@ -42,11 +39,10 @@ _QOS = {
 }
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager["BagWriter"]):
     """Writes a bag, as a context that :meth:`close` makes whole.
 
-    Without that the file has no index, but all that was flushed. After a fault, such as a full disk, it has the end
-    that readers look for; after a kill it just ends, which ``mcap recover`` mends.
+    Without that it has all that was flushed, and no index; after a kill it just ends, which ``mcap recover`` mends.
     """
 
     def __init__(self, path: Path, topics: Iterable[Topic], about: About) -> None:
@@ -95,19 +91,20 @@ class BagWriter:
             self._writer.add_metadata(CONCLUSION, texts)
         self._writer.finish()
         self._stream.close()
-        notes = {**self._about.notes, **texts}
-        _write_metadata(self._path, self._topics, self._counts, self._first, self._last, notes)
+        self._write_metadata({**self._about.notes, **texts})
 
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         with suppress(OSError):  # the same again
             self._stream.close()
-        if error is not None:
-            self._end_after_fault()
+        if error is None:
+            return
+        end = RecordBuilder()
+        DataEnd(0).write(end)
+        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(end)
+        with suppress(OSError):
+            os.truncate(self._path, self._whole)  # without what was written in part
+            with self._path.open("ab") as stream:
+                stream.write(end.end() + MCAP0_MAGIC)
 
     def _register(self) -> dict[int, int]:
         """Declare the topics; returns the number of each one's channel in the file."""
@@ -121,52 +118,38 @@ class BagWriter:
             for topic in self._topics
         }
 
-    def _end_after_fault(self) -> None:
-        """Cut off what was written in part, and write the end of a file without an index."""
-        end = RecordBuilder()
-        DataEnd(0).write(end)
-        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(end)
-        with suppress(OSError):
-            os.truncate(self._path, self._whole)
-            with self._path.open("ab") as stream:
-                stream.write(end.end() + MCAP0_MAGIC)
-
-
-def _write_metadata(
-    file: Path, topics: Iterable[Topic], counts: Mapping[int, int], first: int, last: int, custom: Mapping[str, str]
-) -> None:
-    """Write metadata.yaml beside ``file``, whose messages are from ``first`` to ``last`` [ns]. Raises OSError."""
-    times: dict[str, Any] = {
-        "starting_time": {"nanoseconds_since_epoch": first},
-        "duration": {"nanoseconds": last - first},
-        "message_count": sum(counts.values()),
-    }
-    information = {
-        "version": _VERSION,
-        "storage_identifier": "mcap",
-        "relative_file_paths": [file.name],
-        **times,
-        "topics_with_message_count": [
-            {
-                "topic_metadata": {
-                    "name": topic.name,
-                    "type": topic.type,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": [_QOS],
-                    "type_description_hash": STORE.hash_rihs01(topic.type),
-                },
-                "message_count": counts.get(topic.channel, 0),
-            }
-            for topic in topics
-        ],
-        "compression_format": "",
-        "compression_mode": "",
-        "files": [{"path": file.name, **times}],
-        "custom_data": dict(custom) or None,
-        "ros_distro": "jazzy",
-    }
-    target = file.with_name(METADATA_FILE)
-    part = target.with_suffix(".part")
-    plain = json.loads(json.dumps({"rosbag2_bagfile_information": information}))  # nothing twice, so no references
-    part.write_text(yaml.safe_dump(plain, sort_keys=False), encoding="utf-8")
-    os.replace(part, target)
+    def _write_metadata(self, custom: Mapping[str, str]) -> None:
+        times: dict[str, Any] = {
+            "starting_time": {"nanoseconds_since_epoch": self._first},
+            "duration": {"nanoseconds": self._last - self._first},
+            "message_count": self._counts.total(),
+        }
+        information = {
+            "version": _VERSION,
+            "storage_identifier": "mcap",
+            "relative_file_paths": [self._path.name],
+            **times,
+            "topics_with_message_count": [
+                {
+                    "topic_metadata": {
+                        "name": topic.name,
+                        "type": topic.type,
+                        "serialization_format": "cdr",
+                        "offered_qos_profiles": [_QOS],
+                        "type_description_hash": STORE.hash_rihs01(topic.type),
+                    },
+                    "message_count": self._counts[topic.channel],
+                }
+                for topic in self._topics
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "files": [{"path": self._path.name, **times}],
+            "custom_data": dict(custom) or None,
+            "ros_distro": "jazzy",
+        }
+        target = self._path.with_name(METADATA_FILE)
+        part = target.with_suffix(".part")
+        plain = json.loads(json.dumps({"rosbag2_bagfile_information": information}))  # nothing twice, so no references
+        part.write_text(yaml.safe_dump(plain, sort_keys=False), encoding="utf-8")
+        os.replace(part, target)

@@ -1,8 +1,4 @@
-"""Takes the pictures of a recording, in a process of its own.
-
-The loop only copies where everything is, and that at ticks at which a picture is due. Pictures are drawn of those
-copies whenever there is time, since copies are small and may wait.
-"""
+"""Takes the pictures of a recording in a process of its own; the loop only copies where everything is."""
 
 from __future__ import annotations
 
@@ -21,18 +17,18 @@ from PIL import Image
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import PlantError
-from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.helper_process import HelperProcess, reason_of
-from q2r2_control.recording.messages import Message, picture
-from q2r2_control.recording.topics import Topic, picture_topic
+from q2r2_control.recording.messages import Message, Topic, picture, picture_topic
 from q2r2_control.summary.tick import Tick
 
 if TYPE_CHECKING:
-    from q2r2_control.plants.mujoco_cameras import CellPictures
+    from q2r2_control.plants.mujoco import MujocoPlant
 
-
+ROOM = 128 << 10  # for copies that wait [bytes]; of the shipped cell, some seconds of a camera at 30 Hz
 _NICENESS = 19  # loop and writer go first
 _QUALITY = 90  # of JPEG
+_ROUNDING = 1e-6  # of a period: a picture that is due but for the rounding of times is due
+_READY = 10.0  # for the process to be ready, before the run [s]
 
 
 @dataclass(frozen=True)
@@ -45,8 +41,6 @@ class CameraSetup:
 
 
 class PictureRequest(NamedTuple):
-    """Pictures of one tick."""
-
     number: int  # of the tick
     time: int  # of day [ns]
     cameras: list[str]
@@ -54,53 +48,37 @@ class PictureRequest(NamedTuple):
 
 
 def main(requests: Iterator[Any], answer: Callable[[Message | None], None]) -> None:
-    """Answer None when ready, and then the message of each picture.
-
-    Raises :class:`PlantError`, one line, where OpenGL is missing.
-    """
+    """Answer None when ready, then each picture's message. Raises :class:`PlantError` where OpenGL is missing."""
     with suppress(OSError):
         os.nice(_NICENESS)
     setup = next(requests, None)
     if setup is None:
         return
-    cell = _cell_of(setup)
-    answer(None)
-    for request in requests:
-        cell.place(np.frombuffer(request.qpos))
-        for name in request.cameras:
-            payload = picture(name, request.time, _jpeg(cell, name))
-            answer(Message(setup.channels[name], request.number, request.time, request.time, payload))
-
-
-def _cell_of(setup: CameraSetup) -> CellPictures:
     try:
         from q2r2_control.plants.mujoco_cameras import CellPictures
     except (ImportError, AttributeError, RuntimeError) as error:
         raise PlantError(f"no pictures: MUJOCO_GL={os.environ['MUJOCO_GL']}: {reason_of(error)}") from error
-    return CellPictures(pickle.loads(setup.model), setup.cameras)
-
-
-def _jpeg(cell: CellPictures, name: str) -> bytes:
-    packed = io.BytesIO()
-    Image.fromarray(cell.take(name)).save(packed, "JPEG", quality=_QUALITY)
-    return packed.getvalue()
-
-
-ROOM = 128 << 10  # for copies that wait [bytes]; of the shipped cell, some seconds of a camera at 30 Hz
-_ROUNDING = 1e-6  # of a period: what is due but for the rounding of times is due
-_READY = 10.0  # for the process to be ready, before the run [s]
+    cell = CellPictures(pickle.loads(setup.model), setup.cameras)
+    answer(None)
+    for request in requests:
+        cell.place(np.frombuffer(request.qpos))
+        for name in request.cameras:
+            packed = io.BytesIO()
+            Image.fromarray(cell.take(name)).save(packed, "JPEG", quality=_QUALITY)
+            payload = picture(name, request.time, packed.getvalue())
+            answer(Message(setup.channels[name], request.number, request.time, request.time, payload))
 
 
 class CameraRecorder:
-    """Its process begins with its imports at once. To be ended by :meth:`finish`."""
+    """Its process starts at once. To be ended by :meth:`finish`."""
 
     def __init__(self, write: Callable[[Message], None], room: int = ROOM) -> None:
         """``write`` gets the message of each picture, in another thread; ``room`` [bytes] is for copies that wait.
 
-        Raises :class:`OSError` where there can be no such process.
+        Raises :class:`OSError`.
         """
         self._write, self._ready = write, Event()
-        self._process = HelperProcess(
+        self.process = HelperProcess(
             "takes pictures",
             "q2r2_control.recording.camera_recorder",
             self._on_answer,
@@ -108,7 +86,6 @@ class CameraRecorder:
             MUJOCO_GL="egl",  # MuJoCo's own choice needs a display
             LP_NUM_THREADS="1",  # without a graphics card, one processor stays the loop's
         )
-        self.pid = self._process.pid
         self.due = 0  # pictures that should be there by now
         self._plant: MujocoPlant | None = None  # None: not begun
         self._rates: dict[str, float] = {}  # of the cameras [Hz]
@@ -121,26 +98,18 @@ class CameraRecorder:
         else:
             self._ready.set()
 
-    @property
-    def fault(self) -> str | None:
-        """Why no more pictures are taken."""
-        return self._process.fault
-
     def prepare(self, plant: MujocoPlant, cameras: Mapping[str, CameraConfig], topics: Mapping[str, Topic]) -> None:
         """Make ready for pictures of ``plant``, for messages of ``topics``; waits for that, some seconds at most."""
         channels = {name: topics[picture_topic(name)].channel for name in cameras}
-        self._process.send(CameraSetup(pickle.dumps(plant.model), dict(cameras), channels))
+        self.process.send(CameraSetup(pickle.dumps(plant.model), dict(cameras), channels))
         waited = 0.0
-        while self._process.alive and waited < _READY and not self._ready.wait(0.1):
+        while self.process.alive and waited < _READY and not self._ready.wait(0.1):
             waited += 0.1
         self._plant, self._last = plant, dict.fromkeys(cameras, -1)
         self._rates = {name: camera.rate for name, camera in cameras.items()}
 
     def take_pictures(self, number: int, tick: Tick, epoch: int, *, wait: bool) -> None:
-        """Have those pictures taken that are due at a tick, the ``number``-th; ``wait`` for room, or lose them.
-
-        ``epoch``: time of day at which the run began [ns].
-        """
+        """Have pictures taken that are due at the ``number``-th tick of a run from ``epoch`` [ns] on."""
         since = tick.now - tick.start.now
         if self._plant is None or since < self._next:
             return
@@ -148,17 +117,14 @@ class CameraRecorder:
         newest = {name: math.floor(since * rate + _ROUNDING) for name, rate in self._rates.items()}
         chosen = [name for name, number_of in newest.items() if number_of > self._last[name]]
         request = PictureRequest(number, epoch + round(since * 1e9), chosen, self._plant.observed_qpos.tobytes())
-        self._process.send(request, len(request.qpos), wait=wait)
+        self.process.send(request, len(request.qpos), wait=wait)
         self.due += sum(newest.values()) - sum(self._last.values())
         self._last = newest
         self._next = min((last + 1 - _ROUNDING) / self._rates[name] for name, last in newest.items())
 
     def finish(self, patience: float) -> None:
-        """Let it take the pictures that wait, and end.
-
-        One that does nothing for ``patience`` [s] is killed, and one that has not begun at once.
-        """
+        """Let it take the pictures that wait; one that does nothing for ``patience`` [s] is killed."""
         if self._plant is not None and patience > 0.0:
-            self._process.finish(patience)
+            self.process.finish(patience)
         else:
-            self._process.kill()
+            self.process.kill()

@@ -1,8 +1,7 @@
 """A process beside the loop, which gets requests on its standard input and answers on its standard output.
 
-A process and not a thread, which would take Python's interpreter from the loop for milliseconds. It is started by
-``subprocess``: ``multiprocessing`` would import the caller's main module in it, which for the command line takes longer
-than all that the writer imports.
+A thread would take Python's interpreter from the loop for milliseconds. ``multiprocessing`` would import the caller's
+main module, which for the command line takes longer than all that the writer imports.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -27,13 +25,6 @@ from q2r2_control.process.scheduling import how_it_ended
 _LOOKS = 0.1  # between two looks at whether it gets on, at its end [s]
 _AFTER_KILL = 1.0  # for what handles the last answer [s]
 _NO_ROOM = 1e-3  # between two attempts to send [s]
-
-
-@dataclass(frozen=True)
-class HelperFault:
-    """The last answer of a process that failed."""
-
-    reason: str  # one line
 
 
 class HelperProcess:
@@ -54,8 +45,8 @@ class HelperProcess:
         """Call ``module.main(requests, answer)`` in a new process. Raises :class:`OSError`.
 
         ``what`` it does, for faults. ``on_answer`` gets each answer, in a thread of its own. ``room`` [bytes] is for
-        requests that wait. The process gets a request None when no other has come for ``idle`` [s]. ``environment``:
-        variables of the process, where this one does not have them.
+        requests that wait; one that is None comes when no other has for ``idle`` [s]. ``environment``: variables, where
+        this process does not have them.
         """
         self._what, self._on_answer, self._room, self._idle = what, on_answer, room, idle
         paths = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
@@ -80,14 +71,10 @@ class HelperProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether it may answer yet."""
         return self._listener.is_alive()
 
     def send(self, request: Any, size: int = 0, *, wait: bool = False) -> bool:
-        """Queue a request, which is pickled; False where there is no room for its ``size`` [bytes] now.
-
-        ``wait`` for room, unless the process ends.
-        """
+        """Queue a request; ``wait`` for room, or return False where there is none for its ``size`` [bytes]."""
         while self.alive:
             with self._lock:
                 if self._put + size - self._sent <= self._room:
@@ -102,8 +89,7 @@ class HelperProcess:
     def finish(self, patience: float) -> None:
         """Wait until it has done what was sent, and has ended.
 
-        One that neither takes nor answers anything for ``patience`` [s] is killed, and has a fault. Time in which other
-        programs keep it off the processors does not count.
+        One that neither takes nor answers anything for ``patience`` [s], although processors are free, is killed.
         """
         self._ending = True
         self._queue.put(None)
@@ -134,7 +120,13 @@ class HelperProcess:
         stream = self._process.stdin
         assert stream is not None
         with suppress(OSError):  # of a process that has ended
-            while (entry := self._next_request()) is not None:
+            while True:
+                try:
+                    entry = self._queue.get(timeout=self._idle)
+                except Empty:
+                    entry = None, 0
+                if entry is None:
+                    break
                 request, size = entry
                 pickle.dump(request, stream)
                 stream.flush()
@@ -143,13 +135,6 @@ class HelperProcess:
         with suppress(OSError):
             stream.close()
 
-    def _next_request(self) -> tuple[Any, int] | None:
-        """The next one and its size, once there is one; None at the end."""
-        try:
-            return self._queue.get(timeout=self._idle)
-        except Empty:
-            return None, 0
-
     def _listen(self) -> None:
         stream, fault = self._process.stdout, None
         assert stream is not None
@@ -157,8 +142,8 @@ class HelperProcess:
             while fault is None:
                 answer = pickle.load(stream)
                 self._moved = time.monotonic()
-                if isinstance(answer, HelperFault):
-                    fault = answer.reason
+                if isinstance(answer, RuntimeError):
+                    fault = str(answer)
                 else:
                     self._on_answer(answer)
         code = self._process.wait()
@@ -169,13 +154,13 @@ class HelperProcess:
 
 
 def run_helper(module: str) -> None:
-    """Inside the process: call ``module.main``; what goes wrong is the last answer."""
+    """Inside the process: call ``module.main``; the last answer is a RuntimeError of what went wrong."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # for the run, which ends this process
         signal.signal(number, signal.SIG_IGN)
     try:
         import_module(module).main(_requests(), _answer)
     except Exception as error:
-        _answer(HelperFault(reason_of(error)))
+        _answer(RuntimeError(reason_of(error)))
 
 
 def _requests() -> Iterator[Any]:
@@ -192,6 +177,5 @@ def _answer(answer: Any) -> None:
 
 
 def reason_of(error: BaseException) -> str:
-    """One line that says what went wrong."""
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error) or repr(error)
     return " ".join(reason.split())

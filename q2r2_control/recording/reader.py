@@ -1,12 +1,13 @@
-"""Reads recordings, chunk by chunk: those that were ended, and what a killed process left."""
+"""Reads recordings, also what a killed process left: chunk by chunk, and the episodes that an operator told in them."""
 
 from __future__ import annotations
 
 import json
+import math
 import struct
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -22,11 +23,23 @@ from rosbags.serde import SerdeError
 from zstandard import ZstdError
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.events import Event
-from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, ROBOT, About, Conclusion
-from q2r2_control.recording.messages import Message, jpeg_of, numbers_of, text_of
+from q2r2_control.events import Event, ReasonKind
+from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, LOOP, ROBOT, About, Conclusion
+from q2r2_control.recording.helper_process import reason_of
+from q2r2_control.recording.messages import (
+    PICTURE,
+    SAMPLES,
+    STATE,
+    TEXT,
+    TICK,
+    Message,
+    Topic,
+    data_of,
+    numbers_of,
+    picture_topic,
+)
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
-from q2r2_control.recording.topics import SAMPLES, STATE, TICK, Topic, picture_topic
+from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.types import Array
 
 _LARGEST = 1 << 30  # of a record [bytes]
@@ -54,18 +67,13 @@ class TickChunk:
         return np.asarray(self.rows["index"].astype(np.int64))
 
     def events(self) -> dict[int, list[Event]]:
-        """What happened to the arms' states, by the number of the tick.
-
-        Raises :class:`ValueError`, :class:`KeyError` and :class:`TypeError` for what is no such thing.
-        """
+        """Events by the number of the tick. Raises ValueError, KeyError and TypeError for other data."""
         found = {number: json.loads(text).get("events", ()) for number, text in self.states.items()}
         return {number: [Event.from_json(event) for event in events] for number, events in found.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One picture of a camera."""
-
     time: int  # of day, that of the tick at which all was where it shows it [ns]
     tick: int  # its number
     jpeg: bytes
@@ -76,7 +84,10 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         """``path``: the file, or the folder that it is alone in."""
-        self.file = _file_of(path)
+        files = recordings_in([path])
+        if len(files) != 1:
+            raise RecordingError(f"{path}: has {len(files)} files .mcap; allowed: a folder with one, or a file")
+        self.file = files[0]
         self.about = self._read_about()
         self.since = 0  # time of day [ns]; what is known to be before it is left out
 
@@ -94,7 +105,7 @@ class Recording:
                     rows=rows.reshape(-1).view(kind),
                     times=np.array([message.time for message in found[TICK]], dtype=np.int64),
                     samples=numbers_of([message.payload for message in found[SAMPLES]], labels),
-                    states={message.number: text_of(message.payload) for message in found[STATE]},
+                    states={message.number: str(data_of(message.payload, TEXT)) for message in found[STATE]},
                 )
                 if (np.diff(chunk.numbers, prepend=last_number) < 1).any():
                     raise ValueError("ticks are not in the order of their numbers")
@@ -106,14 +117,14 @@ class Recording:
 
     def pictures(self, camera: str) -> Iterator[Picture]:
         """All pictures of a camera, in the order of time."""
-        yield from self._pictures_on(picture_topic(camera))
-
-    def _pictures_on(self, topic: str) -> Iterator[Picture]:
-        for messages in self.messages((topic,)):
+        for messages in self.messages((self._topic_of(camera),)):
             for message in messages:
                 with self._faults():
-                    picture = Picture(message.time, message.number, jpeg_of(message.payload))
+                    picture = Picture(message.time, message.number, bytes(data_of(message.payload, PICTURE)))
                 yield picture
+
+    def _topic_of(self, camera: str) -> str:
+        return picture_topic(camera)
 
     @cached_property
     def declared_topics(self) -> dict[int, Topic]:
@@ -136,23 +147,19 @@ class Recording:
                 if isinstance(record, DataEnd):
                     return
                 if isinstance(record, Chunk) and record.message_end_time >= self.since:
-                    channels = {
-                        channel
-                        for channel, topic in self.declared_topics.items()
-                        if topics is None or topic.name in topics
-                    }
+                    declared = self.declared_topics.items()
+                    channels = {channel for channel, topic in declared if topics is None or topic.name in topics}
                     stream, size = get_chunk_data_stream(record, validate_crc=True)
                     yield list(_messages_in(stream.read(size), channels))
 
     @contextmanager
     def _faults(self) -> Iterator[None]:
-        """What is wrong with a file, as one line."""
         try:
             yield
         except EndOfFile:
             return  # cut off in the middle of a record, by a machine that lost its power
         except _BROKEN as error:
-            raise RecordingError(f"{self.file}: damaged: {_line(error)}") from error
+            raise RecordingError(f"{self.file}: damaged: {reason_of(error):.200}") from error
 
     @property
     def closed(self) -> bool:
@@ -161,18 +168,16 @@ class Recording:
 
     @property
     def conclusion(self) -> Conclusion:
-        """What was said at the end of the run; nothing where the file has no index."""
-        summary = self._summary()
-        places = [] if summary is None else [one.offset for one in summary.metadata_indexes if one.name == CONCLUSION]
-        for place in places:
-            with self._faults():
-                record = next(self._records(place), None)
-                if isinstance(record, Metadata):
-                    return Conclusion.from_texts(record.metadata)
+        """Facts of the end of the run; none where the file has no index."""
+        if (summary := self._summary()) is not None:
+            for index in summary.metadata_indexes:
+                with self._faults():
+                    record = next(self._records(index.offset), None) if index.name == CONCLUSION else None
+                    if isinstance(record, Metadata):
+                        return Conclusion.from_texts(record.metadata)
         return Conclusion()
 
     def _summary(self) -> Summary | None:
-        """The index of the file."""
         try:
             with self.file.open("rb") as stream:
                 return SeekingReader(stream, record_size_limit=_LARGEST).get_summary()
@@ -206,7 +211,7 @@ class Recording:
         except EndOfFile:
             pass
         except _BROKEN as error:
-            raise RecordingError(f"{self.file}: not an MCAP file, or damaged: {_line(error)}") from error
+            raise RecordingError(f"{self.file}: not an MCAP file, or damaged: {reason_of(error):.200}") from error
         if not texts:
             raise RecordingError(f"{self.file}: not a recording of q2r2 run --record: no metadata {ABOUT}")
         try:
@@ -214,11 +219,10 @@ class Recording:
         except KeyError as error:
             raise RecordingError(f"{self.file}: damaged: no {error.args[0]}") from error
         except ValueError as error:
-            raise RecordingError(f"{self.file}: {_line(error)}") from error
+            raise RecordingError(f"{self.file}: {reason_of(error):.200}") from error
 
 
 def _messages_in(data: bytes, channels: Container[int]) -> Iterator[Message]:
-    """The messages of a chunk, of some channels."""
     at = 0
     while at < len(data):
         opcode, length, channel, number, time, sent = _HEAD.unpack_from(data, at)
@@ -230,26 +234,8 @@ def _messages_in(data: bytes, channels: Container[int]) -> Iterator[Message]:
         at = end
 
 
-def _file_of(path: Path) -> Path:
-    if not path.is_dir():
-        if not path.exists():
-            raise RecordingError(f"{path}: no such file or folder")
-        return path
-    files = sorted(path.glob("*.mcap"))
-    if len(files) != 1:
-        raise RecordingError(f"{path}: has {len(files)} files .mcap; allowed: a folder with one, or a file")
-    return files[0]
-
-
-def _line(error: Exception) -> str:
-    return " ".join((str(error) or repr(error)).split())[:200]
-
-
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
-    """Files of recordings: those given, and all in folders given, by name; each once.
-
-    Raises :class:`RecordingError` for a path without any.
-    """
+    """Files of recordings: those given, and all in folders, by name; each once. Raises :class:`RecordingError`."""
     files: dict[Path, Path] = {}
     for path in paths:
         if path.is_dir():
@@ -263,3 +249,54 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
         for file in found:
             files.setdefault(file.resolve(), file)
     return list(files.values())
+
+
+@dataclass(frozen=True)
+class EpisodeSpan:
+    """An episode within a run; times are since the run began [s]."""
+
+    start: float = -math.inf
+    end: float = math.inf  # inf: the run's
+    discarded: bool = False  # by its operator
+    success: bool | None = None  # None: nobody said
+    number: int = 0  # from 1 on; 0: the whole run
+
+
+WHOLE = EpisodeSpan()
+
+
+def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list[EpisodeSpan]:
+    """The episodes that an operator has told; the whole run where that are none.
+
+    A discard, a success and a failure are for the episode that goes on, or else for the last one; what was said last
+    counts. Of the whole run they are what the operator said, or else ``run_succeeded``, what the task's own check did.
+    """
+    whole = replace(WHOLE, success=run_succeeded)
+    spans: list[EpisodeSpan] = []
+    for event in events:
+        is_open = bool(spans) and spans[-1].end == math.inf
+        if event.kind is ReasonKind.EPISODE_BEGINS and not is_open:
+            spans.append(EpisodeSpan(event.t))
+        elif event.kind is ReasonKind.EPISODE_ENDS and is_open:
+            spans[-1] = replace(spans[-1], end=event.t)
+        elif event.kind is ReasonKind.EPISODE_DISCARDED and spans:
+            spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), discarded=True)
+        elif event.kind in (ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED):
+            success = event.kind is ReasonKind.EPISODE_SUCCEEDED
+            if spans:
+                spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), success=success)
+            else:
+                whole = replace(whole, success=success)
+    return [replace(span, number=number) for number, span in enumerate(spans, 1)] or [whole]
+
+
+def read_spans(recording: Recording) -> list[EpisodeSpan]:
+    """The episodes of a recording. Raises :class:`RecordingError` for a damaged one."""
+    about, success = recording.about, recording.conclusion.success
+    if about.source == LOOP and not any(action in about.cell for action in EpisodeMarks.actions):
+        return spans_of((), success)  # without reading all of it; of nodes, a service tells episodes too
+    try:
+        told = (events for chunk in recording.chunks() for events in chunk.events().values())
+        return spans_of((event for events in told for event in events), success)
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordingError(f"{recording.file}: damaged: {error!r:.200}") from error

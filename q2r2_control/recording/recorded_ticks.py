@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -20,11 +19,11 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import RunStart
 from q2r2_control.types import SIDES, Array, HandInputs, HandSample, RobotState
 
+_SAME_POSE = 1e-6  # [m], and of a quaternion
+
 
 @dataclass(frozen=True, slots=True)
 class RecordedTick:
-    """What one tick took."""
-
     number: int
     now: float
     dt: float
@@ -46,7 +45,6 @@ class RecordedTicks:
         self._ticks = self._all(recording)
         self._starts: list[RunStart] = []
         self.missing = 0  # ticks that were lost behind the last one
-        self.count = 0
         self.current: RecordedTick | None = None
         self.next = next(self._ticks, None)
         if self.next is None or not self._starts:
@@ -58,7 +56,6 @@ class RecordedTicks:
         if self.next is None:
             raise NoMoreTicksError
         self.current, self.next = self.next, next(self._ticks, None)
-        self.count += 1
         return self.current
 
     def _all(self, recording: Recording) -> Iterator[RecordedTick]:
@@ -81,7 +78,11 @@ class RecordedTicks:
         for row, number, first, end in zip(chunk.rows, chunk.numbers.tolist(), *places.tolist(), strict=True):
             state = chunk.states.get(number, "")
             if not self._starts and state:
-                self._starts.append(_start_of(json.loads(state)["start"]))
+                start = json.loads(state)["start"]
+                numbers = {name: np.array(start[name], dtype=np.float64) for name in ("q", "v", "tau")}
+                felt = None if start["tau_external"] is None else np.array(start["tau_external"], dtype=np.float64)
+                at_start = RobotState(**numbers, tau_external=felt, stamp=start["stamp"])
+                self._starts.append(RunStart(start["now"], at_start))
             samples, openings = chunk.samples[first:end], row["arms"]["opening"].tolist()
             external = row["tau_external"].copy() if row["external"] else None
             yield RecordedTick(
@@ -101,13 +102,6 @@ class RecordedTicks:
                 events=events.get(number, []),
                 packed=PackedTick(row.tobytes(), samples.tobytes(), state),
             )
-
-
-def _start_of(start: dict[str, Any]) -> RunStart:
-    q, v, tau = (np.array(start[name], dtype=np.float64) for name in ("q", "v", "tau"))
-    external = start["tau_external"]
-    felt = None if external is None else np.array(external, dtype=np.float64)
-    return RunStart(start["now"], RobotState(q, v, tau, felt, start["stamp"]))
 
 
 class NoMoreTicksError(Exception):
@@ -130,14 +124,10 @@ def _sample(numbers: Array) -> HandSample:
     )
 
 
-_SAME_POSE = 1e-6  # [m], and of a quaternion
-
-
 def cell_and_robot_of(recording: Recording, config: Config | None = None) -> tuple[Config, Robot]:
     """The recorded cell, or ``config``, with its robot.
 
-    Raises :class:`RecordingError`, which names the file, where the recorded cell cannot be built or either one has
-    other arms or joints, and :class:`Q2R2Error` where ``config`` cannot be built.
+    Raises :class:`RecordingError` where the recorded cell cannot be built or either one has other arms or joints.
     """
     about = recording.about
     if config is not None:
@@ -154,16 +144,12 @@ def cell_and_robot_of(recording: Recording, config: Config | None = None) -> tup
 
 @lru_cache(maxsize=4)
 def _built(text: str) -> tuple[Config, Robot]:
-    """Recordings of a day have the same cell."""
     config = parse_config(text, "its cell")
     return config, Robot.from_config(config)
 
 
 def check_tools(positions: Array, tools: Array, robot: Robot) -> None:
-    """Raises :class:`RecordingError` where tools that were recorded, (arms, 7), are not at joint positions (joints,).
-
-    So another robot, whose files have changed since, shows.
-    """
+    """Raises :class:`RecordingError` where recorded tools (arms, 7) are not at joint positions (joints,)."""
     (found,) = tool_poses(positions[None], robot)
     near = np.minimum(np.abs(found - tools), np.abs(found + tools))[:, 3:].max() < _SAME_POSE  # q and -q are the same
     if not near or np.abs(found - tools)[:, :3].max() > _SAME_POSE:

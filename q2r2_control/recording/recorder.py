@@ -1,41 +1,131 @@
-"""Records a run while it goes on: a listener that only packs ticks, and a process that writes them.
-
-One file a run, from its start on: what the loop remembers from before the first engagement (filters, anchors, grippers)
-is part of what a replay has to repeat.
-"""
+"""Records a run, or what ROS nodes publish: a new folder for each, and a process that writes there."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from datetime import datetime
+from functools import partial
 from pathlib import Path
-from types import TracebackType
+from typing import TYPE_CHECKING
 
 from q2r2_control.config.recording import CameraConfig
-from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.errors import ConfigError
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
-from q2r2_control.recording.base_recorder import PATIENCE, BaseRecorder
 from q2r2_control.recording.camera_recorder import CameraRecorder
-from q2r2_control.recording.helper_process import reason_of
-from q2r2_control.recording.messages import Message
+from q2r2_control.recording.helper_process import HelperProcess, reason_of
+from q2r2_control.recording.messages import Message, Topic, run_topics
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
-from q2r2_control.recording.topics import run_topics
-from q2r2_control.recording.writer import MessageBatch, RecordedRobot, TickBatch
+from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, RecordingSetup, Written
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 
-ROOM = 8 << 20  # for ticks that wait to be written [bytes]; one of two arms with seven joints each takes 1.6 kB
+if TYPE_CHECKING:  # the ROS node does without MuJoCo
+    from q2r2_control.plants.mujoco import MujocoPlant
+
+PATIENCE = 10.0  # with a disk that hangs, at the end of a run [s]
+# For what waits to be written [bytes]: a tick of two arms takes 1.6 kB, both arms' nodes send some 0.6 MB a second.
+ROOM = 8 << 20
+ROOM_WITH_PICTURES = 64 << 20  # of cameras of nodes, which have a megabyte each where they are not compressed
+_LAST_NUMBER = 2**32 - 1
 _BATCH = 16  # ticks that are sent at once
 _LONGEST_FAULT = 500  # that ended a run [characters]
 
 _logger = logging.getLogger(__name__)
 
 
+class BaseRecorder:
+    """Raises nothing: what fails is logged once, and the run goes on."""
+
+    def __init__(self, parent: Path, name: str, room: int) -> None:
+        """Start the process; ``room`` [bytes] is for what waits to be written."""
+        self._parent, self._name = parent, name
+        self.fault: str | None = None  # why nothing more is recorded
+        self.file: Path | None = None  # that is written; None while there is none
+        self.written = Written()
+        self.writer: HelperProcess | None = None
+        self.record_outcome: Callable[[Reason], None] = lambda reason: None  # lets the operator know of the failure
+        try:
+            module = "q2r2_control.recording.writer"
+            on_written = partial(setattr, self, "written")
+            self.writer = HelperProcess("writes it", module, on_written, room, idle=FLUSH_PERIOD)
+        except OSError as error:
+            self._check(reason_of(error))
+
+    def _open(self, about: About, robot: RecordedRobot | None, topics: tuple[Topic, ...]) -> bool:
+        """Have the file of a run begun that begins at ``about.epoch``; whether that was possible."""
+        if self.writer is None:
+            return False
+        try:
+            # The time of day, so that recordings are listed in their order.
+            when = datetime.fromtimestamp(about.epoch * 1e-9)
+            folder = new_folder(self._parent, f"{when:%Y%m%d-%H%M%S}-{self._name}", "--record")
+        except (ConfigError, OSError) as error:
+            self._check(reason_of(error))
+            return False
+        self.file = folder / f"{folder.name}.mcap"
+        self.writer.send(RecordingSetup(self.file.absolute(), about, topics, robot))
+        return True
+
+    def _send(self, batch: list[PackedTick] | list[Message], *, wait: bool = False) -> bool:
+        """Have some written; False where there is no room for them now. ``wait`` for room."""
+        if self.writer is None or self.fault is not None:
+            return False
+        sent = self.writer.send(batch, sum(one.size for one in batch), wait=wait)
+        self._check()
+        return sent
+
+    def finish(self, conclusion: Conclusion | None = None) -> None:
+        """Write what there is with the ``conclusion``, and close the file."""
+        if self.writer is not None:
+            if self.file is not None:
+                self.writer.send(conclusion or Conclusion())
+            self.writer.finish(PATIENCE)
+            self._check()
+
+    def _check(self, fault: str | None = None) -> None:
+        """Log the first ``fault``, or one of the writer, in one line; nothing more is recorded."""
+        if fault is None and self.writer is not None:
+            fault = self.writer.fault
+        if fault is not None and self.fault is None:
+            self.fault = f"{self.file}: {fault}" if self.file is not None else fault
+            _logger.warning("recording ended, the run goes on: %s", self.fault)
+            self.record_outcome(Reason.of(ReasonKind.RECORDING_ENDED, text=self.fault))
+
+
+class MessageRecorder(BaseRecorder):
+    """Writes one file. It never waits: messages for which there is no room are lost, and counted."""
+
+    def __init__(self, parent: Path, name: str, room: int = ROOM) -> None:
+        super().__init__(parent, name, room)
+        self.count = self.overflows = 0  # messages that came; those of them for which there was no room
+        self._last = 0  # time of the newest message [ns of day]
+        self._begun = False
+
+    def begin(self, about: About, topics: tuple[Topic, ...]) -> None:
+        self._begun, self._last = self._open(about, None, topics), about.epoch
+
+    def record(self, messages: Iterable[Message]) -> None:
+        """Have messages written, in the order of their receipt.
+
+        One that was received before the last one counts as received with it: a file is in the order of time.
+        """
+        batch = []
+        for message in sorted(messages, key=lambda one: one.time):
+            self.count += 1
+            self._last = max(message.time, self._last)
+            batch.append(message._replace(number=message.number & _LAST_NUMBER, time=self._last))
+        self._check()
+        if batch and self._begun and self.fault is None and not self._send(batch):
+            self.overflows += len(batch)
+
+
 @dataclass(frozen=True, slots=True)
 class RecordingSummary:
-    """What became of a recording."""
-
     file: str | None  # None: none could be made
     ticks: int  # written
     lost_ticks: int  # that came while there was no room, or after the disk had failed
@@ -45,12 +135,10 @@ class RecordingSummary:
     pictures_fault: str | None = None  # why they ended before the run did
 
 
-class Recorder(BaseRecorder):
+class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
     """A listener of one run, as a context around it. It raises nothing: what fails is logged once, and the run goes on.
 
     Its process starts with it, so make it before what takes long, and :meth:`begin` when the run is about to begin.
-    ``waits``: ticks wait for room, as they may in simulated time; otherwise they are lost, and counted. With
-    ``pictures`` there is one more process, which takes those of the cameras of :meth:`prepare`.
     """
 
     keeps_episodes = True  # its operator can tell where one begins and ends
@@ -58,7 +146,10 @@ class Recorder(BaseRecorder):
     def __init__(
         self, parent: Path, name: str, *, waits: bool = False, room: int = ROOM, pictures: bool = False
     ) -> None:
-        """``room`` [bytes] for ticks that wait to be written."""
+        """``waits``: ticks wait for ``room`` [bytes], as they may in simulated time; else they are lost, and counted.
+
+        With ``pictures`` there is one more process, which takes those of the cameras of :meth:`prepare`.
+        """
         self._waits = waits
         self._count = 0  # ticks
         self.overflows = 0  # ticks for which there was no room
@@ -73,7 +164,7 @@ class Recorder(BaseRecorder):
             try:
                 self.cameras = CameraRecorder(self._write_picture)
             except OSError as error:
-                self._fail_pictures(reason_of(error))
+                self._check_cameras(reason_of(error))
 
     def prepare(self, plant: MujocoPlant, robot: Robot, cameras: Mapping[str, CameraConfig]) -> None:
         """Make ready to take pictures of a run of ``plant``, just before :meth:`begin`; some seconds at most."""
@@ -83,13 +174,11 @@ class Recorder(BaseRecorder):
             self._check_cameras()
 
     def begin(self, about: About, robot: Robot) -> None:
-        """Take ticks from now on, of a run that begins at ``about.epoch``."""
         topics = about.topics()
         if self._open(about, RecordedRobot.of(robot), tuple(topics.values())):
             self._packer, self._epoch = TickPacker(about.arms, about.joints), about.epoch
 
     def __call__(self, tick: Tick) -> None:
-        """Take one tick; never raises, and waits in simulated time only."""
         number, self._count = self._count, self._count + 1
         if self.fault is not None or self._packer is None:
             return
@@ -98,45 +187,35 @@ class Recorder(BaseRecorder):
             if len(self._batch) >= _BATCH:
                 self._send_batch()
         except Exception as error:  # the arms move on, whatever it is
-            self._fail(reason_of(error))
+            self._check(reason_of(error))
         if self.cameras is not None:
-            self._take_pictures(self.cameras, number, tick)
+            try:
+                self.cameras.take_pictures(number, tick, self._epoch, wait=self._waits)
+            except Exception as error:  # ticks are recorded all the same
+                self._check_cameras(reason_of(error))
+            self._check_cameras()
 
     def _send_batch(self) -> None:
         """Send all ticks that wait; those for which there is no room are lost."""
         batch, self._batch = self._batch, []
-        if batch and not self._send(TickBatch(batch), wait=self._waits) and self._packer is not None:
+        if batch and not self._send(batch, wait=self._waits) and self._packer is not None:
             self.overflows += len(batch)
             self._packer.repeat_state()
-
-    def _take_pictures(self, cameras: CameraRecorder, number: int, tick: Tick) -> None:
-        """Those that are due; whatever fails, ticks are recorded all the same."""
-        try:
-            cameras.take_pictures(number, tick, self._epoch, wait=self._waits)
-        except Exception as error:
-            self._fail_pictures(reason_of(error))
-        self._check_cameras()
 
     def _write_picture(self, picture: Message) -> None:
         """Called in the thread that hears of the cameras, which may wait for room."""
         if self.writer is not None:
-            self.writer.send(batch := MessageBatch([picture]), batch.size, wait=True)
+            self.writer.send([picture], picture.size, wait=True)
 
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._send_batch()
         if self.cameras is not None:
             self.cameras.finish(0.0 if self.fault else PATIENCE)
             self._check_cameras()
-        self._end(Conclusion(self.success, None if error is None else reason_of(error)[:_LONGEST_FAULT]))
+        self.finish(Conclusion(self.success, None if error is None else reason_of(error)[:_LONGEST_FAULT]))
 
     @property
     def summary(self) -> RecordingSummary:
-        """After the run."""
         pictures = self.written.messages
         return RecordingSummary(
             file=None if self.file is None else str(self.file),
@@ -148,12 +227,10 @@ class Recorder(BaseRecorder):
             pictures_fault=self._pictures_fault,
         )
 
-    def _check_cameras(self) -> None:
-        if self.cameras is not None and self.cameras.fault is not None:
-            self._fail_pictures(self.cameras.fault)
-
-    def _fail_pictures(self, reason: str) -> None:
-        """Log the first failure in one line; no more pictures are taken."""
-        if self._pictures_fault is None:
-            self._pictures_fault = reason
-            _logger.warning("no more pictures are recorded, the run goes on: %s", reason)
+    def _check_cameras(self, fault: str | None = None) -> None:
+        """Log the first ``fault``, or one of their process, in one line; no more pictures are taken."""
+        if fault is None and self.cameras is not None:
+            fault = self.cameras.process.fault
+        if fault is not None and self._pictures_fault is None:
+            self._pictures_fault = fault
+            _logger.warning("no more pictures are recorded, the run goes on: %s", fault)

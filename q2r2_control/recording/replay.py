@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,10 +19,10 @@ from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import make_plant
-from q2r2_control.recording.about import ROS, About
-from q2r2_control.recording.comparison import Comparison, changes
+from q2r2_control.recording.about import ROS, About, changes
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks, cell_and_robot_of
+from q2r2_control.recording.tick_rows import NOT_REPLAYED, TickPacker, tick_labels
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
@@ -39,8 +40,6 @@ class ArmDifference:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """What came of a replay."""
-
     ticks: int
     summary: RunSummary | None  # None: the recording has no end, or a fault ended the run
     ended_by: str | None  # that fault, or why it ended before the recording did
@@ -59,12 +58,10 @@ def replay(
 ) -> Replay:
     """Run a recording again, with its own cell or another one.
 
-    Without a ``plant``, what was measured then is measured again, whatever is commanded; with one, it moves and is
-    measured. Only a plant of the recorded kind can do the same to the bit, so ``compare`` then is for no other.
-    ``prepare`` gets the pipeline before it runs.
-
-    Raises :class:`RecordingError` for a file that is none or is damaged, and :class:`Q2R2Error` for a cell that cannot
-    be built or whose arms and joints have other names, and for a plant that does not have the recorded mode.
+    Without a ``plant``, what was measured is measured again, whatever is commanded; with one, it moves and is measured.
+    Only one of the recorded kind can do the same to the bit, so ``compare`` is for no other. ``prepare`` gets the
+    pipeline. Raises :class:`RecordingError` for a file that is none or is damaged, and :class:`Q2R2Error` for a cell
+    that cannot be built or has other arms or joints, and for a plant without the recorded mode.
     """
     recording = Recording(path)
     about = recording.about
@@ -76,10 +73,10 @@ def replay(
     cell, robot = cell_and_robot_of(recording, config)
     ticks = RecordedTicks(recording)
     pipeline = ReplayPipeline(cell, robot, ticks, about, plant)
-    comparison = Comparison(about, ticks) if compare or plant is None else None
+    comparison = _Comparison(about, ticks) if compare or plant is None else None
     if comparison is not None:
-        recorded, moves = about.notes.get("plant", "another plant"), type(pipeline.plant).__name__
-        if plant is not None and recorded != moves:
+        recorded = about.notes.get("plant", "another plant")
+        if plant is not None and recorded != type(pipeline.plant).__name__:
             raise ConfigError(
                 f"--plant {plant}: recorded with {recorded}; --compare is allowed with the recorded plant"
             )
@@ -92,20 +89,16 @@ def replay(
     try:
         summary = pipeline.run(realtime=False)
     except NoMoreTicksError:
-        ended_by = _end_of(ticks)
+        ended_by = "the arms were at rest here when it was recorded, and are not now"
+        if ticks.missing:
+            ended_by = f"{ticks.missing} ticks were lost here when it was recorded"
+        elif ticks.current is not None and ticks.current.following:
+            ended_by = "the recording has no end: its process was killed, or the disk was full"
     except PlantError as error:
         ended_by = str(error)
     found = None if comparison is None else comparison.finish()
-    return Replay(ticks.count, summary, ended_by, found, changes(about, cell, robot), difference.arms())
-
-
-def _end_of(ticks: RecordedTicks) -> str:
-    """Why there are no more ticks."""
-    if ticks.missing:
-        return f"{ticks.missing} ticks were lost here when it was recorded"
-    if ticks.current is not None and ticks.current.following:
-        return "the recording has no end: its process was killed, or the disk was full"
-    return "the arms were at rest here when it was recorded, and are not now"
+    count = 0 if ticks.current is None else ticks.current.number + 1
+    return Replay(count, summary, ended_by, found, changes(about, cell, robot), difference.arms())
 
 
 class ReplayPipeline(Pipeline):
@@ -119,11 +112,10 @@ class ReplayPipeline(Pipeline):
         self._recorded = ticks
 
     def make_clock(self, realtime: bool) -> LoopClock:
-        """See :meth:`Pipeline.make_clock`."""
         return _Clock(1.0 / self.config.loop_rate_hz, self._recorded)
 
     def _ask_again(self, tick: RecordedTick) -> None:
-        """What a program asked of the run at this tick; both arms were told of it, so it is asked twice."""
+        """Repeat what a program asked of the run at this tick; both arms have the event, so it is asked twice."""
         for event in tick.events:
             self.requests.repeat(event.reason, self.teleop.settings)
 
@@ -135,21 +127,17 @@ class ReplayPipeline(Pipeline):
 
 
 class _Clock(LoopClock):
-    """Ticks when they came."""
-
     def __init__(self, period: float, ticks: RecordedTicks) -> None:
         super().__init__(period, realtime=False)
         self._recorded = ticks
         self.start = self.now = ticks.start.now
 
     def wait(self) -> float:
-        """See :meth:`LoopClock.wait`."""
         tick = self._recorded.advance()
         self.now = tick.now
         return tick.dt
 
     def after(self, duration: float) -> bool:
-        """Whether the run was ended then, whatever by."""
         return self._recorded.next is not None and not self._recorded.next.following
 
 
@@ -178,23 +166,12 @@ class _Recorded:
     def gripper_openings(self) -> dict[str, float]:
         return {} if self._ticks.current is None else self._ticks.current.openings
 
-    def start(self) -> None:
-        pass
-
-    def send_haptic(self, feedback: HapticFeedback) -> None:
-        pass
-
-    def reset(self, q: Array | None = None) -> None:
-        pass
-
-    def apply(self, command: Command) -> None:
-        pass
-
-    def advance(self, dt: float) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
+    def start(self) -> None: ...
+    def send_haptic(self, feedback: HapticFeedback) -> None: ...
+    def reset(self, q: Array | None = None) -> None: ...
+    def apply(self, command: Command) -> None: ...
+    def advance(self, dt: float) -> None: ...
+    def close(self) -> None: ...
 
 
 class _Solver:
@@ -225,7 +202,6 @@ class _PlantDifference:
         self._off: dict[str, list[tuple[float, float]]] = {name: [] for name in robot.arms}  # [m], [rad]
 
     def __call__(self, tick: Tick) -> None:
-        """Take one tick of the replay."""
         recorded = self._ticks.current
         if recorded is None or not np.isfinite(recorded.state.q).all():
             return
@@ -236,7 +212,6 @@ class _PlantDifference:
             self._off[name].append((distance, angle))
 
     def arms(self) -> dict[str, ArmDifference]:
-        """Of each arm; empty where no tick was compared."""
         found = {}
         for name, off in self._off.items():
             if off:
@@ -244,3 +219,46 @@ class _PlantDifference:
                 rms = 1e3 * math.sqrt(float(np.mean(distances**2)))
                 found[name] = ArmDifference(rms, 1e3 * float(distances.max()), math.degrees(float(angles.max())))
         return found
+
+
+class _Comparison:
+    """A listener of a replay that holds each tick to the recorded one, bit for bit, but for how long it took."""
+
+    keeps_episodes = True  # as when it was recorded
+
+    def __init__(self, about: About, ticks: RecordedTicks) -> None:
+        self._ticks, self._packer = ticks, TickPacker(about.arms, about.joints)
+        self._labels = tick_labels(about.arms, about.joints)
+        left_out = [any(name in label.split(".") for name in NOT_REPLAYED) for label in self._labels]
+        self._compared = np.flatnonzero(~np.array(left_out))
+        self._difference: str | None = None
+
+    def __call__(self, tick: Tick) -> None:
+        recorded = self._ticks.current
+        assert recorded is not None
+        replayed = self._packer.pack(recorded.number, tick)
+        if self._difference is None:
+            found = self._difference_of_rows(recorded.packed.row, replayed.row)
+            found = found or _difference_of_states(recorded.packed.state, replayed.state)
+            if found is not None:
+                self._difference = f"{tick.now - self._ticks.start.now:.6f} s: {found}"
+
+    def finish(self) -> str | None:
+        """The first difference, after the replay, of which nothing may be left; None: there is none."""
+        if self._difference is None and self._ticks.next is not None:
+            return f"{self._ticks.next.now - self._ticks.start.now:.6f} s: a tick was recorded only"
+        return self._difference
+
+    def _difference_of_rows(self, recorded: bytes, replayed: bytes) -> str | None:
+        before, after = (np.frombuffer(row)[self._compared] for row in (recorded, replayed))
+        for place in np.flatnonzero(before.view(np.uint64) != after.view(np.uint64)):
+            return f"{self._labels[self._compared[place]]}: recorded {before[place]}, replayed {after[place]}"
+        return None
+
+
+def _difference_of_states(recorded: str, replayed: str) -> str | None:
+    before, after = (json.loads(text) if text else {} for text in (recorded, replayed))
+    for name in {**before, **after}:
+        if before.get(name) != after.get(name):
+            return f"{name}: recorded {before.get(name)!r}, replayed {after.get(name)!r}"
+    return None if recorded == replayed else "state: told another time"

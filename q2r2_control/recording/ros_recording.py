@@ -1,7 +1,7 @@
-"""A recording of the ROS nodes, read as if one loop had made it, so that whoever reads recordings reads it as well.
+"""A recording of the ROS nodes, read as if one loop had made it.
 
-A tick is one of the controller's node. With it counts what had been received by then: the newest joint states, flags of
-the arms, and targets. The reference is the one with the same time.
+A tick is one of the controller's node, with what had been received by then: the newest joint states, flags of the arms,
+and targets. The reference is the one with the same time.
 """
 
 from __future__ import annotations
@@ -21,21 +21,11 @@ from q2r2_control.config.external import ControllerKind
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event
-from q2r2_control.recording import topics as names
+from q2r2_control.recording import messages as names
 from q2r2_control.recording.about import ROS, About
 from q2r2_control.recording.messages import NANOSECONDS, STORE, Message, pose_of
-from q2r2_control.recording.reader import Picture, Recording, TickChunk
+from q2r2_control.recording.reader import Recording, TickChunk
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, tool_poses
-from q2r2_control.recording.ros_topics import (
-    ARM_FIELDS,
-    CONTROLLER_TICK,
-    RECORDER_EVENTS,
-    arm_events,
-    arm_flags,
-    is_compressed,
-    ros_topics,
-    tick_fields,
-)
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array
@@ -53,7 +43,6 @@ class RosRecording(Recording):
     """Raises :class:`RecordingError` for any other recording, and where another controller moved the arms."""
 
     def chunks(self) -> Iterator[TickChunk]:
-        """See :meth:`Recording.chunks`."""
         config, robot = cell_and_robot_of(self)
         if config.controller is not ControllerKind.BUILTIN:
             raise RecordingError(
@@ -73,21 +62,18 @@ class RosRecording(Recording):
             previous.rows["following"][-1] = 0.0
         yield ticks.rest(previous)
 
-    def pictures(self, camera: str) -> Iterator[Picture]:
-        """See :meth:`Recording.pictures`; of the time at which they were received."""
+    def _topic_of(self, camera: str) -> str:
         topic = parse_config(self.about.cell, f"{self.file}: its cell").cameras[camera].topic or ""
-        if not is_compressed(topic):
+        if not names.is_compressed(topic):
             raise RecordingError(
                 f"{self.file}: pictures of camera {camera} are sensor_msgs/Image on {topic}; allowed to export: "
                 "CompressedImage; --no-pictures leaves them out"
             )
-        yield from self._pictures_on(topic)
+        return topic
 
 
 @dataclass(slots=True)
 class _Tick:
-    """A tick of the controller."""
-
     time: int  # of its receipt [ns of day]
     now: float  # of the controller [s]
     row: Rows  # (1,), filled with what was known by then
@@ -96,14 +82,14 @@ class _Tick:
 
 
 class RosTicks:
-    """Takes the messages of a recording in their order, and gives ticks."""
+    """Makes ticks of the messages of a recording."""
 
     def __init__(self, about: About, robot: Robot) -> None:
         self._robot, self._epoch, self._arms, self._joint_names = robot, about.epoch, about.arms, about.joints
-        self._fields, self._type = tick_fields(about.arms), tick_type(len(about.arms), len(about.joints))
-        self._types = {topic.name: topic.type for topic in ros_topics(about.arms, {})}
+        self._fields, self._type = names.tick_fields(about.arms), tick_type(len(about.arms), len(about.joints))
+        self._types = {topic.name: topic.type for topic in names.ros_topics(about.arms, {})}
         self._joints = np.full((3, len(about.joints)), np.nan)
-        self._flags = np.full((len(about.arms), len(ARM_FIELDS)), np.nan)
+        self._flags = np.full((len(about.arms), len(names.ARM_FIELDS)), np.nan)
         self._targets: dict[int, tuple[int, Array]] = {}  # by the arm's place: when it came [ns], and the pose
         self._samples: list[Array] = []
         self._events: list[Event] = []
@@ -113,13 +99,13 @@ class RosTicks:
         self._take: dict[str, Callable[[Any, int], None]] = {
             names.JOINT_STATES: self._on_joints,
             names.REFERENCE: self._on_reference,
-            CONTROLLER_TICK: self._on_tick,
-            RECORDER_EVENTS: self._on_event,
+            names.CONTROLLER_TICK: self._on_tick,
+            names.RECORDER_EVENTS: self._on_event,
         }
         for place, arm in enumerate(about.arms):
             self._take[names.target(arm)] = partial(self._on_target, place)
-            self._take[arm_flags(arm)] = partial(self._on_flags, place)
-            self._take[arm_events(arm)] = self._on_event
+            self._take[names.arm_flags(arm)] = partial(self._on_flags, place)
+            self._take[names.arm_events(arm)] = self._on_event
         for side, hand in enumerate(SIDES):
             self._take[names.hand_pose(hand)] = partial(self._on_hand, side)
 
@@ -180,7 +166,7 @@ class RosTicks:
         row["q"], row["v"], row["tau"] = self._joints
         arms = row["arms"][0]
         for place, (arm, flags) in enumerate(zip(self._arms, self._flags, strict=True)):
-            for name, value in zip(ARM_FIELDS, flags.tolist(), strict=True):
+            for name, value in zip(names.ARM_FIELDS, flags.tolist(), strict=True):
                 arms["opening" if name == "measured" else name][place] = value
             arms["commanded"][place] = arms["wanted"][place]
             arms["rejected"][place] = values[f"rejected_{arm}"]

@@ -1,8 +1,4 @@
-"""A tick as one row of float64, which the topic ``tick`` has, and what only some ticks have beside it.
-
-The loop's own thread packs it, so this is some microseconds of work. Fields are in the order in which a tick computes
-them, so that of a replay the first difference in a row is nearest to its cause.
-"""
+"""A tick as one row of float64, in the order in which a tick computes its numbers, with its samples and state."""
 
 from __future__ import annotations
 
@@ -17,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
-from q2r2_control.types import SIDES, Array, CommandMode, HandFault, HandInputs, HandSample, RobotState, StepStatus
+from q2r2_control.types import SIDES, Array, CommandMode, HandFault, HandInputs, HandSample, StepStatus
 
 if TYPE_CHECKING:  # the writer's process does without the loop's modules
     from q2r2_control.summary.tick import Tick
@@ -42,12 +38,9 @@ NOT_REPLAYED = ("compute_time", "solve_time", "tool")  # the writer adds the too
 _LOOP = ("index", "now", "dt", "connected", "following", "samples", "state_stamp", "external")
 _MEASURED = ("q", "v", "tau", "tau_external")
 _CONTROLLER = ("step", "unsolved", "status", "certified", "fallback", "closest_distance", "margin", "slack")
-_REFERENCE = ("reference_q", "reference_v", "reference_a")
-_COMMAND = ("command_q", "command_v", "command_tau")
+_DECIDED = ("reference_q", "reference_v", "reference_a", "command_q", "command_v", "command_tau")
 _LAST = ("command_mode", "compute_time", "solve_time")
 
-_MODE_NUMBERS = {mode: number for number, mode in enumerate(COMMAND_MODES)}
-_STATUS_NUMBERS = {status: number for number, status in enumerate(STATUSES)}
 _values_of = attrgetter(*HandInputs.__slots__)
 _NO_POSE = (0.0,) * len(POSE_FIELDS)  # whose quaternion is none
 
@@ -61,34 +54,30 @@ class PackedTick(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Of all [bytes]."""
         return len(self.row) + len(self.samples) + len(self.state)
 
 
 def tick_type(arms: int, joints: int) -> np.dtype[np.void]:
     """A row for so many arms and joints; all numbers are float64."""
-    number = np.dtype("<f8")
-    poses = [(name, number, (len(POSE_FIELDS),)) for name in ARM_POSES]
-    arm = np.dtype([*((name, number) for name in ARM_FIELDS), *poses])
-    of_joints = {name: (name, number, (joints,)) for name in (*_MEASURED, *_REFERENCE, *_COMMAND)}
+    number, pose, of_joints = "<f8", f"({len(POSE_FIELDS)},)<f8", f"({joints},)<f8"
+    arm = [*((name, number) for name in ARM_FIELDS), *((name, pose) for name in ARM_POSES)]
     return np.dtype(
         [
             *((name, number) for name in _LOOP),
-            *(of_joints[name] for name in _MEASURED),
+            *((name, of_joints) for name in _MEASURED),
             ("arms", arm, (arms,)),
             *((name, number) for name in _CONTROLLER),
-            *(of_joints[name] for name in (*_REFERENCE, *_COMMAND)),
+            *((name, of_joints) for name in _DECIDED),
             *((name, number) for name in _LAST),
         ]
     )
 
 
 def tick_labels(arms: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
-    """The names of a row's numbers."""
     poses = [f"{name}.{number}" for name in ARM_POSES for number in POSE_FIELDS]
     names = [*_LOOP, *(f"{name}.{joint}" for name in _MEASURED for joint in joints)]
     names += [f"{arm}.{name}" for arm in arms for name in (*ARM_FIELDS, *poses)]
-    names += [*_CONTROLLER, *(f"{name}.{joint}" for name in (*_REFERENCE, *_COMMAND) for joint in joints)]
+    names += [*_CONTROLLER, *(f"{name}.{joint}" for name in _DECIDED for joint in joints)]
     return (*names, *_LAST)
 
 
@@ -126,11 +115,11 @@ class TickPacker:
         row += self._not_measured if external is None else external.tolist()
         for arm in self._arms:
             row += self._of_arm(arm, tick)
-        row += (tick.step, min(report.unsolved, UNSOLVED_MAX), _STATUS_NUMBERS[report.status], report.certified)
+        row += (tick.step, min(report.unsolved, UNSOLVED_MAX), STATUSES.index(report.status), report.certified)
         row += (report.fallback, report.closest_distance, report.margin, report.slack)
         for joints in (reference.q, reference.v, reference.a, command.q, command.v, command.tau):
             row += joints.tolist()
-        row += (_MODE_NUMBERS[command.mode], tick.compute_time, report.solve_time)
+        row += (COMMAND_MODES.index(command.mode), tick.compute_time, report.solve_time)
         packed_samples = b"".join([_packed_sample(number, sample) for sample in samples])
         return PackedTick(self._row.pack(*row), packed_samples, self._state_text(tick))
 
@@ -165,14 +154,11 @@ class TickPacker:
         if tick.events:
             state["events"] = [event.as_json() for event in tick.events]
         if before is None:
-            state["start"] = {"now": tick.start.now, **_plain(tick.start.state)}
+            at_start = tick.start.state
+            felt = None if at_start.tau_external is None else at_start.tau_external.tolist()
+            joints = {"q": at_start.q.tolist(), "v": at_start.v.tolist(), "tau": at_start.tau.tolist()}
+            state["start"] = {"now": tick.start.now, **joints, "tau_external": felt, "stamp": at_start.stamp}
         return json.dumps(state)
-
-
-def _plain(state: RobotState) -> dict[str, Any]:
-    external = None if state.tau_external is None else state.tau_external.tolist()
-    joints = {"q": state.q.tolist(), "v": state.v.tolist(), "tau": state.tau.tolist()}
-    return {**joints, "tau_external": external, "stamp": state.stamp}
 
 
 def _packed_sample(number: int, sample: HandSample) -> bytes:

@@ -1,7 +1,4 @@
-"""The process that writes a recording: it makes messages of packed ticks and writes them.
-
-It imports none of the modules that compute: :class:`BaseRecorder` starts it.
-"""
+"""The process that writes a recording. It imports none of the modules that compute."""
 
 from __future__ import annotations
 
@@ -19,18 +16,17 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.recording import messages
-from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.bag import BagWriter
-from q2r2_control.recording.messages import NANOSECONDS, Message, MessageTemplate
+from q2r2_control.recording.messages import NANOSECONDS, Message, MessageTemplate, Topic
 from q2r2_control.recording.tick_rows import POSE_FIELDS, SAMPLE_FIELDS, PackedTick, numbers_in, tick_type
-from q2r2_control.recording.topics import Topic
 from q2r2_control.types import SIDES, Array, HandInputs
 
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
-
+FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
+_NICENESS = 10  # the loop goes first where there are not enough processors
 _LAST_TIME = (2**31 - 1) * NANOSECONDS  # that a stamp can have [ns]
 _HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (
     SAMPLE_FIELDS.index(name) for name in ("hand", "pose_stamp", "inputs_stamp", "x", "button_upper")
@@ -71,53 +67,48 @@ class TickEncoder:
         self._type = tick_type(len(robot.arms), len(robot.joints))
         self._start: float | None = None  # of the loop's clock [s]
         self._stamps: dict[tuple[float, int], float] = {}  # the last of each hand's poses and inputs
-        self._templates = _templates(list(robot.joints), topics[names.TICK])
+        self._templates = _templates(list(robot.joints), topics[messages.TICK])
         self._poses = {
-            frame: MessageTemplate(messages.POSE, messages.pose_stamped(_numbers(7), frame), 7)
-            for frame in ("", names.WORLD)
+            frame: MessageTemplate(messages.POSE, messages.pose_stamped(np.arange(1.0, 8.0), frame), 7)
+            for frame in ("", messages.WORLD)
         }
 
     def encode(self, batch: Sequence[PackedTick]) -> list[Message]:
         """Messages of packed ticks that follow the last ones, tick by tick, as readers without an index expect."""
         rows = np.frombuffer(b"".join(tick.row for tick in batch), dtype=self._type).copy()
         rows["arms"]["tool"] = self._robot.tool_poses(rows["reference_q"])
-        first = self._first_message(batch[0]) if self._start is None else []
+        first = []
+        if self._start is None:
+            self._start = float(json.loads(batch[0].state)["start"]["now"])
+            channel = self._topics[messages.DESCRIPTION].channel
+            first.append(Message(channel, 0, self._epoch, self._epoch, messages.text(self._robot.urdf)))
         made = _Batch(self._topics, rows["index"].astype(np.int64), self._times(rows["now"]))
         every, arms = np.arange(len(rows)), rows["arms"]
-        made.add(names.TICK, every, self._filled(names.TICK, numbers_in(rows), made.times))
+        made.add(messages.TICK, every, self._templates[messages.TICK].filled(numbers_in(rows), made.times))
         for at, tick in enumerate(batch):
             self._add_samples(made, at, np.frombuffer(tick.samples).reshape(-1, len(SAMPLE_FIELDS)))
-        measured = np.hstack((rows["q"], rows["v"], rows["tau"]))
-        made.add(names.JOINT_STATES, every, self._filled(names.JOINT_STATES, measured, made.times))
         felt = np.flatnonzero(rows["external"])
-        external = self._filled(names.EXTERNAL_TORQUE, rows["tau_external"][felt], made.times[felt])
-        made.add(names.EXTERNAL_TORQUE, felt, external)
+        external = self._templates[messages.EXTERNAL_TORQUE].filled(rows["tau_external"][felt], made.times[felt])
+        made.add(messages.EXTERNAL_TORQUE, felt, external)
         for index, arm in enumerate(self._robot.arms):
             for topic, field, frame in (
-                (names.filtered_hand(arm), "filtered_hand", ""),
-                (names.target(arm), "target", names.WORLD),
-                (names.safe_target(arm), "tool", names.WORLD),
+                (messages.filtered_hand(arm), "filtered_hand", ""),
+                (messages.target(arm), "target", messages.WORLD),
+                (messages.safe_target(arm), "tool", messages.WORLD),
             ):
                 poses = arms[field][:, index]
                 there = np.flatnonzero(poses.any(axis=1))
                 made.add(topic, there, self._poses[frame].filled(poses[there], made.times[there]))
         for topic, columns in (
-            (names.REFERENCE, ("reference_q", "reference_v", "reference_a")),
-            (names.JOINT_COMMANDS, ("command_q", "command_v", "command_tau")),
+            (messages.JOINT_STATES, ("q", "v", "tau")),
+            (messages.REFERENCE, ("reference_q", "reference_v", "reference_a")),
+            (messages.JOINT_COMMANDS, ("command_q", "command_v", "command_tau")),
         ):
-            made.add(topic, every, self._filled(topic, np.hstack([rows[name] for name in columns]), made.times))
+            numbers = np.hstack([rows[name] for name in columns])
+            made.add(topic, every, self._templates[topic].filled(numbers, made.times))
         told = [at for at, tick in enumerate(batch) if tick.state]
-        made.add(names.STATE, told, [messages.text(batch[at].state) for at in told])
-        return first + made.in_order()
-
-    def _first_message(self, tick: PackedTick) -> list[Message]:
-        """The robot for viewers."""
-        self._start = float(json.loads(tick.state)["start"]["now"])
-        channel = self._topics[names.DESCRIPTION].channel
-        return [Message(channel, 0, self._epoch, self._epoch, messages.text(self._robot.urdf))]
-
-    def _filled(self, topic: str, numbers: Array, stamps: npt.NDArray[np.int64]) -> list[bytes]:
-        return self._templates[topic].filled(numbers, stamps)
+        made.add(messages.STATE, told, [messages.text(batch[at].state) for at in told])
+        return first + [message for of_tick in made.messages for message in of_tick]
 
     def _times(self, seconds: Array) -> npt.NDArray[np.int64]:
         """Times of the loop's clock [s] as times of day [ns]; any number of a sender gives some time."""
@@ -129,17 +120,17 @@ class TickEncoder:
         """Samples of a tick as the loop got them; poses and inputs that are new as messages of the nodes too."""
         for sample in samples:
             hand = SIDES[int(sample[_HAND])]
-            made.add(names.SAMPLES, [at], [messages.serialized(messages.ARRAY, messages.float_array(sample))])
+            made.add(messages.SAMPLES, [at], [messages.serialized(messages.ARRAY, messages.float_array(sample))])
             if self._is_new(sample, _POSE_STAMP):
                 (stamp,) = self._times(sample[_POSE_STAMP : _POSE_STAMP + 1]).tolist()
                 pose = messages.pose_stamped(sample[_X : _X + len(POSE_FIELDS)], stamp=stamp)
-                made.add(names.hand_pose(hand), [at], [messages.serialized(messages.POSE, pose)])
+                made.add(messages.hand_pose(hand), [at], [messages.serialized(messages.POSE, pose)])
             if self._is_new(sample, _INPUTS_STAMP):
                 with np.errstate(over="ignore"):  # float32, whatever an input sends
                     values = sample[_BUTTONS : _BUTTONS + len(HandInputs.__slots__)].astype(np.float32)
                 upper, lower, *analog = values.tolist()
                 inputs = messages.make(messages.HAND_INPUTS, bool(upper), bool(lower), *analog)
-                made.add(names.hand_buttons(hand), [at], [messages.serialized(messages.HAND_INPUTS, inputs)])
+                made.add(messages.hand_buttons(hand), [at], [messages.serialized(messages.HAND_INPUTS, inputs)])
 
     def _is_new(self, sample: Array, stamp: int) -> bool:
         """Whether a sample of a hand has another stamp than the one before."""
@@ -153,84 +144,48 @@ class _Batch:
 
     def __init__(self, topics: dict[str, Topic], numbers: npt.NDArray[np.int64], times: npt.NDArray[np.int64]) -> None:
         self._topics, self._numbers, self.times = topics, numbers.tolist(), times
-        self._messages: list[list[Message]] = [[] for _ in self._numbers]
+        self.messages: list[list[Message]] = [[] for _ in self._numbers]  # tick by tick
 
     def add(self, topic: str, at: Iterable[int], payloads: Iterable[bytes]) -> None:
-        """A message of each of the ticks ``at`` these places."""
         channel = self._topics[topic].channel
         for place, payload in zip(at, payloads, strict=True):
             time = int(self.times[place])
-            self._messages[place].append(Message(channel, self._numbers[place], time, time, payload))
-
-    def in_order(self) -> list[Message]:
-        """All, tick by tick."""
-        return [message for of_tick in self._messages for message in of_tick]
-
-
-def _numbers(count: int, first: int = 1) -> Array:
-    return np.arange(first, first + count, dtype=np.float64)
+            self.messages[place].append(Message(channel, self._numbers[place], time, time, payload))
 
 
 def _templates(joints: list[str], tick: Topic) -> dict[str, MessageTemplate]:
-    """Of the topics that every tick has."""
-    n, none = len(joints), np.empty(0)
-    lists = _numbers(n), _numbers(n, n + 1), _numbers(n, 2 * n + 1)
-    numbers: Any = messages.float_array(_numbers(len(tick.labels)))
+    n, count = len(joints), len(tick.labels)
+    none, numbers = np.empty(0), np.arange(1.0, max(3 * n, count) + 1.0)
+    lists = numbers[:n], numbers[n : 2 * n], numbers[2 * n : 3 * n]
     states = MessageTemplate(messages.JOINTS, messages.joint_state(joints, *lists), 3 * n)
     return {
-        names.TICK: MessageTemplate(messages.ARRAY, numbers, len(tick.labels)),
-        names.JOINT_STATES: states,
-        names.JOINT_COMMANDS: states,
-        names.EXTERNAL_TORQUE: MessageTemplate(messages.JOINTS, messages.joint_state(joints, none, none, lists[0]), n),
-        names.REFERENCE: MessageTemplate(messages.TRAJECTORY, messages.joint_trajectory(joints, *lists), 3 * n),
+        messages.TICK: MessageTemplate(messages.ARRAY, messages.float_array(numbers[:count]), count),
+        messages.JOINT_STATES: states,
+        messages.JOINT_COMMANDS: states,
+        messages.EXTERNAL_TORQUE: MessageTemplate(
+            messages.JOINTS, messages.joint_state(joints, none, none, lists[0]), n
+        ),
+        messages.REFERENCE: MessageTemplate(messages.TRAJECTORY, messages.joint_trajectory(joints, *lists), 3 * n),
     }
-
-
-FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
-_NICENESS = 10  # the loop goes first where there are not enough processors
 
 
 @dataclass(frozen=True)
 class RecordingSetup:
-    """The first request."""
-
     path: Path  # of the file, in a folder that is there
     about: About
     topics: tuple[Topic, ...]  # of the file
     robot: RecordedRobot | None = None  # of packed ticks
 
 
-class TickBatch(NamedTuple):
-    """Ticks one after the other, packed by :class:`TickPacker`."""
-
-    ticks: list[PackedTick]
-
-    @property
-    def size(self) -> int:
-        """Of all [bytes]."""
-        return sum(tick.size for tick in self.ticks)
-
-
-class MessageBatch(NamedTuple):
-    """Messages, to be written as they are."""
-
-    messages: list[Message]
-
-    @property
-    def size(self) -> int:
-        """Of all [bytes]."""
-        return sum(len(message.payload) for message in self.messages)
-
-
 class Written(NamedTuple):
     """An answer: how much of what was sent is in the file."""
 
     ticks: int = 0
-    messages: int = 0  # of message batches
+    messages: int = 0  # that were sent as such
 
 
 def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
-    """Write one recording. Raises :class:`OSError`, with a file that has what was written before."""
+    """Write one recording, of lists of packed ticks or messages. Raises :class:`OSError`; what was written stays."""
     with suppress(OSError):
         os.nice(_NICENESS)
     setup = next((request for request in requests if request is not None), None)
@@ -244,13 +199,12 @@ def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
         for request in requests:
             if isinstance(request, Conclusion):
                 conclusion = request
-            elif isinstance(request, MessageBatch):
-                bag.write(request.messages)
-                received = received._replace(messages=received.messages + len(request.messages))
-            elif isinstance(request, TickBatch):
-                assert encoder is not None
-                bag.write(encoder.encode(request.ticks))
-                received = received._replace(ticks=received.ticks + len(request.ticks))
+            elif request and isinstance(request[0], Message):
+                bag.write(request)
+                received = received._replace(messages=received.messages + len(request))
+            elif request and encoder is not None:
+                bag.write(encoder.encode(request))
+                received = received._replace(ticks=received.ticks + len(request))
             if time.monotonic() >= due:
                 bag.flush()
                 answer(received)

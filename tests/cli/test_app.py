@@ -48,7 +48,7 @@ def test_the_help_lists_every_command_whose_own_has_an_example(command: str) -> 
         (("replay", "pyproject.toml"), "pyproject.toml"),
         (("replay", "missing.mcap"), "missing.mcap"),
         (("judge", "pyproject.toml"), "pyproject.toml"),
-        (("export", "mcap", "recordings", "--output", "out"), "'mcap' is not one of 'lerobot'"),
+        (("export", "mcap", "recordings", "--output", "out"), "export mcap: allowed: lerobot"),
         (("report", "pyproject.toml", "--output", "page.html"), "pyproject.toml"),
         (("headset-check", "--host", "no such host"), "no such host"),
         (("headset-check", "--duration", "inf"), "--duration inf"),

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.cli import recordings as command
+from q2r2_control.export.formats import FORMATS, Format, write_table
 from tests.cli.command import q2r2
-from tests.export.runs import DURATION, contents, record_two
+from tests.export.files import DURATION, contents, record_two
 
 
 @pytest.fixture(scope="module")
@@ -20,22 +20,20 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Path]:
     return record_two(tmp_path_factory.mktemp("recordings"))
 
 
-def test_one_recording_is_one_table_and_a_folder_of_them_a_folder(recordings: Sequence[Path], tmp_path: Path) -> None:
-    rows: list[list[dict[str, Any]]] = []
-    for options in ((), ("--trim",)):
-        out = tmp_path / f"a{len(rows)}.csv"
-        assert q2r2("export", "csv", str(recordings[0]), "--output", str(out), "--fps", "50", *options).exit_code == 0
-        with out.open(newline="") as stream:
-            rows.append(list(csv.DictReader(stream)))
-    assert len(rows[0]) >= DURATION * 50, "the arms come to rest after the end"
-    assert len(rows[0]) - len(rows[1]) >= 5, "the press comes 0.1 s after the beginning"
-    assert {row["task"] for row in rows[0]} == {"a test"}
-    folder = str(recordings[0].parent.parent)
-    assert q2r2("export", "csv", folder, "--output", str(tmp_path / "all")).exit_code == 0
-    assert set(contents(tmp_path / "all")) == {f"{file.stem}.csv" for file in recordings}
-    result = q2r2("export", "csv", folder, "--output", str(tmp_path / "b.csv"))
-    assert result.exit_code == 2
-    assert "for 2 recordings; allowed: a folder, or one recording" in result.stderr
+def test_a_folder_of_recordings_is_a_folder_of_tables_with_or_without_the_time_before_the_first_engagement(
+    recordings: Sequence[Path], tmp_path: Path
+) -> None:
+    lengths = []
+    for name, options in (("whole", ()), ("trimmed", ("--trim",))):
+        out, folder = tmp_path / name, str(recordings[0].parent.parent)
+        assert q2r2("export", "csv", folder, "--output", str(out), "--fps", "100", *options).exit_code == 0
+        assert set(contents(out)) == {f"{file.stem}.csv" for file in recordings}
+        with (out / f"{recordings[0].stem}.csv").open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        assert {row["task"] for row in rows} == {"a test"}
+        lengths.append(len(rows))
+    assert lengths[0] >= DURATION * 100  # the arms come to rest after the end
+    assert lengths[0] - lengths[1] >= 10  # the press comes 0.1 s after the beginning
 
 
 def test_a_bad_recording_ends_the_export_with_one_line_or_is_skipped(
@@ -64,7 +62,7 @@ def test_an_interrupted_export_leaves_nothing_half_and_the_next_one_ends_it(
 
     arguments = ("export", "csv", *map(str, recordings), "--output")
     with monkeypatch.context() as patch:
-        patch.setattr(command, "gather_tables", interrupted)
+        patch.setitem(FORMATS, "csv", Format(write_table, interrupted))
         assert q2r2(*arguments, str(tmp_path / "out")).exit_code == 130
     assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
     for name in ("out", "at_once"):
@@ -74,9 +72,9 @@ def test_an_interrupted_export_leaves_nothing_half_and_the_next_one_ends_it(
 
 
 def test_an_output_that_exists_is_left_alone(recordings: Sequence[Path], tmp_path: Path) -> None:
-    (tmp_path / "out.csv").write_text("mine")
-    result = q2r2("export", "csv", str(recordings[0]), "--output", str(tmp_path / "out.csv"))
+    (tmp_path / "out").write_text("mine")
+    result = q2r2("export", "csv", str(recordings[0]), "--output", str(tmp_path / "out"))
     assert result.exit_code == 2
-    assert "out.csv: exists; allowed: a name that does not exist yet" in result.stderr
-    assert (tmp_path / "out.csv").read_text() == "mine"
-    assert not (tmp_path / "out.csv.partial").exists()
+    assert "out: exists; allowed: a name that does not exist yet" in result.stderr
+    assert (tmp_path / "out").read_text() == "mine"
+    assert not (tmp_path / "out.partial").exists()

@@ -9,7 +9,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from tests.cli.command import FAST, changed_cell, one_object, q2r2
-from tests.judging.runs import hands, record_episode
+from tests.judging.episodes import hands, record_episode
 
 IDLE = "max_idle_share: 0.5 "
 

@@ -3,28 +3,34 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+import pickle
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import pinocchio as pin
 from PIL import Image
 
 from q2r2_control.config.recording import CameraConfig
+from q2r2_control.export.episodes import EpisodeVectors
+from q2r2_control.export.sampling import Pixels
+from q2r2_control.inputs.played import EvenSampling, PlayedInput
 from q2r2_control.recording.about import About, Conclusion, as_yaml
 from q2r2_control.recording.bag import BagWriter
-from q2r2_control.recording.messages import ARRAY, Message, float_array, picture, serialized
+from q2r2_control.recording.messages import ARRAY, TICK, Message, float_array, picture, picture_topic, serialized
 from q2r2_control.recording.tick_rows import numbers_in, tick_type
-from q2r2_control.recording.topics import TICK, picture_topic
-from tests.recording.runs import ARMS, JOINTS
-from tests.support.processes import cell
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import SIDES, HandInputs
+from tests.recording.runs import ARMS, JOINTS, file_of, pipeline, record
+from tests.support.processes import Watch, cell
 
 EPOCH = 1_700_000_000_000_000_000  # [ns]
 CHUNK = 7  # ticks
 
 
 def brightness(number: int) -> int:
-    """Of the pictures that :func:`write_recording` makes."""
     return 10 * number
 
 
@@ -53,22 +59,10 @@ def write_recording(
     (arms,). ``pictures``: of ``cameras``, when they were taken [ns], each brighter than the last.
     """
     config = cell().model_copy(update={"cameras": dict(cameras or {})})
-    about = About(
-        ARMS,
-        JOINTS,
-        "position",
-        ("position",),
-        EPOCH,
-        False,
-        as_yaml(config),
-        "<robot/>",
-        tuple(config.cameras),
-        {"task": "to count"},
-    )
-    topics = about.topics()
-    count = len(times)
-    at = np.arange(count)
-    rows = np.zeros(count, dtype=tick_type(len(ARMS), len(JOINTS)))
+    how, cameras_of, notes = ("position", ("position",), EPOCH, False), tuple(config.cameras), {"task": "to count"}
+    about = About(ARMS, JOINTS, *how, as_yaml(config), "<robot/>", cameras_of, notes)
+    topics, at = about.topics(), np.arange(len(times))
+    rows = np.zeros(len(times), dtype=tick_type(len(ARMS), len(JOINTS)))
     rows["index"] = at if numbers is None else numbers
     rows["q"], rows["v"], rows["tau"] = -at[:, None], -10 * at[:, None], -100 * at[:, None]
     rows["reference_q"], rows["reference_v"] = at[:, None], np.isin(at, moving)[:, None]
@@ -92,3 +86,82 @@ def write_recording(
                 bag.write([Message(topics[picture_topic(name)].channel, number, stamp, stamp, payload)])
         bag.close(Conclusion())
     return path
+
+
+STEP_AT = 0.5  # [s]
+DURATION = 0.9  # [s]
+
+
+@dataclass(frozen=True)
+class Run:
+    file: Path
+    ticks: list[Tick]
+
+
+def step_of_the_hand(hand: str, t: float) -> pin.SE3:
+    """Rests, and is 1 cm to the left from :data:`STEP_AT` on."""
+    return pin.SE3(np.eye(3), np.array([0.0, 0.01 if t >= STEP_AT else 0.0, 0.0]))
+
+
+def press(hand: str, t: float) -> HandInputs:
+    return HandInputs(button_lower=0.1 <= t < 0.2, button_upper=hand == "left" and STEP_AT <= t < STEP_AT + 0.1)
+
+
+def record_step(folder: Path, duration: float = DURATION) -> Run:
+    """A run in which both arms are engaged and the hands step; the plant is where the reference was a tick before."""
+    loop = pipeline(source=PlayedInput(step_of_the_hand, press, {side: EvenSampling(100.0) for side in SIDES}))
+    watch = Watch(loop)
+    return Run(file_of(record(folder, loop, duration)), watch.ticks)
+
+
+def record_two(folder: Path) -> Sequence[Path]:
+    """Files of two such runs of different lengths."""
+    return [record_step(folder, duration).file for duration in (DURATION, 0.6)]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+NAMES = {"observation.state": ("left_A1", "left_gripper"), "action": ("left_A1", "left_gripper", "right_A1")}
+OUTCOMES = {1: True, 2: None, 3: False}
+CAMERA, WIDTH, HEIGHT = "front", 64, 48
+
+
+def episode(seed: int, frames: int, task: str) -> EpisodeVectors:
+    random = np.random.default_rng(seed)
+    vectors = {name: random.normal(size=(frames, len(labels))).astype(np.float32) for name, labels in NAMES.items()}
+    about = (f"run-{seed}.mcap", "two_arms", task, 30, NAMES, {"operator": "Ada"})
+    return EpisodeVectors(*about, vectors, success=OUTCOMES[seed])
+
+
+EPISODES = (episode(1, 40, "stack"), episode(2, 25, "circle"), episode(3, 60, "stack"))
+
+
+@dataclass(frozen=True)
+class Waves:
+    """A smooth pattern, which an encoder of videos keeps, that moves from frame to frame."""
+
+    frames: int
+    seed: int
+    size: tuple[int, int, int] = (HEIGHT, WIDTH, 3)
+
+    def __iter__(self) -> Iterator[Pixels]:
+        y, x = np.mgrid[:HEIGHT, :WIDTH]
+        for frame in range(self.frames):
+            waves = [np.sin(0.1 * x + 0.07 * (channel + 1) * y + 0.3 * frame + self.seed) for channel in range(3)]
+            yield (128 + 100 * np.stack(waves, axis=-1)).astype(np.uint8)
+
+
+def with_pictures(plain: EpisodeVectors, seed: int) -> EpisodeVectors:
+    return replace(plain, cameras={CAMERA: Waves(plain.frames, seed)})  # type: ignore[dict-item]
+
+
+def write_vectors(episode: EpisodeVectors, path: Path) -> None:
+    """Keep an episode, as the formats do."""
+    path.write_bytes(pickle.dumps(replace(episode, cameras={})))
+
+
+def load_vectors(path: Path) -> EpisodeVectors:
+    episode: EpisodeVectors = pickle.loads(path.read_bytes())
+    return episode

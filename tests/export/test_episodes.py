@@ -1,7 +1,10 @@
-"""A recorded run becomes the episode that was lived."""
+"""A recorded run becomes the episode that was lived, made once by however many processes."""
 
 from __future__ import annotations
 
+import os
+import shutil
+from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +12,16 @@ import numpy.typing as npt
 import pytest
 
 from q2r2_control.config.recording import CameraConfig
-from q2r2_control.errors import ConfigError
-from q2r2_control.export.episodes import FrameSampling, make_episode
-from tests.export.runs import Run, record_step
-from tests.export.vectors import CAMERA, HEIGHT, WIDTH
+from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.export.episodes import FrameSampling, Output, keep_episodes, make_episode
+from tests.export.files import CAMERA, HEIGHT, WIDTH, Run, contents, load_vectors, record_step, write_vectors
 from tests.recording.runs import RATE, file_of, pipeline, record
 from tests.support.pictures import needs_opengl
 
 pytestmark = pytest.mark.slow
 
 MOVED = 1e-4  # [m] and [rad]
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # begins the data of a chunk
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +38,7 @@ def first_moved(joints: npt.NDArray[np.floating]) -> int:
     return first
 
 
-def test_a_step_of_the_hand_is_in_action_and_observation_at_the_stated_frames(run: Run) -> None:
+def test_a_step_of_the_hand_is_in_action_and_observation_at_the_stated_frames_of_an_episode(run: Run) -> None:
     poses = {i: tick.targets["left"].pose for i, tick in enumerate(run.ticks)}
     asked = {i: pose.translation[1] for i, pose in poses.items() if pose is not None}
     engaged = min(asked)
@@ -52,26 +55,14 @@ def test_a_step_of_the_hand_is_in_action_and_observation_at_the_stated_frames(ru
     assert first_moved(whole.vectors["observation.state"][:, joints]) == command + 1
     gripper = whole.vectors["action"][:, whole.names["action"].index("left_gripper")]
     assert int(np.argmax(gripper < 1.0)) == closing
+    assert (whole.task, whole.cell, whole.recording) == ("a test", "dual_iiwa7", run.file.name)
+    assert "version" in whole.notes
+    assert np.flatnonzero(whole.outcome()["next.done"]).tolist() == [whole.frames - 1]
     # Ticks are 2 ms apart: frame k is that of command i where i - 1 < k / fps / 2 ms <= i, of state i where it is in
     # i <= ... < i + 1.
     slow = make_episode(run.file, FrameSampling(fps=30))
     assert first_moved(slow.vectors["action"][:, joints]) == (command - 1) * 60 // 1000 + 1
     assert first_moved(slow.vectors["observation.state"][:, joints]) == -(-(command + 1) * 60 // 1000)
-
-
-def test_measured_tools_are_those_that_the_loop_measured(run: Run) -> None:
-    episode = make_episode(run.file, FrameSampling(fps=int(RATE)))
-    for arm in ("left", "right"):
-        at = [episode.names["observation.tool"].index(f"{arm}_{axis}") for axis in "xyz"]
-        lived = [tick.tools[arm].translation for tick in run.ticks]
-        np.testing.assert_allclose(episode.vectors["observation.tool"][:, at], lived, atol=1e-6)
-
-
-def test_an_episode_knows_its_task_its_cell_and_its_last_frame(run: Run) -> None:
-    episode = make_episode(run.file, FrameSampling(fps=50))
-    assert (episode.task, episode.cell, episode.recording) == ("a test", "dual_iiwa7", run.file.name)
-    assert "version" in episode.notes
-    assert np.flatnonzero(episode.outcome()["next.done"]).tolist() == [episode.frames - 1]
 
 
 def test_an_episode_has_the_pictures_of_its_frames(tmp_path: Path) -> None:
@@ -88,3 +79,111 @@ def test_an_episode_has_the_pictures_of_its_frames(tmp_path: Path) -> None:
 def test_a_rate_that_no_recording_has_is_refused(fps: int) -> None:
     with pytest.raises(ConfigError, match=rf"--fps {fps}: allowed: 1 \.\. 1000"):
         FrameSampling(fps=fps)
+
+
+def test_several_processes_make_the_same_bytes_as_one(run: Run, tmp_path: Path) -> None:
+    files = [run.file, Path(shutil.copy(run.file, tmp_path / "copy.mcap"))]
+    for workers in (1, 2):
+        (tmp_path / str(workers)).mkdir()
+        made = keep_episodes(files, FrameSampling(), write_vectors, tmp_path / str(workers), workers=workers)
+        assert len(made.kept) == 2
+        assert [load_vectors(file).recording for file in made.kept] == [file.name for file in files]
+    assert contents(tmp_path / "1") == contents(tmp_path / "2") != {}
+
+
+def test_an_interrupted_export_goes_on_with_what_it_had(run: Run, tmp_path: Path) -> None:
+    files = [run.file, Path(shutil.copy(run.file, tmp_path / "copy.mcap"))]
+    kept = tmp_path / "kept"
+    kept.mkdir()
+
+    def interrupt(done: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        keep_episodes(files, FrameSampling(), write_vectors, kept, progress=interrupt)
+    (first,) = kept.iterdir()
+    made_at = first.stat().st_mtime_ns
+    made = keep_episodes(files, FrameSampling(), write_vectors, kept)
+    assert made.kept[0] == first
+    assert first.stat().st_mtime_ns == made_at
+    # An episode that was not finished, and other options, are made anew.
+    first.rename(first.with_name(f"{first.name}.unfinished"))
+    keep_episodes(files, FrameSampling(), write_vectors, kept)
+    assert load_vectors(first).frames == load_vectors(made.kept[1]).frames
+    other = keep_episodes(files[:1], FrameSampling(fps=10), write_vectors, kept)
+    assert load_vectors(other.kept[0]).fps == 10
+
+
+def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Run, tmp_path: Path) -> None:
+    files = [run.file, *(Path(shutil.copy(run.file, tmp_path / f"copy-{number}.mcap")) for number in range(2))]
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    *others, last = keep_episodes(files, FrameSampling(), write_vectors, kept).kept
+    last.unlink()
+    made_at = [other.stat().st_mtime_ns for other in others]
+    unfinished = last.with_name(f"{last.name}.unfinished")
+    os.mkfifo(unfinished)  # nobody reads it, so a worker is in the middle of its episode for good
+
+    def kill(done: int) -> None:
+        if done == len(others):
+            for process in active_children():
+                process.kill()
+
+    with pytest.raises(ConfigError, match="a process of --workers was killed") as fault:
+        keep_episodes(files, FrameSampling(), write_vectors, kept, workers=2, progress=kill)
+    assert "\n" not in str(fault.value)
+    unfinished.unlink()
+    assert keep_episodes(files, FrameSampling(), write_vectors, kept, workers=2).kept == [*others, last]
+    assert [other.stat().st_mtime_ns for other in others] == made_at
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_bad_recording_is_named_or_skipped(workers: int, run: Run, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.mcap"
+    data = bytearray(run.file.read_bytes())
+    data[data.rindex(ZSTD_MAGIC) + 200] ^= 0xFF
+    damaged.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"damaged\.mcap: damaged"):
+        keep_episodes([damaged, run.file], FrameSampling(), write_vectors, tmp_path, workers=workers)
+    made = keep_episodes([damaged, run.file], FrameSampling(), write_vectors, tmp_path, workers=workers, skip_bad=True)
+    assert len(made.kept) == 1
+    (fault,) = made.skipped
+    assert "damaged.mcap: damaged" in fault
+
+
+def test_an_output_that_was_interrupted_is_not_there_and_a_second_try_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "below" / "made"
+
+    def write(target: Path) -> None:
+        target.mkdir()
+        (target / "half").touch()
+        raise KeyboardInterrupt
+
+    output = Output(path)
+    (output.episodes() / "0.npz").touch()
+    with pytest.raises(KeyboardInterrupt):
+        output.write(write)
+    assert not path.exists()
+    again = Output(path)
+    assert [file.name for file in again.episodes().iterdir()] == ["0.npz"]
+    again.write(lambda target: target.mkdir())
+    assert list(path.iterdir()) == []
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_an_output_that_exists_or_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    with pytest.raises(ConfigError, match="there: exists; allowed: a name that does not exist yet"):
+        Output(tmp_path / "there")
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"--output .*file/made: Not a directory"):
+        Output(tmp_path / "file" / "made").episodes()
+    late = Output(tmp_path / "late")
+    late.episodes()
+
+    def meanwhile(target: Path) -> None:
+        target.mkdir()
+        shutil.copytree(tmp_path / "there", tmp_path / "late")
+
+    with pytest.raises(ConfigError, match="late: exists"):
+        late.write(meanwhile)

@@ -1,36 +1,49 @@
-"""Frames are evenly spaced; observations are the newest that were known, commands the first that followed."""
+"""Frames are evenly spaced: observations are the newest that were known, commands the first that followed.
+
+Their features have the numbers that their names say, and a frame has the newest picture at or before it.
+"""
 
 from __future__ import annotations
 
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
+from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import RecordingError
-from q2r2_control.export.sampling import sample
+from q2r2_control.export.sampling import MOTION, CameraFrames, features, sample
 from q2r2_control.recording.reader import Recording
-from tests.export.files import write_recording
+from q2r2_control.recording.tick_rows import NOT_MEASURED, POSE_FIELDS
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from tests.export.files import EPOCH, brightness, write_recording
+from tests.support.processes import cell
 
 pytestmark = pytest.mark.slow
 
-MS = 1_000_000
+MS = 1_000_000  # [ns]
+CAMERA = CameraConfig(position=(1, 0, 1), rpy=(0, 0, 0), width=16, height=16, rate=50.0)
+COUNT = 60
 
 
-def uneven(count: int) -> list[int]:
-    """Times of ticks about a millisecond apart, with one that was 70 ms late."""
-    random = np.random.default_rng(0)
-    steps = random.integers(MS // 2, 3 * MS // 2, count)
-    steps[count // 2] += 70 * MS
-    return [int(time) for time in np.cumsum(steps)]
+def recording(path: Path, times: list[int], **what: Any) -> Recording:
+    """With ticks at ``times`` [ms] since its start; see :func:`write_recording`."""
+    return Recording(write_recording(path / "a.mcap", [MS * time for time in times], **what))
 
 
 @pytest.mark.parametrize("fps", [1, 24, 30, 60, 200, 1000])
 def test_observations_are_of_the_newest_tick_and_commands_of_the_first_that_is_not_before(
     fps: int, tmp_path: Path
 ) -> None:
-    times = uneven(1500)
+    # Ticks about a millisecond apart, one of them 70 ms late.
+    steps = np.random.default_rng(0).integers(MS // 2, 3 * MS // 2, 1500)
+    steps[750] += 70 * MS
+    times = [int(time) for time in np.cumsum(steps)]
     frames = sample(Recording(write_recording(tmp_path / "a.mcap", times)), fps)
     k = 0
     while (due := times[0] + round(Fraction(k * 10**9, fps))) <= times[-1]:
@@ -41,24 +54,18 @@ def test_observations_are_of_the_newest_tick_and_commands_of_the_first_that_is_n
         assert frames["effort"][k, 3] == -100 * newest
         assert frames["reference"][k, 3] == first
         assert frames["target"][k, 1, 0] == first
+        assert frames["time"][k] == pytest.approx((due - times[0]) * 1e-9, abs=1e-12)
         k += 1
     assert {len(values) for values in frames.values()} == {k}
 
 
-def test_a_tick_at_the_time_of_a_frame_gives_both(tmp_path: Path) -> None:
-    times = [10 * MS * place for place in range(40)]
-    frames = sample(Recording(write_recording(tmp_path / "a.mcap", times)), fps=50)
-    assert frames["reference"][:, 0].tolist() == [2 * k for k in range(20)]
-    assert frames["position"][:, 0].tolist() == [-2 * k for k in range(20)]
-    assert frames["time"] == pytest.approx([k / 50 for k in range(20)], abs=0.0)
-
-
-def test_the_target_is_the_operators_while_there_is_one_and_the_reference_else(tmp_path: Path) -> None:
-    times = [MS * place for place in range(30)]
-    file = write_recording(tmp_path / "a.mcap", times, engaged=range(5, 20))
-    frames = sample(Recording(file), fps=1000)
+def test_targets_are_the_operators_while_there_is_one_and_openings_are_of_their_arms(tmp_path: Path) -> None:
+    openings = {"wanted": (0.1, 0.4), "commanded": (0.2, 0.5), "opening": (0.3, 0.6)}
+    frames = sample(recording(tmp_path, [*range(30)], engaged=range(5, 20), openings=openings), fps=1000)
     assert frames["target"][:, 0, 0].tolist() == [k + 1000 if 5 <= k < 20 else k for k in range(30)]
     assert frames["target"][:, 1, 0].tolist() == list(range(30))
+    assert frames["gripper"].tolist() == [[0.2, 0.5]] * 30
+    assert frames["opening"].tolist() == [[0.3, 0.6]] * 30
 
 
 @pytest.mark.parametrize(
@@ -72,42 +79,174 @@ def test_the_target_is_the_operators_while_there_is_one_and_the_reference_else(t
 def test_trimmed_frames_begin_and_end_where_an_arm_is_engaged_or_moves(
     engaged: range, moving: range, first: int, last: int, tmp_path: Path
 ) -> None:
-    times = [MS * place for place in range(60)]
-    recording = Recording(write_recording(tmp_path / "a.mcap", times, engaged=engaged, moving=moving))
-    frames = sample(recording, fps=500, trim=True)
+    whole = recording(tmp_path, [*range(60)], engaged=engaged, moving=moving)
+    frames = sample(whole, fps=500, trim=True)
     assert frames["reference"][:, 0].tolist() == list(range(first, last + 1, 2))
     assert frames["time"][0] == 0.0
-    assert len(sample(recording, fps=500)["time"]) == 30
+    assert len(sample(whole, fps=500)["time"]) == 30
 
 
-def test_nothing_to_trim_to_is_an_error(tmp_path: Path) -> None:
-    file = write_recording(tmp_path / "still.mcap", [0, MS, 2 * MS])
-    with pytest.raises(RecordingError, match=r"still\.mcap: no arm was ever engaged"):
-        sample(Recording(file), fps=30, trim=True)
+LOSSY = [*range(20), *range(45, 65)]
 
 
-def test_ticks_that_were_lost_for_longer_than_a_frame_are_an_error(tmp_path: Path) -> None:
-    numbers = [*range(20), *range(45, 65)]
-    file = write_recording(tmp_path / "lossy.mcap", [MS * number for number in numbers], numbers=numbers)
-    assert len(sample(Recording(file), fps=30)["time"]) == 2
-    with pytest.raises(RecordingError, match=r"lossy\.mcap: 25 ticks were lost after 0\.019 s"):
-        sample(Recording(file), fps=60)
+@pytest.mark.parametrize(
+    ("times", "numbers", "trim", "what"),
+    [
+        pytest.param([0, 1, 2], None, True, "no arm was ever engaged", id="nothing to trim to"),
+        pytest.param(LOSSY, LOSSY, False, r"25 ticks were lost after 0\.019 s", id="lost for longer than a frame"),
+        pytest.param([0, 2, 1], None, False, "damaged: ticks are not in the order of time", id="times that go back"),
+        pytest.param([5, 4], None, False, "damaged: ticks are not in the order of time", id="that go back at once"),
+        pytest.param([], None, False, "no tick was recorded", id="no tick"),
+    ],
+)
+def test_there_are_no_frames_of(
+    times: list[int], numbers: list[int] | None, trim: bool, what: str, tmp_path: Path
+) -> None:
+    with pytest.raises(RecordingError, match=rf"a\.mcap: {what}"):
+        sample(recording(tmp_path, times, numbers=numbers), fps=60, trim=trim)
 
 
-@pytest.mark.parametrize("times", [(0, 2 * MS, MS), (5 * MS, 4 * MS)], ids=["later", "at once"])
-def test_times_that_go_back_are_an_error(times: tuple[int, ...], tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"a\.mcap: damaged: ticks are not in the order of time"):
-        sample(Recording(write_recording(tmp_path / "a.mcap", times)), fps=30)
+def test_ticks_that_were_lost_for_less_than_a_frame_are_no_error(tmp_path: Path) -> None:
+    assert len(sample(recording(tmp_path, LOSSY, numbers=LOSSY), fps=30)["time"]) == 2
 
 
-def test_a_recording_without_a_tick_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"a\.mcap: no tick was recorded"):
-        sample(Recording(write_recording(tmp_path / "a.mcap", [])), fps=30)
+@cache
+def robot() -> Robot:
+    return Robot.from_config(cell())
 
 
-def test_openings_are_of_the_arms_they_are_named_by(tmp_path: Path) -> None:
-    times = [MS * place for place in range(3)]
-    openings = {"wanted": (0.1, 0.4), "commanded": (0.2, 0.5), "opening": (0.3, 0.6)}
-    frames = sample(Recording(write_recording(tmp_path / "a.mcap", times, openings=openings)), fps=1000)
-    assert frames["gripper"].tolist() == [[0.2, 0.5]] * 3
-    assert frames["opening"].tolist() == [[0.3, 0.6]] * 3
+def poses(q: Array) -> list[Array]:
+    return [pin.SE3ToXYZQUAT(robot().tool_pose(q, arm)) for arm in robot().arms]
+
+
+def frames(seed: int = 0) -> dict[str, Array]:
+    """Joints that move through much of their range, with targets at tools elsewhere."""
+    random = np.random.default_rng(seed)
+
+    def motion() -> Array:
+        ends = random.uniform(robot().position_lower, robot().position_upper, (2, len(robot().joint_names)))
+        return np.linspace(ends[0], ends[1], COUNT)
+
+    position, reference = motion(), motion()
+    return {
+        "position": position,
+        "velocity": random.normal(size=position.shape),
+        "effort": random.normal(size=position.shape),
+        "opening": random.uniform(size=(COUNT, 2)),
+        "reference": reference,
+        "gripper": random.uniform(size=(COUNT, 2)),
+        "target": np.array([poses(q) for q in motion()]),
+        "reference_tool": np.array([poses(q) for q in reference]),
+    }
+
+
+def test_every_number_has_the_name_of_its_joint_or_gripper() -> None:
+    given = frames()
+    vectors, names = features(given, robot())
+    grippers = [f"{arm}_gripper" for arm in robot().arms]
+    for feature, labels, what in (
+        ("observation.state", robot().joint_names, "position"),
+        ("observation.velocity", robot().joint_names, "velocity"),
+        ("observation.effort", robot().joint_names, "effort"),
+        ("action", robot().joint_names, "reference"),
+        ("observation.state", grippers, "opening"),
+        ("action", grippers, "gripper"),
+    ):
+        columns = [names[feature].index(label) for label in labels]
+        np.testing.assert_array_equal(vectors[feature][:, columns], given[what].astype(np.float32))
+
+
+def test_tools_are_where_the_measured_joints_put_them() -> None:
+    given = frames()
+    vectors, names = features(given, robot())
+    for arm in robot().arms:
+        at = [names["observation.tool"].index(f"{arm}_{number}") for number in POSE_FIELDS]
+        for q, pose in zip(given["position"], vectors["observation.tool"][:, at], strict=True):
+            off = robot().tool_pose(q, arm).actInv(pin.XYZQUATToSE3(pose.astype(np.float64)))
+            assert np.linalg.norm(pin.log6(off).vector) < 1e-5
+
+
+def test_tool_deltas_lead_from_each_target_to_the_next_and_nowhere_from_the_last() -> None:
+    vectors, names = features(frames(), robot())
+    for arm in robot().arms:
+        targets = vectors["action.tool"][:, [names["action.tool"].index(f"{arm}_{number}") for number in POSE_FIELDS]]
+        at = [names["action.tool_delta"].index(f"{arm}_{number}") for number in MOTION]
+        deltas = vectors["action.tool_delta"][:, at].astype(np.float64)
+        places = [pin.XYZQUATToSE3(pose.astype(np.float64)) for pose in targets]
+        for now, then, delta in zip(places, places[1:], deltas, strict=False):
+            reached = now * pin.SE3(pin.exp3(delta[3:]), delta[:3])
+            assert np.linalg.norm(pin.log6(then.actInv(reached)).vector) < 1e-4
+        assert not deltas[-1].any()
+
+
+def test_quaternions_do_not_jump_and_targets_are_on_the_side_of_the_tools() -> None:
+    flipped = 0
+    for seed in range(5):
+        given = frames(seed)
+        vectors, names = features(given, robot())
+        recorded = given["target"][..., 3:]
+        flipped += int((np.sum(recorded[1:] * recorded[:-1], axis=-1) < 0.0).any())
+        for arm in robot().arms:
+            at = [names["action.tool"].index(f"{arm}_{number}") for number in POSE_FIELDS[3:]]
+            tools, targets = vectors["observation.tool"][:, at], vectors["action.tool"][:, at]
+            for quaternions in (tools, targets):
+                assert (np.sum(quaternions[1:] * quaternions[:-1], axis=1) > 0.0).all()
+            assert np.dot(tools[0], targets[0]) >= 0.0
+            assert tools[0][np.abs(tools[0]).argmax()] > 0.0
+    assert flipped  # without which this would show nothing
+
+
+def test_grippers_that_are_never_measured_are_left_out() -> None:
+    given = frames()
+    given["opening"][:, 1] = NOT_MEASURED
+    vectors, names = features(given, robot())
+    assert names["observation.state"] == (*robot().joint_names, "left_gripper")
+    assert vectors["observation.state"].shape == (COUNT, 15)
+    given["opening"][:3, 0] = NOT_MEASURED
+    with pytest.raises(RecordingError, match="the opening of arm left is not known at frame 0"):
+        features(given, robot())
+
+
+def test_what_is_no_number_is_named_and_another_robot_is_refused() -> None:
+    given = frames()
+    given["effort"][7, 2] = np.nan
+    with pytest.raises(RecordingError, match=rf"observation.effort\[{robot().joint_names[2]}\] .* at frame 7"):
+        features(given, robot())
+    given["reference_tool"][:, 0, 2] += 1e-4
+    with pytest.raises(RecordingError, match="not the recorded one"):
+        features(given, robot())
+
+
+def shown(path: Path, taken: list[int], frames: list[int]) -> list[int]:
+    """The brightness of the picture of each frame; all times in [ms] since the start."""
+    pictures = {"front": [MS * time for time in taken]}
+    of = recording(path, [*range(1, 200)], cameras={"front": CAMERA}, pictures=pictures)
+    stamps = [EPOCH + MS * time for time in frames]
+    return [round(float(pixels.mean())) for pixels in CameraFrames(of, "front", CAMERA, stamps)]
+
+
+def test_a_frame_has_the_newest_picture_at_or_before_it(tmp_path: Path) -> None:
+    found = shown(tmp_path, [1, 20, 40, 60, 80], [1, 19, 20, 21, 59, 60, 85, 120])
+    assert found == [brightness(number) for number in (0, 0, 1, 1, 2, 3, 4, 4)]
+
+
+@pytest.mark.parametrize(
+    ("taken", "frames", "what"),
+    [
+        pytest.param([1, 20], [1, 60, 61], r"a picture 0\.041 s old at 0\.061 s", id="lost for more than two periods"),
+        pytest.param([5], [4], r"no picture yet at 0\.004 s", id="taken later"),
+        pytest.param([], [4], r"no picture yet at 0\.004 s", id="never taken"),
+    ],
+)
+def test_a_frame_without_a_picture_of_its_time_is_refused(
+    tmp_path: Path, taken: list[int], frames: list[int], what: str
+) -> None:
+    with pytest.raises(RecordingError, match=rf"a\.mcap: camera front has {what}; allowed: at most two of its periods"):
+        shown(tmp_path, taken, frames)
+
+
+def test_a_picture_of_another_size_is_damage(tmp_path: Path) -> None:
+    of = recording(tmp_path, [1], cameras={"front": CAMERA}, pictures={"front": [MS]})
+    larger = CAMERA.model_copy(update={"width": 32})
+    with pytest.raises(RecordingError, match=r"a\.mcap: damaged: a picture of camera front has a size"):
+        next(iter(CameraFrames(of, "front", larger, [EPOCH + MS])))

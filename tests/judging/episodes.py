@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pinocchio as pin
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Event
-from q2r2_control.judging.episode import Episode, Frames, Hand, Ticks
+from q2r2_control.inputs.played import HeadsetSampling, PlayedInput
+from q2r2_control.inputs.scripted import HANDS_AT_REST
+from q2r2_control.judging.episode import Episode, Flags, Frames, Hand, Ticks
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.reader import Recording
-from q2r2_control.types import Array
+from q2r2_control.types import SIDES, Array, HandInputs, HandSample
+from tests.recording.runs import file_of, record, rewrite
 from tests.support.processes import cell
 
 DT = 0.002  # of the loop [s]
@@ -22,16 +28,10 @@ EVERY = 5  # ticks, a frame
 ARMS = ("left", "right")
 
 
-def recording() -> Recording:
-    """What is asked of a recording once it is read."""
-    about = SimpleNamespace(arms=ARMS, realtime=True, notes={"task": "to <stack>"})
-    return cast(Recording, SimpleNamespace(about=about, closed=True, file=Path("some/where/run.mcap")))
-
-
 def episode(
     seconds: float = 4.0,
     *,
-    engaged: Array | None = None,
+    engaged: Flags | None = None,
     path: Array | None = None,
     target_path: Array | None = None,
     received: Sequence[float] | Array | None = None,
@@ -74,8 +74,10 @@ def episode(
     stamps = np.arange(0.0, seconds, 0.01) if received is None else np.asarray(received)
     places = np.zeros((len(stamps), 3)) if hand_path is None else hand_path
     hands = {arm: Hand(arm, stamps, stamps + delay, places) for arm in ARMS}
+    about = SimpleNamespace(arms=ARMS, realtime=True, notes={"task": "to <stack>"})
+    recording = SimpleNamespace(about=about, closed=True, file=Path("some/where/run.mcap"))
     return Episode(
-        recording=recording(),
+        recording=cast(Recording, recording),
         config=(config or cell()).model_copy(update={"loop_rate_hz": 1.0 / DT}),
         ticks=replace(rows, **ticks),
         frames=Frames(frames, np.zeros((len(frames), 14)), targets, tools.copy()),
@@ -87,5 +89,122 @@ def episode(
 
 
 def frame_times(seconds: float = 4.0) -> Array:
-    """(m,) of an episode's frames [s]."""
     return np.asarray(DT * np.arange(1, round(seconds / DT) + 1)[::EVERY])
+
+
+RATE = 250.0  # [Hz], with longer substeps than by default, since most of a test's time goes by ticks
+DURATION = 4.0  # [s]
+PRESS, START = 0.2, 0.5  # [s]
+_PRESSED = 0.1  # [s]
+_BINDINGS = {"trigger": "toggle", "grip": "discard", "stick_up": "mark", "stick_down": "success"}
+EPISODES = TeleopSettings.model_validate({"bindings": {name: f"record_{does}" for name, does in _BINDINGS.items()}})
+
+Pose = Callable[[str, float], pin.SE3]
+
+
+def at(hand: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> pin.SE3:
+    home = HANDS_AT_REST[hand]
+    return pin.SE3(home.rotation, home.translation + np.array([x, y, z]))
+
+
+def eased(t: float, begin: float = START, over: float = 1.0) -> float:
+    s = min(max((t - begin) / over, 0.0), 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+class Work:
+    """Reaches to and fro between points that are drawn at random, each hand its own; a stop at each."""
+
+    def __init__(self, seed: int, begin: float = START, reaches: int = 20) -> None:
+        random = np.random.default_rng(seed)
+        self._ways: dict[str, list[tuple[float, float, np.ndarray]]] = {}
+        for hand in SIDES:
+            t, ways = begin, []
+            for _ in range(reaches):
+                over = float(random.uniform(0.8, 1.3))
+                ways.append((t, over, random.uniform((-0.04, -0.07, 0.0), (0.08, 0.07, 0.12))))
+                t += over + float(random.uniform(0.0, 0.3))
+            self._ways[hand] = ways
+
+    def __call__(self, hand: str, t: float) -> pin.SE3:
+        place = np.zeros(3)
+        for begin, over, goal in self._ways[hand]:
+            if t < begin:
+                break
+            place = place + eased(t, begin, over) * (goal - place)
+        return at(hand, *place)
+
+
+def press(hand: str, t: float) -> HandInputs:
+    return HandInputs(button_lower=PRESS <= t < PRESS + _PRESSED, button_upper=2.0 <= t < 2.0 + _PRESSED)
+
+
+def operator(
+    toggled: Sequence[float], discarded: float, marked: float | None = None, succeeded: float | None = None
+) -> Callable[[str, float], HandInputs]:
+    """Controls of an operator whose left hand tells of episodes at these times [s], by :data:`EPISODES`."""
+
+    def held(hand: str, t: float, *begin: float | None) -> float:
+        return float(hand == "left" and any(at <= t < at + _PRESSED for at in begin if at is not None))
+
+    def controls(hand: str, t: float) -> HandInputs:
+        return replace(
+            press(hand, t),
+            press_index=held(hand, t, *toggled),
+            press_middle=held(hand, t, discarded),
+            thumb_stick_vertical=held(hand, t, marked) - held(hand, t, succeeded),
+        )
+
+    return controls
+
+
+class WithDropouts(HeadsetSampling):
+    def times(self) -> Iterator[float]:
+        return (t for t in super().times() if not (t > 0.6 and t % 0.4 < 0.08))
+
+
+class Late(PlayedInput):
+    """The loop gets samples 80 ms after they were received."""
+
+    _waiting: Sequence[HandSample] = ()
+
+    def poll(self, now: float) -> list[HandSample]:
+        waiting = [*self._waiting, *super().poll(now)]
+        due = [sample for sample in waiting if sample.pose_stamp + 0.08 <= now]
+        self._waiting = waiting[len(due) :]
+        return due
+
+
+def hands(
+    seed: int = 0,
+    pose: Pose | None = None,
+    inputs: Callable[[str, float], HandInputs] = press,
+    sampling: type[HeadsetSampling] = HeadsetSampling,
+    played: type[PlayedInput] = PlayedInput,
+) -> PlayedInput:
+    """Hands of a headset that do random work unless a ``pose`` is given.
+
+    Samples are uneven, with noise, and some of them lost; the hands tremble.
+    """
+    timing = {hand: sampling(hand, seed, tremor=True, dropout_probability=0.002) for hand in SIDES}
+    return played(pose or Work(seed), inputs, timing)
+
+
+def loop_of(source: PlayedInput, **changes: object) -> Pipeline:
+    """A pipeline at :data:`RATE` with a kinematic plant."""
+    config = cell()
+    control = config.control.model_copy(update={"max_substep": 1.0 / RATE})
+    config = config.model_copy(update={"loop_rate_hz": RATE, "control": control, **changes})
+    return Pipeline.from_config(config, input=source, plant="kinematic")
+
+
+def record_episode(folder: Path, source: PlayedInput, duration: float = DURATION, **changes: object) -> Path:
+    return file_of(record(folder, loop_of(source, **changes), duration))
+
+
+def without_ticks(file: Path, target: Path, first: int, count: int) -> Path:
+    return rewrite(file, target, lambda _, message: None if first <= message.number < first + count else message)
+
+
+def killed(file: Path, target: Path, ticks: int) -> Path:
+    return rewrite(file, target, lambda _, message: message if message.number < ticks else None, whole=False)

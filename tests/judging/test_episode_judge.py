@@ -6,22 +6,27 @@ import logging
 import os
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from q2r2_control.events import Event, Reason
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.events import ReasonKind as K
+from q2r2_control.export.episodes import FrameSampling, keep_episodes, make_episode
 from q2r2_control.judging.episode_judge import EpisodeJudge, Question, written_episode
-from q2r2_control.judging.judge import judge
+from q2r2_control.judging.judge import Judged, judge
+from q2r2_control.judging.page import page_of
 from q2r2_control.recording.about import About
-from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.reader import EpisodeSpan, Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.haptics import EPISODE_KEPT, EPISODE_REJECTED
 from q2r2_control.types import HapticFeedback
-from tests.judging.runs import EPISODES, RATE, Work, hands, killed, loop_of, operator
+from tests.export.files import load_vectors, write_vectors
+from tests.judging.episodes import EPISODES, RATE, Work, hands, killed, loop_of, operator, record_episode
 from tests.support.processes import alive, wait_until
 
 pytestmark = pytest.mark.slow
@@ -30,13 +35,12 @@ pytestmark = pytest.mark.slow
 TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7
 VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # [s]
 DURATION = 7.0
+FIRST = EpisodeSpan(1.0, 2.5, number=1)
 BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
 RESTS = 3.6  # the hands, from then on [s]
 
 
 class PatientRun:
-    """A recorded run in simulated time, in which verdicts are waited for at some times."""
-
     def __init__(self, folder: Path, before: Callable[[EpisodeJudge], None] = lambda judge: None) -> None:
         self.told: list[Reason] = []
         self.felt: list[HapticFeedback] = []
@@ -63,13 +67,11 @@ class PatientRun:
 
     def _patient(self, tick: Tick) -> None:
         for due in [due for due in self._due if tick.t >= due]:
-            count = self._due.pop(due)
+            wait_until(partial(self._judged, self._due.pop(due)))
 
-            def judged(count: int = count) -> bool:
-                self.judge.look()
-                return len(self.told) >= count or self.judge.pid is None
-
-            wait_until(judged)
+    def _judged(self, count: int) -> bool:
+        self.judge.look()
+        return len(self.told) >= count or self.judge.pid is None
 
 
 @pytest.fixture(scope="module")
@@ -93,14 +95,15 @@ def test_both_hands_feel_it_and_the_run_is_replayed_with_it(run: PatientRun) -> 
     for pulse in (EPISODE_KEPT, EPISODE_REJECTED):
         felt = {one.hand for one in run.felt if (one.frequency, one.amplitude) == (pulse.frequency, pulse.amplitude)}
         assert felt == {"left", "right"}
-    found = replay(run.file)
-    assert found.difference is None
+    assert replay(run.file).difference is None
+    assert run.pid is not None
+    assert not alive(run.pid), "its process ends with the run"
 
 
 def test_none_is_judged_before_all_of_it_is_written(run: PatientRun, tmp_path: Path) -> None:
     written = killed(run.file, tmp_path / "part.mcap", round(2.45 * RATE))
-    assert written_episode(Question(str(written), 1, 1.0, 2.5)) is None
-    whole = written_episode(Question(str(run.file), 1, 1.0, 2.5))
+    assert written_episode(Question(str(written), FIRST, timed=True)) is None
+    whole = written_episode(Question(str(run.file), FIRST, timed=True))
     assert whole is not None
     assert len(whole.ticks.t) == pytest.approx(1.5 * RATE, abs=2)
 
@@ -120,11 +123,6 @@ def test_one_that_is_discarded_before_its_verdict_is_there_gets_none(run: Patien
     assert (verdict.detail["episode"], verdict.detail["keep"]) == (2, False)
 
 
-def test_its_process_ends_with_the_run(run: PatientRun) -> None:
-    assert run.pid is not None
-    assert not alive(run.pid)
-
-
 def test_one_whose_process_is_killed_says_so_once_and_the_run_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -139,3 +137,66 @@ def test_one_whose_process_is_killed_says_so_once_and_the_run_goes_on(
     ended = "the process that judges episodes was ended by SIGKILL"
     assert line == f"episodes are not judged before the run ends: {ended}"
     assert [one.verdict.keep for one in judge(Recording(run.file))] == [True, False, False]
+
+
+# Three episodes, 1 to 2.5, 3 to 4.5 and from 5 s on, of which the first succeeded and the second is discarded.
+PARTS, SUCCEEDED, DISCARDED_AT, MARKED = (1.0, 2.5, 3.0, 4.5, 5.0), 2.7, 4.7, 1.7
+PARTS_DURATION = 7.0
+CONTROLS = operator(PARTS, DISCARDED_AT, MARKED, SUCCEEDED)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_episode(tmp_path_factory.mktemp("parts"), hands(5, inputs=CONTROLS), PARTS_DURATION, teleop=EPISODES)
+
+
+@pytest.fixture(scope="module")
+def judged(file: Path) -> list[Judged]:
+    return judge(Recording(file))
+
+
+def test_each_is_judged_by_what_is_in_it_alone(judged: list[Judged]) -> None:
+    assert [one.figures.part for one in judged] == [1, 2, 3]
+    assert [one.verdict.line for one in judged] == ["keep", "discard: its operator discarded it", "keep"]
+    assert [one.figures.success for one in judged] == [True, None, None]
+    durations = [one.figures.duration_s for one in judged]
+    assert durations == [pytest.approx(seconds, abs=0.05) for seconds in (1.5, 1.5, 2.0)]
+    assert [one.figures.timing.lost_ticks for one in judged] == [0, 0, 0]
+    assert [one.figures.hands["left"].pose_rate_hz for one in judged] == pytest.approx(3 * [75.0], rel=0.05)
+    assert all(one.figures.idle_share is not None and one.figures.idle_share < 0.5 for one in judged)
+    # The gripper closes at 2 s, which is in the first one.
+    assert [one.figures.arms["left"].gripper_changes for one in judged] == [1, 0, 0]
+
+
+def test_its_events_are_by_its_own_time_and_its_name_on_the_page_is_its_own(file: Path, judged: list[Judged]) -> None:
+    marks = [(event.t, event.kind) for event in judged[0].episode.events]
+    assert marks == [
+        (pytest.approx(0.0, abs=0.02), "episode_begins"),
+        (pytest.approx(MARKED - PARTS[0], abs=0.03), "mark"),
+        (pytest.approx(1.5, abs=0.03), "episode_ends"),
+    ]
+    page = page_of(judged, "Recordings")
+    assert all(f" {file.stem} #{number}</a>" in page for number in (1, 2, 3))
+
+
+def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_own(file: Path, tmp_path: Path) -> None:
+    made = keep_episodes([file], FrameSampling(fps=50), write_vectors, tmp_path)
+    assert made.skipped == []
+    episodes = [load_vectors(kept) for kept in made.kept]
+    assert [kept.stem for kept in made.kept] == [f"{file.stem}-1", f"{file.stem}-3"]
+    assert [episode.success for episode in episodes] == [True, None]
+    succeeded = [np.flatnonzero(episode.outcome()["next.success"]).tolist() for episode in episodes]
+    assert succeeded == [[episodes[0].frames - 1], []]
+    assert episodes[0].frames == pytest.approx(75, abs=2)
+    assert episodes[1].frames >= 100  # and until the arms are at rest
+    whole = make_episode(file, FrameSampling(fps=250))
+    for episode, began in zip(episodes, (1.0, 5.0), strict=True):
+        state = episode.vectors["observation.state"]
+        near = whole.vectors["observation.state"][round((began - 0.05) * 250) : round((began + 0.05) * 250)]
+        assert np.abs(near - state[0]).max(axis=1).min() < 1e-9
+
+
+def test_where_nothing_is_recorded_the_controls_say_so() -> None:
+    loop = loop_of(hands(3, inputs=CONTROLS), teleop=EPISODES)
+    summary = loop.run(1.5, realtime=False)
+    assert [event.kind for event in summary.events].count(ReasonKind.NO_RECORDING) == 1

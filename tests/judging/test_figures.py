@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from q2r2_control.config.teleop import Stance
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.judging.figures import figures_of, hand_figures, timing_figures
-from q2r2_control.judging.motion import arm_figures, delays, idle_share
+from q2r2_control.inputs.assembly import minimum_jerk
+from q2r2_control.judging.episode import FRAME, Flags
+from q2r2_control.judging.figures import HandFigures, figures_of, hand_figures, timing_figures
+from q2r2_control.judging.motion import arm_figures, delays, idle_share, ldlj, smoothness
 from q2r2_control.types import Array
 from q2r2_control.wording import sentence
 from tests.judging.episodes import DT, episode, frame_times
 from tests.support.processes import cell
 
 DROPOUT = 0.06
+NEVER = np.zeros(2000, dtype=bool)
+
+
+def hand(**what: Any) -> HandFigures:
+    return hand_figures(episode(**what), "left", DROPOUT)
 
 
 def without(begin: float, end: float) -> Array:
@@ -26,40 +34,42 @@ def without(begin: float, end: float) -> Array:
     return t[(t <= begin + 1e-9) | (t >= end - 1e-9)]
 
 
+def engaged_until(first: int, again: int) -> Flags:
+    """Of 2000 ticks, all but those from ``first`` to ``again``."""
+    at = np.arange(2000)
+    return (at < first) | (at >= again)
+
+
 class TestHands:
     def test_a_gap_is_as_long_as_it_is_and_its_share_is_of_the_time_engaged(self) -> None:
-        found = hand_figures(episode(received=without(1.0, 1.2)), "left", DROPOUT)
+        found = hand(received=without(1.0, 1.2), delay=0.03)
         assert (found.arm, found.dropouts) == ("left", 1)
+        assert (found.sample_age_ms_p50, found.sample_age_ms_p99) == pytest.approx((30.0, 30.0))
         assert found.longest_gap_s == pytest.approx(0.2)
         assert found.dropout_share == pytest.approx(0.2 / 4.0, abs=2e-3)
         assert found.pose_rate_hz == pytest.approx(0.95 * 100.0, abs=1.0)
 
     def test_poses_that_cease_are_a_gap_until_the_end(self) -> None:
-        found = hand_figures(episode(received=np.arange(0.0, 3.0, 0.01)), "left", DROPOUT)
-        assert found.longest_gap_s == pytest.approx(1.0, abs=0.02)
-        found = hand_figures(episode(received=()), "left", DROPOUT)
+        assert hand(received=np.arange(0.0, 3.0, 0.01)).longest_gap_s == pytest.approx(1.0, abs=0.02)
+        found = hand(received=())
         assert (found.pose_rate_hz, found.dropouts, found.sample_age_ms_p99) == (0.0, 1, None)
 
-    def test_a_gap_while_no_arm_is_engaged_spoils_nothing(self) -> None:
-        engaged = np.ones(2000, dtype=bool)
-        engaged[500:1500] = False
-        found = hand_figures(episode(engaged=engaged, received=without(1.1, 2.9)), "left", DROPOUT)
+    def test_of_a_gap_only_the_time_counts_in_which_the_arm_is_engaged(self) -> None:
+        found = hand(engaged=engaged_until(500, 1500), received=without(1.1, 2.9))
         assert (found.dropouts, found.dropout_share) == (0, 0.0)
         assert found.pose_rate_hz == pytest.approx(100.0, abs=1.0)
-
-    def test_of_one_that_the_arm_was_paused_by_only_the_time_before_that_counts(self) -> None:
-        engaged = np.ones(2000, dtype=bool)
-        engaged[575:1500] = False
-        found = hand_figures(episode(engaged=engaged, received=without(1.0, 2.9)), "left", DROPOUT)
+        found = hand(engaged=engaged_until(575, 1500), received=without(1.0, 2.9))
         assert found.longest_gap_s == pytest.approx(1.9)
         assert found.dropout_share == pytest.approx(0.15 / 2.15, abs=2e-3)
 
-    def test_a_pose_that_is_no_number_is_none_that_came(self) -> None:
-        places = np.zeros((400, 3))
+    def test_a_pose_or_a_stamp_that_is_no_number_is_none_that_came(self) -> None:
+        places, stamps = np.zeros((400, 3)), np.arange(0.0, 4.0, 0.01)
         places[100:120] = math.nan
-        found = hand_figures(episode(hand_path=places), "left", DROPOUT)
+        found = hand(hand_path=places)
         assert found.unusable_poses == 20
         assert found.longest_gap_s == pytest.approx(0.21)
+        stamps[5], stamps[6] = math.nan, -math.inf
+        assert hand(received=stamps).longest_gap_s == pytest.approx(0.03)
 
     def test_a_gap_in_which_ticks_were_lost_is_none(self) -> None:
         number = np.concatenate((np.arange(500), np.arange(600, 2100)))
@@ -69,34 +79,22 @@ class TestHands:
         assert hand_figures(of, "left", DROPOUT).dropouts == 2
         assert hand_figures(lossy, "left", DROPOUT).dropouts == 1  # the one at the end
 
-    def test_ages_are_from_the_receipt_to_the_tick(self) -> None:
-        found = hand_figures(episode(delay=0.03), "left", DROPOUT)
-        assert found.sample_age_ms_p50 == pytest.approx(30.0)
-        assert found.sample_age_ms_p99 == pytest.approx(30.0)
-
-    def test_stamps_that_are_no_numbers_are_left_out(self) -> None:
-        stamps = np.arange(0.0, 4.0, 0.01)
-        stamps[5] = math.nan
-        stamps[6] = -math.inf
-        found = hand_figures(episode(received=stamps), "left", DROPOUT)
-        assert found.longest_gap_s == pytest.approx(0.03)
-
     def test_a_hand_whose_arm_is_never_engaged_has_no_shares(self) -> None:
-        found = hand_figures(episode(engaged=np.zeros(2000, dtype=bool)), "left", DROPOUT)
+        found = hand(engaged=NEVER)
         assert (found.pose_rate_hz, found.dropout_share, found.longest_gap_s) == (None, None, None)
 
 
 def wander(t: Array) -> Array:
-    """A motion of several frequencies, (n, 3) [m]."""
     return np.stack((0.05 * np.sin(4.0 * t), 0.03 * np.sin(7.0 * t + 1.0), 0.02 * np.cos(5.0 * t)), axis=1)
 
 
 class TestDelays:
+    stamps = np.arange(0.0, 4.0, 1.0 / 75.0)
+
     @pytest.mark.parametrize("delay", [0.045, 0.1, 0.237])
     def test_a_tool_that_repeats_its_hand_later_has_that_delay(self, delay: float) -> None:
-        stamps = np.arange(0.0, 4.0, 1.0 / 75.0)
         later = wander(frame_times() - delay)
-        found = delays(episode(path=later, received=stamps, hand_path=wander(stamps)), "left")
+        found = delays(episode(path=later, received=self.stamps, hand_path=wander(self.stamps)), "left")
         assert found == pytest.approx((delay, delay), abs=1.5e-3)
 
     @pytest.mark.parametrize("stance", list(Stance))
@@ -104,52 +102,39 @@ class TestDelays:
         config = cell()
         teleop = config.teleop.model_copy(update={"stance": stance, "axes": ("+z", "-x", "+y"), "position_scale": 2.0})
         config = config.model_copy(update={"teleop": teleop})
-        stamps = np.arange(0.0, 4.0, 1.0 / 75.0)
-        moving = wander(np.clip(stamps, 1.5, 3.0))
+        moving = wander(np.clip(self.stamps, 1.5, 3.0))
         tool = 2.0 * wander(np.clip(frame_times() - 0.06, 1.5, 3.0))
         if stance is Stance.MIRROR_REFLECTED:
             tool = tool * (1.0, -1.0, 1.0)
         # World x is the hand's z, world y minus its x, world z its y.
         raw = np.stack((-moving[:, 1], moving[:, 2], moving[:, 0]), axis=1)
-        found = delays(episode(path=tool, received=stamps, hand_path=raw, config=config), "left")
+        found = delays(episode(path=tool, received=self.stamps, hand_path=raw, config=config), "left")
         assert found[1] == pytest.approx(0.06, abs=2e-3)
 
     def test_a_hand_that_rests_a_tool_that_is_held_and_a_hand_of_one_pose_have_none(self) -> None:
-        stamps = np.arange(0.0, 4.0, 1.0 / 75.0)
-        assert delays(episode(received=stamps, hand_path=wander(stamps)), "left") == (None, None)
-        assert delays(episode(path=wander(frame_times())), "left") == (None, None)
-        assert delays(episode(received=[1.0]), "left") == (None, None)
+        assert delays(episode(received=self.stamps, hand_path=wander(self.stamps)), "left") == [None, None]
+        assert delays(episode(path=wander(frame_times())), "left") == [None, None]
+        assert delays(episode(received=[1.0]), "left") == [None, None]
 
 
 class TestArms:
     def test_errors_are_those_of_the_time_engaged(self) -> None:
-        engaged = np.zeros(2000, dtype=bool)
-        engaged[:1000] = True
-        path = np.zeros((400, 3))
-        target = path.copy()
-        target[:100, 2] = 0.01
-        target[100:200, 2] = 0.03
-        target[200:, 2] = 1.0
-        found = arm_figures(episode(engaged=engaged, path=path, target_path=target), "left")
+        path, target = np.zeros((400, 3)), np.zeros((400, 3))
+        target[:100, 2], target[100:200, 2], target[200:, 2] = 0.01, 0.03, 1.0
+        found = arm_figures(episode(engaged=engaged_until(1000, 2000), path=path, target_path=target), "left")
         assert found.engaged_s == pytest.approx(2.0)
         assert found.position_error_mm_rms == pytest.approx(math.sqrt((10.0**2 + 30.0**2) / 2.0))
         assert found.position_error_mm_p99 == pytest.approx(30.0)
         assert found.rotation_error_deg_rms == 0.0
 
-    def test_the_leash_counts_while_it_drags(self) -> None:
+    def test_the_leash_counts_while_it_drags_and_a_new_anchor_takes_no_slip_back(self) -> None:
         slip = np.zeros((2000, 2))
         slip[500:1000, 0] = np.linspace(0.0, 0.2, 500)
-        slip[1000:, 0] = 0.2
+        slip[1000:1500, 0], slip[1900:, 0] = 0.2, 0.05
         found = arm_figures(episode(slip=slip), "left")
         assert found.leashed_share == pytest.approx(0.25, abs=2e-3)
-        assert found.slip_mm == pytest.approx(200.0)
+        assert found.slip_mm == pytest.approx(250.0)
         assert arm_figures(episode(slip=slip), "right").leashed_share == 0.0
-
-    def test_a_new_anchor_takes_no_slip_back(self) -> None:
-        slip = np.zeros((2000, 2))
-        slip[500:1000, 0] = 0.1
-        slip[1500:, 0] = 0.05
-        assert arm_figures(episode(slip=slip), "left").slip_mm == pytest.approx(150.0)
 
     def test_rejected_targets_and_changes_of_the_gripper_are_counted(self) -> None:
         rejected = np.zeros((2000, 2), dtype=bool)
@@ -161,29 +146,23 @@ class TestArms:
         assert found.gripper_changes == 2
 
     def test_an_arm_that_is_never_engaged_has_no_figures(self) -> None:
-        found = arm_figures(episode(engaged=np.zeros(2000, dtype=bool)), "left")
+        found = arm_figures(episode(engaged=NEVER), "left")
         assert found.engaged_s == 0.0
         assert found.position_error_mm_rms is found.leashed_share is found.ldlj is found.hand_to_tool_ms is None
 
 
 class TestIdle:
-    def test_a_tool_that_stands_is_idle_and_one_that_trembles_too(self) -> None:
-        assert idle_share(episode()) == 1.0
+    def test_a_tool_that_stands_or_trembles_or_whose_arm_is_not_engaged_is_idle(self) -> None:
         tremor = 4e-4 * np.sin(60.0 * frame_times())[:, None] * np.ones(3)
-        assert idle_share(episode(path=tremor)) == 1.0
-
-    def test_a_second_of_motion_and_half_a_second_before_and_after_are_not_idle(self) -> None:
-        path = np.zeros((400, 3))
-        path[150:, 0] = np.minimum(0.002 * np.arange(250), 0.2)
-        assert idle_share(episode(path=path)) == pytest.approx(0.5, abs=0.02)
-
-    def test_a_motion_of_no_engaged_arm_is_idle(self) -> None:
         path = np.linspace(0.0, 0.5, 400)[:, None] * np.ones(3)
         assert idle_share(episode(path=path)) == pytest.approx(0.0)
-        assert idle_share(episode(path=path, engaged=np.zeros(2000, dtype=bool))) == 1.0
+        for idle in (episode(), episode(path=tremor), episode(path=path, engaged=NEVER)):
+            assert idle_share(idle) == 1.0
 
-    def test_a_gripper_that_closes_is_work(self) -> None:
-        gripper = np.ones((2000, 2))
+    def test_half_a_second_before_and_after_a_motion_or_a_change_of_the_gripper_is_not_idle(self) -> None:
+        path, gripper = np.zeros((400, 3)), np.ones((2000, 2))
+        path[150:, 0] = np.minimum(0.002 * np.arange(250), 0.2)
+        assert idle_share(episode(path=path)) == pytest.approx(0.5, abs=0.02)
         gripper[1000:, 0] = 0.0
         assert idle_share(episode(gripper=gripper)) == pytest.approx(0.75, abs=0.01)
 
@@ -191,8 +170,7 @@ class TestIdle:
 class TestTiming:
     def test_ticks_that_are_missing_in_the_file_are_lost_and_not_missed(self) -> None:
         number = np.concatenate((np.arange(1000), np.arange(1100, 2100)))
-        t = DT * (number + 1.0)
-        found = timing_figures(episode(number=number, t=t))
+        found = timing_figures(episode(number=number, t=DT * (number + 1.0)))
         assert (found.lost_ticks, found.missed_ticks, found.late_ticks) == (100, 0, 0)
         assert found.lost_share == pytest.approx(100 / 2100)
         assert found.longest_lost_s == pytest.approx(0.2)
@@ -203,12 +181,9 @@ class TestTiming:
         found = timing_figures(episode(dt=dt, t=np.cumsum(dt)))
         assert (found.lost_ticks, found.missed_ticks, found.late_ticks) == (0, 9, 1)
         assert found.missed_share == pytest.approx(9 / 2009)
-        assert found.longest_tick_s == pytest.approx(0.02)
-        assert found.longest_lost_s == 0.0
-
-    def test_a_file_has_an_end_where_the_arms_came_to_rest(self) -> None:
-        assert timing_figures(episode()).ended
-        assert not timing_figures(episode(following=np.ones(2000, dtype=bool))).ended
+        assert (found.longest_tick_s, found.longest_lost_s) == (pytest.approx(0.02), 0.0)
+        assert found.ended
+        assert not timing_figures(episode(following=~NEVER)).ended
 
 
 def test_faults_are_pauses_that_no_operator_asked_for_each_once() -> None:
@@ -221,13 +196,65 @@ def test_faults_are_pauses_that_no_operator_asked_for_each_once() -> None:
         Event(2.0, "left", "paused", "paused", refused),
         Event(3.0, "right", "pausing", "paused", pressed),
     ]
-    (fault,) = figures_of(episode(events=events), DROPOUT).faults
-    assert (fault.t, fault.arm, fault.reason) == (1.0, "left", sentence(jumped))
-
-
-def test_distances_that_are_none_are_not_the_nearest() -> None:
     distance = np.full(2000, 0.3)
     distance[7], distance[8] = 0.05, math.inf
-    found = figures_of(episode(distance=distance, margin=np.full(2000, math.inf)), DROPOUT)
-    assert found.min_distance_mm == pytest.approx(50.0)
-    assert found.min_margin_mm is None
+    found = figures_of(episode(events=events, distance=distance, margin=np.full(2000, math.inf)), DROPOUT)
+    (fault,) = found.faults
+    assert (fault.t, fault.arm, fault.reason) == (1.0, "left", sentence(jumped))
+    assert (found.min_distance_mm, found.min_margin_mm) == (pytest.approx(50.0), None), "inf: none is near"
+
+
+def reach(duration: float = 1.0, way: float = 0.2) -> Array:
+    share = np.array([minimum_jerk(t / duration) for t in np.arange(0.0, duration + 0.5 * FRAME, FRAME)])
+    return way * share[:, None] * np.array([0.6, 0.0, 0.8])
+
+
+def to_and_fro(seconds: float, noise: float = 0.0) -> tuple[Array, Array]:
+    t = np.arange(0.0, seconds, FRAME)
+    phase = np.array([minimum_jerk(time % 1.0) for time in t])
+    share = np.where(np.floor(t) % 2 == 0, phase, 1.0 - phase)
+    place = 0.2 * share[:, None] * np.array([0.6, 0.0, 0.8])
+    return t, place + np.random.default_rng(0).normal(0.0, noise, place.shape)
+
+
+def test_a_reach_of_minimum_jerk_has_the_value_of_the_definition() -> None:
+    # Of x(s) = 10 s^3 - 15 s^4 + 6 s^5 the integral of the squared jerk is 720, and the peak speed 15 / 8.
+    assert ldlj(reach(), FRAME) == pytest.approx(-np.log(720.0 / (15.0 / 8.0) ** 2), abs=0.12)
+    # It does not depend on the size of a motion, but on whether that stops and goes.
+    assert ldlj(reach(way=0.02), FRAME) == pytest.approx(ldlj(reach(way=0.5), FRAME), rel=1e-6)
+    shorter = reach(0.25, 0.05)
+    in_four = np.concatenate([shorter[:-1] + step * shorter[-1] for step in range(4)])
+    assert ldlj(in_four, FRAME) < ldlj(reach(), FRAME) - 0.5
+
+
+def test_an_episode_twice_as_long_is_as_smooth_and_noise_shows() -> None:
+    short, long, noisy = (
+        smoothness(*to_and_fro(seconds, noise), np.ones(int(seconds / FRAME), dtype=bool))
+        for seconds, noise in ((4.0, 0.0), (8.0, 0.0), (4.0, 1e-3))
+    )
+    assert short == pytest.approx(long, abs=0.05)
+    assert noisy is not None
+    assert short is not None
+    assert noisy < short - 3.0
+
+
+def test_only_what_moves_while_engaged_counts() -> None:
+    t, place = to_and_fro(8.0)
+    place[400:] = place[400]
+    engaged = np.ones(800, dtype=bool)
+    assert smoothness(t, place, engaged) == pytest.approx(smoothness(t[:500], place[:500], engaged[:500]), abs=0.1)
+    engaged[:400] = False
+    assert smoothness(t, place, engaged) is None
+
+
+def test_neither_a_hand_that_trembles_at_rest_nor_what_is_missing_in_the_file_is_a_motion() -> None:
+    t = np.arange(0.0, 4.0, FRAME)
+    place = 2e-4 * np.sin(60.0 * t)[:, None] * np.array([1.0, 0.0, 0.0])
+    assert smoothness(t, place, np.ones(len(t), dtype=bool)) is None
+    t, place = to_and_fro(6.0)
+    there = t % 0.5 < 0.4
+    assert smoothness(t[there], place[there], np.ones(there.sum(), dtype=bool)) is None
+    t, place = to_and_fro(6.0)
+    place[10] = np.nan
+    found = smoothness(t, place, np.ones(600, dtype=bool))
+    assert found == pytest.approx(smoothness(t[11:], place[11:], np.ones(589, dtype=bool)))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -13,20 +14,20 @@ import pytest
 
 from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.errors import RecordingError
-from q2r2_control.inputs.base import Input
-from q2r2_control.judging.judge import VERDICT_FILE, Judged, judge, judge_all, keep_verdicts
+from q2r2_control.inputs.played import PlayedInput
+from q2r2_control.judging.figures import EpisodeFigures, Fault, figures_of
+from q2r2_control.judging.judge import VERDICT_FILE, Judged, judge, judge_all, keep_verdicts, verdict_of
 from q2r2_control.recording.reader import Recording
-from q2r2_control.types import HandInputs
-from tests.judging.runs import (
+from q2r2_control.types import SIDES, HandInputs
+from tests.judging.episodes import (
     START,
-    Held,
-    Pose,
-    Thinned,
+    Late,
+    WithDropouts,
     Work,
     at,
     eased,
+    episode,
     hands,
-    headset,
     killed,
     record_episode,
     without_ticks,
@@ -63,21 +64,16 @@ def test_clean_work_is_kept(seed: int, folder: Path) -> None:
         assert arm.gripper_changes == 1
 
 
-def jerky() -> Pose:
-    """Work of a hand that starts and stops all the time."""
-    work, random = Work(SEED), np.random.default_rng(SEED)
-    noise = {hand: random.normal(0.0, 6e-3, (1000, 3)) for hand in ("left", "right")}
+NOISE = np.random.default_rng(SEED).normal(0.0, 6e-3, (2, 1000, 3))
 
-    def pose(hand: str, t: float) -> pin.SE3:
-        smooth = work(hand, t)
-        return pin.SE3(smooth.rotation, smooth.translation + noise[hand][round(75.0 * t)])
 
-    return pose
+def jerky(hand: str, t: float) -> pin.SE3:
+    smooth = Work(SEED)(hand, t)
+    return pin.SE3(smooth.rotation, smooth.translation + NOISE[SIDES.index(hand), round(75.0 * t)])
 
 
 def jumps(hand: str, t: float) -> pin.SE3:
-    place = Work(SEED)(hand, t)
-    return at(hand, x=0.4) if hand == "left" and t > 3.5 else place
+    return at(hand, x=0.4) if hand == "left" and t > 3.5 else Work(SEED)(hand, t)
 
 
 def reaches_too_far(hand: str, t: float) -> pin.SE3:
@@ -97,32 +93,24 @@ def engages(hand: str, t: float) -> HandInputs:
     return HandInputs(button_lower=0.2 <= t < 0.3)
 
 
-SPOILED: dict[str, tuple[Callable[[], Input], set[str]]] = {
-    "dropouts": (
-        lambda: hands(
-            SEED, sampling=lambda hand, seed: Thinned(headset(hand, seed), lambda t: t > 0.6 and t % 0.4 < 0.08)
-        ),
-        {"max_dropout_share"},
-    ),
-    "hands that come late": (lambda: Held(hands(SEED), 0.08), {"max_sample_age", "max_delay"}),
-    "a jump": (lambda: hands(pose=jumps), {"max_faults"}),
+SPOILED: dict[str, tuple[PlayedInput, set[str]]] = {
+    "dropouts": (hands(SEED, sampling=WithDropouts), {"max_dropout_share"}),
+    "hands that come late": (hands(SEED, played=Late), {"max_sample_age", "max_delay"}),
+    "a jump": (hands(pose=jumps), {"max_faults"}),
     "the leash dragged": (
-        lambda: hands(pose=reaches_too_far),
+        hands(pose=reaches_too_far),
         {"max_leashed_share", "max_position_error_rms", "max_position_error_p99", "max_rotation_error_rms"},
     ),
-    "held by the other arm": (
-        lambda: hands(pose=meets_the_other),
-        {"max_position_error_rms"},
-    ),
-    "hands that rest": (lambda: hands(pose=rests, inputs=engages), {"max_idle_share"}),
-    "jerky hands": (lambda: hands(pose=jerky()), {"min_ldlj"}),
+    "held by the other arm": (hands(pose=meets_the_other), {"max_position_error_rms"}),
+    "hands that rest": (hands(pose=rests, inputs=engages), {"max_idle_share"}),
+    "jerky hands": (hands(pose=jerky), {"min_ldlj"}),
 }
 
 
 @pytest.mark.parametrize("what", SPOILED)
 def test_an_episode_that_is_spoiled_in_one_way_is_discarded_for_that_reason(what: str, folder: Path) -> None:
     source, reasons = SPOILED[what]
-    found = judged(record_episode(folder / what, source()))
+    found = judged(record_episode(folder / what, source))
     assert {reason.name for reason in found.verdict.reasons} == reasons, found.verdict.line
     assert found.verdict.word == "discard"
 
@@ -152,7 +140,7 @@ def test_a_damaged_recording_is_judged_by_what_is_before_the_damage(clean: Path,
     (tmp_path / "damaged.mcap").write_bytes(data)
     found = judged(tmp_path / "damaged.mcap")
     assert found.verdict.reasons[0].name == "damaged"
-    assert "damaged: " in found.verdict.line
+    assert found.verdict.reasons[0].text.startswith(f"after {found.figures.duration_s:.2f} s damaged: ")
     (tmp_path / "cut.mcap").write_bytes(clean.read_bytes()[:-5000])
     assert "needs_end" in {reason.name for reason in judged(tmp_path / "cut.mcap").verdict.reasons}
 
@@ -162,26 +150,11 @@ def test_a_run_in_which_no_arm_was_engaged_says_only_that(tmp_path: Path) -> Non
     assert found.verdict.line == "discard: no arm was ever engaged"
 
 
-def test_one_tick_and_no_tick_are_no_episode(clean: Path, tmp_path: Path) -> None:
-    for ticks in (0, 1):
-        found = judged(killed(clean, tmp_path / f"{ticks}.mcap", ticks))
-        assert {reason.name for reason in found.verdict.reasons} == {"needs_end", "never_engaged"}
-        json.dumps(found.as_json(), allow_nan=False)
-
-
-def test_where_the_operator_rests_changes_nothing(folder: Path) -> None:
-    """The same two reaches behind a rest and before one, engaged all the time."""
-    first, last = (
-        judged(record_episode(folder / name, hands(4, pose=Work(4, begin, reaches=2)), 4.8))
-        for name, begin in (("rest first", START + 1.5), ("rest last", START))
-    )
-    assert first.verdict.line == last.verdict.line == "keep"
-    assert first.figures.idle_share == pytest.approx(last.figures.idle_share, abs=0.05)
-    for arm, one in first.figures.arms.items():
-        other = last.figures.arms[arm]
-        assert one.ldlj == pytest.approx(other.ldlj, abs=0.8)
-        assert one.hand_to_tool_ms == pytest.approx(other.hand_to_tool_ms, abs=3.0)
-        assert one.position_error_mm_rms == pytest.approx(other.position_error_mm_rms, rel=0.1)
+@pytest.mark.parametrize("ticks", [0, 1])
+def test_one_tick_and_no_tick_are_no_episode(ticks: int, clean: Path, tmp_path: Path) -> None:
+    found = judged(killed(clean, tmp_path / "few.mcap", ticks))
+    assert {reason.name for reason in found.verdict.reasons} == {"needs_end", "never_engaged"}
+    json.dumps(found.as_json(), allow_nan=False)
 
 
 def test_a_verdict_is_kept_beside_the_file_with_all_that_it_was_made_of(clean: Path, tmp_path: Path) -> None:
@@ -201,3 +174,77 @@ def test_a_file_that_is_no_recording_is_told_before_any_is_judged(clean: Path, t
     (tmp_path / "notes.mcap").write_text("no recording")
     with pytest.raises(RecordingError, match=r"notes\.mcap: not an MCAP file"):
         next(judge_all([clean, tmp_path / "notes.mcap"]))
+
+
+FIGURES = replace(figures_of(episode(), 0.06), idle_share=0.0)
+JUMP = Fault(1.0, "left", "hand_jumped", "a jump")
+
+
+def changed(of: str = "episode", **changes: Any) -> EpisodeFigures:
+    if of == "arm":
+        return replace(FIGURES, arms={"left": replace(FIGURES.arms["left"], **changes)})
+    if of == "hand":
+        return replace(FIGURES, hands={"right": replace(FIGURES.hands["right"], **changes)})
+    if of == "timing":
+        return replace(FIGURES, timing=replace(FIGURES.timing, **changes))
+    return replace(FIGURES, **changes)
+
+
+# Threshold and its value; a figure at it and beyond it; what the reason says.
+CASES: list[tuple[str, float, str, str, Any, Any, str]] = [
+    ("min_pose_rate", 30.0, "hand", "pose_rate_hz", 30.0, 29.0, "right hand: poses at 29.0 Hz (at least 30)"),
+    ("max_dropout_share", 0.1, "hand", "dropout_share", 0.1, 0.2, "dropouts 20.0 % of the time (at most 10)"),
+    ("max_pose_gap", 0.1, "hand", "longest_gap_s", 0.1, 0.3, "no pose for 300.0 ms (at most 100)"),
+    ("max_sample_age", 0.1, "hand", "sample_age_ms_p99", 100.0, 150.0, "p99 150.0 ms (at most 100)"),
+    ("max_delay", 0.1, "arm", "hand_to_tool_ms", 100.0, 120.0, "later than its hand by 120.0 ms (at most 100)"),
+    ("max_rejected_share", 0.1, "arm", "rejected_share", 0.1, 0.2, "unusable targets 20.0 % (at most 10)"),
+    ("max_leashed_share", 0.1, "arm", "leashed_share", 0.1, 0.2, "leash dragged 20.0 % of the time (at most 10)"),
+    ("max_position_error_rms", 0.01, "arm", "position_error_mm_rms", 10.0, 11.0, "RMS 11.0 mm (at most 10)"),
+    ("max_position_error_p99", 0.01, "arm", "position_error_mm_p99", 10.0, 11.0, "p99 11.0 mm (at most 10)"),
+    ("max_rotation_error_rms", 0.1, "arm", "rotation_error_deg_rms", 5.7, 5.8, "RMS 5.8 deg (at most 5.73)"),
+    ("max_rotation_error_p99", 0.1, "arm", "rotation_error_deg_p99", 5.7, 5.8, "p99 5.8 deg (at most 5.73)"),
+    ("min_ldlj", -9.0, "arm", "ldlj", -9.0, -9.5, "LDLJ -9.5 (at least -9)"),
+    ("max_idle_share", 0.5, "episode", "idle_share", 0.5, 0.6, "no engaged arm moves 60.0 % (at most 50)"),
+    ("max_fallback_share", 0.1, "episode", "fallback_share", 0.1, 0.2, "20.0 % of the ticks (at most 10)"),
+    ("max_uncertified_share", 0.0, "episode", "uncertified_share", 0.0, 0.1, "10.0 % of the ticks (at most 0)"),
+    ("min_margin", 0.0, "episode", "min_margin_mm", 0.0, -3.0, "margin -3.0 mm (at least 0)"),
+    ("max_lost_share", 0.1, "timing", "lost_share", 0.1, 0.2, "in the recording 20.0 % of the ticks (at most 10)"),
+    ("max_lost_gap", 0.1, "timing", "longest_lost_s", 0.1, 0.2, "at once 200.0 ms (at most 100)"),
+    ("max_missed_share", 0.1, "timing", "missed_share", 0.1, 0.2, "missed 20.0 % of the ticks (at most 10)"),
+    ("max_tick_gap", 0.1, "timing", "longest_tick_s", 0.1, 0.2, "stood still for 200.0 ms (at most 100)"),
+    ("max_faults", 1, "episode", "faults", [JUMP], 2 * [JUMP], "left arm at 1.00 s: a jump, and 1 more (at most 1)"),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "limit", "of", "figure", "at_it", "beyond", "says"), CASES, ids=[case[0] for case in CASES]
+)
+def test_a_number_beyond_its_threshold_is_the_one_reason(
+    name: str, limit: float, of: str, figure: str, at_it: Any, beyond: Any, says: str
+) -> None:
+    settings = JudgeSettings.model_validate({name: limit})
+    assert verdict_of(changed(of, **{figure: at_it}), settings).line == "keep"
+    (reason,) = verdict_of(changed(of, **{figure: beyond}), settings).reasons
+    assert reason.name == name
+    assert reason.text.endswith(says)
+    assert verdict_of(changed(of, **{figure: beyond}), JudgeSettings.model_validate({name: None})).keep
+
+
+def test_every_threshold_is_tried_here() -> None:
+    tried = {case[0] for case in CASES}
+    assert set(JudgeSettings.model_fields) - tried == {"dropout", "keep_failed", "needs_end"}
+
+
+def test_a_failure_is_discarded_unless_failures_are_kept_and_a_run_that_a_fault_ended_always() -> None:
+    assert verdict_of(changed(success=True), JudgeSettings()).keep
+    failed = changed(success=False)
+    assert [reason.name for reason in verdict_of(failed, JudgeSettings()).reasons] == ["keep_failed"]
+    assert verdict_of(failed, JudgeSettings(keep_failed=True)).keep
+    ended = changed(ended_by="left_A3 stands still")
+    assert verdict_of(ended, JudgeSettings()).line == "discard: a fault ended the run: left_A3 stands still"
+
+
+def test_a_number_that_is_none_is_not_judged_and_one_that_is_no_number_is_discarded() -> None:
+    assert verdict_of(changed("arm", ldlj=None, hand_to_tool_ms=None), JudgeSettings()).keep
+    assert not verdict_of(changed("arm", ldlj=float("nan")), JudgeSettings()).keep
+    assert not verdict_of(changed("arm", position_error_mm_rms=float("nan")), JudgeSettings()).keep

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +18,13 @@ pytest.importorskip("lerobot", reason="make test-lerobot installs it")
 import pyarrow.parquet
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from q2r2_control.export.episodes import EpisodeVectors
-from q2r2_control.export.lerobot import SOURCES, join_shards, video_key, write_shard
+from q2r2_control.export.formats import SOURCES, join_shards, video_key, write_shard
 from q2r2_control.export.sampling import Pixels
-from tests.export.runs import contents
-from tests.export.vectors import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
+from tests.cli.command import q2r2
+from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, contents, record_two, with_pictures
+from tests.export.test_formats import export
 
+ROOT = Path(__file__).resolve().parents[2]
 FPS = 30
 KEY = video_key(CAMERA)
 SEEN = [with_pictures(episode, number) for number, episode in enumerate(EPISODES)]
@@ -32,30 +32,17 @@ SPANS = [(0, 40), (40, 65), (65, 125)]  # frames of the episodes
 BACKEND = "pyav"  # the default, torchcodec, needs the libraries of FFmpeg, which no wheel brings
 
 
-def export(episodes: Sequence[EpisodeVectors], folder: Path) -> Path:
-    """Write a dataset of each episode, join them, and return the folder of the whole."""
-    folder.mkdir()
-    shards = [folder / str(number) for number in range(len(episodes))]
-    for episode, shard in zip(episodes, shards, strict=True):
-        write_shard(episode, shard)
-    join_shards(shards, folder / "whole")
-    return folder / "whole"
-
-
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of three episodes, without pictures."""
-    return export(EPISODES, tmp_path_factory.mktemp("vectors") / "made")
+    return export("lerobot", EPISODES, tmp_path_factory.mktemp("vectors"), ["1", "2", "3"])
 
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of the same episodes with a camera."""
-    return export(SEEN, tmp_path_factory.mktemp("pictures") / "made")
+    return export("lerobot", SEEN, tmp_path_factory.mktemp("pictures"), ["1", "2", "3"])
 
 
 def rows_of(folder: Path) -> list[dict[str, object]]:
-    """What is said of each episode."""
     (file,) = (folder / "meta" / "episodes").rglob("*.parquet")
     rows: list[dict[str, object]] = pyarrow.parquet.read_table(file).to_pylist()
     return rows
@@ -142,3 +129,16 @@ def test_while_a_video_is_encoded_no_thread_goes_before_a_control_loop(tmp_path:
         over.set()
         watcher.join()
     assert seen == {os.SCHED_OTHER}
+
+
+def test_a_dataset_has_the_features_that_the_docs_name(tmp_path: Path) -> None:
+    record_two(tmp_path / "recordings")
+    out = tmp_path / "out"
+    result = q2r2("export", "lerobot", str(tmp_path / "recordings"), "--output", str(out), "--workers", "2")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == f"{out}: 2 of 2 recordings at 30 frames per second\n"
+    info = json.loads((out / "meta/info.json").read_text())
+    names = [line.split("|")[1] for line in (ROOT / "docs/recording.md").read_text().splitlines() if "| `" in line]
+    documented = {name for cell in names for name in cell.replace("`", " ").replace(",", " ").split()}
+    assert set(info["features"]) <= documented
+    assert info["robot_type"] == "dual_iiwa7"

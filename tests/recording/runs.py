@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -53,9 +55,8 @@ print(json.dumps(found))
 
 
 def read_elsewhere(path: Path, folder: Path) -> dict[str, Any]:
-    result = subprocess.run(
-        [sys.executable, "-c", READER, str(path)], cwd=folder, capture_output=True, text=True, timeout=120
-    )
+    command = (sys.executable, "-c", READER, str(path))
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, result.stderr
     found: dict[str, Any] = json.loads(result.stdout)
     return found
@@ -130,5 +131,11 @@ def rewrite(file: Path, target: Path, change: Callable[[str, Message], Message |
 
 
 def number_of(label: str) -> int:
-    """The place of a number in the rows of the cell's ticks."""
     return tick_labels(ARMS, JOINTS).index(label)
+
+
+def ended_line(caplog: pytest.LogCaptureFixture) -> str:
+    """Why recording ended, of the one line that is logged."""
+    (line,) = caplog.messages
+    assert line.startswith("recording ended, the run goes on: ")
+    return line.partition(": ")[2]

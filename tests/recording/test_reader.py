@@ -1,13 +1,66 @@
-"""Paths that a user gives, as files of recordings."""
+"""Paths that a user gives as files of recordings, and the episodes that an operator tells of in them."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.recording.reader import recordings_in
+from q2r2_control.events import Event, Reason
+from q2r2_control.events import ReasonKind as K
+from q2r2_control.recording import messages
+from q2r2_control.recording.reader import recordings_in, spans_of
+from q2r2_control.recording.tick_rows import numbers_in, tick_labels, tick_type
+
+BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
+SUCCEEDED, FAILED = K.EPISODE_SUCCEEDED, K.EPISODE_FAILED
+
+CASES = {
+    "none at all: the whole run": ([], [(-math.inf, math.inf, False, None)]),
+    "two, one after the other": (
+        [(1.0, BEGINS), (2.0, ENDS), (3.0, BEGINS), (4.0, ENDS)],
+        [(1.0, 2.0, False, None), (3.0, 4.0, False, None)],
+    ),
+    "one that the run ends": ([(1.0, BEGINS)], [(1.0, math.inf, False, None)]),
+    "one that is discarded while it goes on": ([(1.0, BEGINS), (2.0, DISCARDED)], [(1.0, 2.0, True, None)]),
+    "one that is discarded after it has ended": (
+        [(1.0, BEGINS), (2.0, ENDS), (2.5, DISCARDED), (3.0, BEGINS), (4.0, ENDS)],
+        [(1.0, 2.0, True, None), (3.0, 4.0, False, None)],
+    ),
+    "other events": ([(0.5, K.MARK), (1.0, BEGINS), (1.5, K.POSE_SILENT)], [(1.0, math.inf, False, None)]),
+    "success and failure of the one that goes on, which they end": (
+        [(1.0, BEGINS), (2.0, SUCCEEDED), (3.0, BEGINS), (4.0, FAILED)],
+        [(1.0, 2.0, False, True), (3.0, 4.0, False, False)],
+    ),
+    "failure of the last one, which has ended": (
+        [(1.0, BEGINS), (2.0, ENDS), (2.5, FAILED)],
+        [(1.0, 2.0, False, False)],
+    ),
+    "what was said last": ([(1.0, BEGINS), (2.0, FAILED), (2.5, SUCCEEDED)], [(1.0, 2.0, False, True)]),
+    "failure of the run, where no episode is told of": ([(1.0, FAILED)], [(-math.inf, math.inf, False, False)]),
+}
+
+
+def events(*told: tuple[float, K]) -> list[Event]:
+    return [Event(t, "left", "engaged", "engaged", Reason(kind)) for t, kind in told]
+
+
+@pytest.mark.parametrize(("told", "expected"), CASES.values(), ids=CASES)
+def test_episodes_are_where_and_as_the_operator_says(
+    told: list[tuple[float, K]], expected: list[tuple[float, float, bool, bool | None]]
+) -> None:
+    spans = spans_of(events(*told))
+    assert [(span.start, span.end, span.discarded, span.success) for span in spans] == expected
+    assert [span.number for span in spans] == ([0] if math.isinf(spans[0].start) else [1, 2][: len(expected)])
+
+
+def test_of_the_whole_run_the_operator_knows_better_than_the_check_of_its_task() -> None:
+    for told, success in (([], True), ([(1.0, FAILED)], False), ([(1.0, BEGINS)], None)):
+        assert [span.success for span in spans_of(events(*told), run_succeeded=True)] == [success]
 
 
 def test_folders_are_searched_by_name_and_nothing_is_taken_twice(tmp_path: Path) -> None:
@@ -21,3 +74,73 @@ def test_folders_are_searched_by_name_and_nothing_is_taken_twice(tmp_path: Path)
     for path, what in ((tmp_path / "empty", "no file .mcap in it"), (tmp_path / "missing", "no such file or folder")):
         with pytest.raises(RecordingError, match=f"{path.name}: {what}"):
             recordings_in([path])
+
+
+ARMS, NAMES = ("left", "right"), ("left_A1", "left_A2", "right_A1_with_a_longer_name")
+STAMPS = np.array([1_500_000_000, (2**31 - 1) * 10**9])
+POSITIONS, VELOCITIES, EFFORTS = (np.arange(first, first + 3, dtype=np.float64) for first in (1, 4, 7))
+
+
+@pytest.mark.parametrize(
+    ("kind", "example"),
+    [
+        (messages.ARRAY, messages.float_array(np.arange(1.0, 10.0))),
+        (messages.JOINTS, messages.joint_state(list(NAMES), POSITIONS, VELOCITIES, EFFORTS)),
+        (messages.TRAJECTORY, messages.joint_trajectory(list(NAMES), POSITIONS, VELOCITIES, EFFORTS)),
+    ],
+    ids=["array", "joint state", "trajectory"],
+)
+def test_a_filled_template_is_the_message_that_rosbags_writes(kind: str, example: Any) -> None:
+    numbers = np.random.default_rng(0).normal(size=(2, 9))
+    for row, stamp, payload in zip(
+        numbers, STAMPS.tolist(), messages.MessageTemplate(kind, example, 9).filled(numbers, STAMPS), strict=True
+    ):
+        message: Any = messages.STORE.deserialize_cdr(payload, kind)
+        assert bytes(messages.STORE.serialize_cdr(message, kind)) == payload
+        if kind == messages.ARRAY:
+            found = [message.data]
+        elif kind == messages.JOINTS:
+            found = [message.position, message.velocity, message.effort]
+        else:
+            found = [message.points[0].positions, message.points[0].velocities, message.points[0].accelerations]
+        np.testing.assert_array_equal(np.concatenate(found), row)
+        assert kind == messages.ARRAY or message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
+
+
+def test_every_number_of_a_tick_has_a_name_of_its_own_and_its_place() -> None:
+    labels, kind = tick_labels(ARMS, NAMES), tick_type(len(ARMS), len(NAMES))
+    assert len(set(labels)) == len(labels) == kind.itemsize // 8
+    rows = np.arange(2 * len(labels), dtype=np.float64).view(kind)
+    np.testing.assert_array_equal(numbers_in(rows).ravel(), np.arange(2 * len(labels)))
+    row = rows[0]
+    for label, number in (
+        ("index", row["index"]),
+        ("tau_external.left_A2", row["tau_external"][1]),
+        ("right.holding", row["arms"]["holding"][1]),
+        ("left.target.qw", row["arms"]["target"][0, 6]),
+        ("slack", row["slack"]),
+        ("command_tau.left_A1", row["command_tau"][0]),
+        ("solve_time", row["solve_time"]),
+    ):
+        assert number == labels.index(label)
+
+
+def test_arrays_and_texts_are_read_as_they_were_written_and_no_others() -> None:
+    numbers = np.array([[0.5, np.nan, -0.0], [1.0, np.inf, 2.0]])
+    payloads = messages.MessageTemplate(messages.ARRAY, messages.float_array(np.arange(1.0, 4.0)), 3).filled(
+        numbers, STAMPS
+    )
+    assert messages.numbers_of(payloads, 3).tobytes() == numbers.tobytes()
+    with pytest.raises(ValueError, match="has not 4 numbers"):
+        messages.numbers_of(payloads, 4)
+    assert messages.data_of(messages.text("grüezi"), messages.TEXT) == "grüezi"
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 3, 4, 5001])
+def test_a_picture_is_read_as_it_was_also_where_a_middleware_filled_the_message_up(length: int) -> None:
+    jpeg = bytes(number % 251 for number in range(length))
+    payload = messages.picture("front", 1_500_000_000, jpeg)
+    message: Any = messages.STORE.deserialize_cdr(payload, messages.PICTURE)
+    assert (message.header.frame_id, message.format) == ("front", "jpeg")
+    for padding in range(4):
+        assert bytes(messages.data_of(payload + bytes(padding), messages.PICTURE)) == jpeg

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import time
 import tracemalloc
 from dataclasses import replace as changed
@@ -16,30 +17,28 @@ import yaml
 
 from q2r2_control.config.cell import parse_config
 from q2r2_control.recording.about import About
+from q2r2_control.recording.messages import run_topics
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
-from q2r2_control.recording.topics import run_topics
-from q2r2_control.recording.writer import TickBatch
 from q2r2_control.summary.tick import Tick
-from tests.recording.runs import ARMS, JOINTS, RATE, file_of, pipeline, read_elsewhere, record, writer_of
+from tests.recording.runs import ARMS, JOINTS, RATE, ended_line, file_of, pipeline, read_elsewhere, record, writer_of
 
 pytestmark = pytest.mark.slow
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Tick]]:
-    """A run in MuJoCo, and its ticks."""
     ticks: list[Tick] = []
     loop = pipeline("circle", "mujoco")
     loop.listeners.append(ticks.append)
     return file_of(record(tmp_path_factory.mktemp("recordings"), loop, 2.0)), ticks
 
 
-def test_every_topic_opens_with_rosbags_in_another_process(tmp_path: Path, recorded: tuple[Path, list[Tick]]) -> None:
+def test_every_topic_opens_with_rosbags_in_another_process_and_has_what_was_told(
+    tmp_path: Path, recorded: tuple[Path, list[Tick]]
+) -> None:
     file, ticks = recorded
     found = read_elsewhere(file.parent, tmp_path)
     assert {name: entry["type"] for name, entry in found.items()} == {
@@ -57,18 +56,12 @@ def test_every_topic_opens_with_rosbags_in_another_process(tmp_path: Path, recor
     assert commands["position"] == ticks[-1].command.q.tolist()
     assert commands["last"] - commands["first"] == pytest.approx(1e9 * (ticks[-1].t - ticks[0].t), abs=1000)
     states = [json.loads(text) for text in found["/q2r2/state"]["texts"]]
-    events = [event for state in states for event in state.get("events", ())]
-    assert [event["kind"] for event in events] == ["pressed", "pressed"]
-
-
-def test_the_filtered_hand_is_recorded_that_each_target_is_made_of(recorded: tuple[Path, list[Tick]]) -> None:
-    file, ticks = recorded
+    assert [event["kind"] for state in states for event in state.get("events", ())] == ["pressed", "pressed"]
     arms = np.concatenate([chunk.rows["arms"] for chunk in Recording(file).chunks()])[:, 0]
     asked = arms["target"].any(axis=1)
     poses, targets = arms["filtered_hand"][asked, :3], arms["target"][asked, :3]
-    led = [tick.targets["left"] for tick in ticks if tick.targets["left"].pose is not None]
-    assert len(poses) == len(led) > 50
-    np.testing.assert_array_equal(poses, [one.hand.translation for one in led if one.hand is not None])
+    hands = [tick.targets["left"].hand for tick in led]
+    np.testing.assert_array_equal(poses, [hand.translation for hand in hands if hand is not None])
     # Side by side and unscaled, a tool moves as its hand does: by the same from the first target on.
     assert np.ptp(poses, axis=0).max() > 0.005
     np.testing.assert_allclose(targets - targets[0], poses - poses[0], atol=1e-9)
@@ -85,7 +78,7 @@ def test_a_clock_that_is_set_back_during_a_run_changes_no_time_in_the_file(
     np.testing.assert_allclose(np.diff(times), 1.0 / RATE, atol=1e-6)
 
 
-def test_the_folder_is_a_bag_of_version_nine(recorded: tuple[Path, list[Tick]]) -> None:
+def test_the_folder_is_a_bag_of_version_nine_that_says_what_was_run(recorded: tuple[Path, list[Tick]]) -> None:
     file, ticks = recorded
     bag = yaml.safe_load((file.parent / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert (bag["version"], bag["storage_identifier"]) == (9, "mcap")
@@ -95,16 +88,10 @@ def test_the_folder_is_a_bag_of_version_nine(recorded: tuple[Path, list[Tick]]) 
     assert sum(counts.values()) == bag["message_count"] == bag["files"][0]["message_count"]
     hashes = {entry["topic_metadata"]["type_description_hash"][:7] for entry in bag["topics_with_message_count"]}
     assert hashes == {"RIHS01_"}
-
-
-def test_the_file_says_what_was_run(recorded: tuple[Path, list[Tick]]) -> None:
-    about = Recording(recorded[0]).about
-    loop = pipeline("circle", "mujoco")
+    about, loop = Recording(file).about, pipeline("circle", "mujoco")
     assert parse_config(about.cell, "recorded") == loop.config
-    assert about.robot == loop.robot.urdf
-    assert about.notes["task"] == "a test"
-    assert {"version", "machine", "libraries", "plant"} <= about.notes.keys()
-    assert not about.realtime
+    assert (about.robot, about.realtime, about.notes["task"]) == (loop.robot.urdf, False, "a test")
+    assert {"version", "machine", "libraries", "plant"} <= about.notes.keys() & bag["custom_data"].keys()
 
 
 def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
@@ -114,11 +101,9 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
     file.write_text("in the way")
     with caplog.at_level(logging.WARNING):
         summary = record(file, pipeline(), 0.2)
-    (line,) = [entry.getMessage() for entry in caplog.records]
-    assert line.startswith(f"recording ended, the run goes on: --record {file}")
+    assert ended_line(caplog).startswith(f"--record {file}")
     assert summary.fault is not None
-    assert summary.file is None
-    assert summary.ticks == 0
+    assert (summary.file, summary.ticks) == (None, 0)
     assert summary.lost_ticks >= 0.2 * RATE
 
 
@@ -130,54 +115,39 @@ def test_runs_that_begin_within_one_second_get_a_folder_each(tmp_path: Path, mon
         assert replay(file).difference is None
 
 
-class Broken(TickPacker):
-    def __init__(self) -> None:
-        pass
-
-    def pack(self, number: int, tick: Tick) -> PackedTick:
-        raise ZeroDivisionError("of the packer")
-
-
 @pytest.mark.parametrize("side", ["the loop's", "the writer's"])
 def test_a_recorder_that_fails_inside_does_not_end_the_run(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, side: str
 ) -> None:
     def spoil(recorder: Recorder) -> None:
         if side == "the writer's":
-            writer_of(recorder).send(TickBatch([PackedTick(b"no tick", b"", "")]))
+            writer_of(recorder).send([PackedTick(b"no tick", b"", "")])
         else:
-            recorder._packer = Broken()
+            recorder._packer = TickPacker(("third",), ())
 
     with caplog.at_level(logging.WARNING):
         summary = record(tmp_path, pipeline(), 0.3, during=spoil)
     assert summary.fault is not None
-    assert ("buffer size" if side == "the writer's" else "of the packer") in summary.fault
+    assert ("buffer size" if side == "the writer's" else "third") in summary.fault
     assert summary.ticks == 0
     assert summary.lost_ticks >= 0.3 * RATE
-    (line,) = [entry.getMessage() for entry in caplog.records]
-    assert line == f"recording ended, the run goes on: {summary.fault}"
+    assert ended_line(caplog) == summary.fault
 
 
 def test_memory_is_flat_however_long_a_run_is(tmp_path: Path, recorded: tuple[Path, list[Tick]]) -> None:
-    loop = pipeline("circle", "mujoco")
-    (tick,) = recorded[1][200:201]
+    loop, tick = pipeline("circle", "mujoco"), recorded[1][200]
     held: list[tuple[int, int]] = []
     with Recorder(tmp_path, "long", waits=True) as recorder:
-        writer = writer_of(recorder)
+        status = Path(f"/proc/{writer_of(recorder).pid}/status")
         recorder.begin(About.of(loop, False, {}), loop.robot)
         tracemalloc.start()
         for number in range(24000):
             recorder(changed(tick, now=tick.start.now + 1e-3 * number))
             if number % 6000 == 5999:
-                held.append((tracemalloc.get_traced_memory()[0], resident(writer.pid)))
+                (resident,) = re.findall(r"VmRSS:\s*(\d+) kB", status.read_text())
+                held.append((tracemalloc.get_traced_memory()[0], 1024 * int(resident)))
         tracemalloc.stop()
     assert recorder.summary.lost_ticks == 0
     for now, then in zip(held[-1], held[0], strict=True):
         # At most 8 MB wait at any time; the ticks in between are 28 as they are packed.
         assert now - then < 14e6
-
-
-def resident(pid: int) -> int:
-    """What a process has in RAM [bytes]."""
-    (line,) = [line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS")]
-    return 1024 * int(line.split()[1])

@@ -14,12 +14,11 @@ from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.judge import judge
 from q2r2_control.plants.kinematic import KinematicPlant
-from q2r2_control.recording.messages import Message
+from q2r2_control.recording.messages import SAMPLES, STATE, TICK, Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS
-from q2r2_control.recording.topics import SAMPLES, STATE, TICK
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import HandFault, HandSample, RobotState
@@ -75,18 +74,17 @@ def test_a_replay_on_a_plant_of_the_recorded_kind_is_identical_and_on_another_on
 
 def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
     loop = pipeline("circle", "kinematic")
-    teleop = loop.config.teleop
-    other = TeleopSettings.model_validate(
-        teleop.model_dump() | {"position_scale": 0.3, "workspace": {"left": BOX}, "filter": {"smoothing_delay": 0.05}}
-    )
+    changes = {"position_scale": 0.3, "workspace": {"left": BOX}, "filter": {"smoothing_delay": 0.05}}
+    other = TeleopSettings.model_validate(loop.config.teleop.model_dump() | changes)
+    asks = {
+        0.8: lambda: loop.change_teleop(other),
+        1.0: lambda: loop.change_control({"min_distance": 0.03, "position_gain": 4.0}),
+        1.2: loop.go_home,
+    }
 
     def ask(tick: Tick) -> None:
-        if 0.8 <= tick.t < 0.8 + 0.9 / RATE:
-            loop.change_teleop(other)
-        if 1.0 <= tick.t < 1.0 + 0.9 / RATE:
-            loop.change_control({"min_distance": 0.03, "position_gain": 4.0})
-        if 1.2 <= tick.t < 1.2 + 0.9 / RATE:
-            loop.go_home()
+        for due in [due for due in asks if tick.t >= due]:
+            asks.pop(due)()
 
     loop.listeners.append(ask)
     result = replay(file_of(record(tmp_path, loop, 1.6)))
@@ -115,9 +113,8 @@ def test_a_replay_of_a_run_by_the_computers_clock_is_identical(tmp_path: Path) -
 
 def test_what_a_gripper_holds_is_replayed(tmp_path: Path) -> None:
     flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
-    config = object_cell(None, flat).model_copy(update={"loop_rate_hz": RATE})
-    changes = {name: getattr(config, name) for name in ("arms", "mujoco")}
-    loop = pipeline("grasp", "mujoco", source=ScriptedInput("grasp"), **changes)
+    config = object_cell(None, flat)
+    loop = pipeline("grasp", "mujoco", source=ScriptedInput("grasp"), arms=config.arms, mujoco=config.mujoco)
     result = replay(file_of(record(tmp_path, loop, 5.5)))
     assert result.difference is None
     assert result.summary is not None
@@ -156,8 +153,6 @@ def test_lost_connections_numbers_that_are_none_and_faults_that_the_input_found_
 
 
 class LosesItsSensors(KinematicPlant):
-    """Measures nothing any more after 1 s."""
-
     def state(self) -> RobotState:
         state = super().state()
         return changed(state, q=np.full_like(state.q, np.nan)) if state.stamp > 1.0 else state
@@ -168,10 +163,9 @@ def test_a_run_that_a_fault_ended_ends_by_the_same_fault(tmp_path: Path) -> None
     recorders: list[Recorder] = []
     with pytest.raises(PlantError) as fault:
         record(tmp_path, pipeline(plant=plant), 1.5, during=recorders.append)
-    result = replay(file_of(recorders[0].summary))
-    assert result.difference is None
-    assert result.ended_by == str(fault.value)
-    recording = Recording(file_of(recorders[0].summary))
+    file = file_of(recorders[0].summary)
+    result, recording = replay(file), Recording(file)
+    assert (result.difference, result.ended_by) == (None, str(fault.value))
     assert recording.closed
     assert recording.conclusion.ended_by == str(fault.value)
     (judged,) = judge(recording)
@@ -200,23 +194,6 @@ def test_solutions_that_came_too_late_are_too_late_again(tmp_path: Path) -> None
     assert result.summary.fallback_ticks > 50
 
 
-def flip(file: Path, target: Path, topic: str, place: int) -> Path:
-    """A copy in which a low bit of one number is flipped, in the first message of a topic after one second."""
-    flipped: list[int] = []
-
-    def change(name: str, message: Message) -> Message:
-        if name != topic or message.number < 1.0 * RATE or flipped:
-            return message
-        flipped.append(message.number)
-        payload = bytearray(message.payload)
-        payload[20 + 8 * place + 1] ^= 1
-        return message._replace(payload=bytes(payload))
-
-    copy = rewrite(file, target, change)
-    assert flipped
-    return copy
-
-
 @pytest.mark.parametrize(
     ("topic", "place", "at", "said"),
     [
@@ -229,39 +206,42 @@ def flip(file: Path, target: Path, topic: str, place: int) -> Path:
 def test_a_flipped_bit_is_the_first_difference(
     tmp_path: Path, circle: Path, topic: str, place: int, at: float, said: str
 ) -> None:
-    result = replay(flip(circle, tmp_path / "flipped.mcap", topic, place))
+    flipped: list[int] = []
+
+    def flip(name: str, message: Message) -> Message:
+        """A low bit of one number, in the first message of the topic after one second."""
+        if name != topic or message.number < 1.0 * RATE or flipped:
+            return message
+        flipped.append(message.number)
+        payload = bytearray(message.payload)
+        payload[20 + 8 * place + 1] ^= 1
+        return message._replace(payload=bytes(payload))
+
+    result = replay(rewrite(circle, tmp_path / "flipped.mcap", flip))
     assert result.difference is not None
     time, _, rest = result.difference.partition(" s: ")
     assert float(time) == pytest.approx(at, abs=0.4 if topic == STATE else 0.02)
     assert rest.startswith(said)
 
 
-def test_a_file_that_is_no_recording_is_one_line(tmp_path: Path, circle: Path) -> None:
-    damaged = tmp_path / "damaged.mcap"
-    data = bytearray(circle.read_bytes())
-    data[data.rindex(b"zstd", 0, len(data) // 2) + 50] ^= 1  # in what a chunk packs, not in an index
-    damaged.write_bytes(data)
-    text = tmp_path / "text.mcap"
-    text.write_text("nothing of the kind")
-    empty = tmp_path / "empty.mcap"
-    empty.write_bytes(b"")
-    other = tmp_path / "other.mcap"
-    other.write_bytes(circle.read_bytes().replace(b"q2r2_control", b"q9r9_control"))
-    for file, what in (
-        (damaged, "damaged: "),
-        (text, "not an MCAP file"),
-        (empty, "not a recording"),
-        (other, "not a recording of q2r2 run --record"),
-        (tmp_path / "none.mcap", "no such file"),
-        (tmp_path, "has 4 files .mcap"),
-    ):
+def test_a_file_that_is_no_recording_or_of_another_cell_is_one_line(tmp_path: Path, circle: Path) -> None:
+    data = circle.read_bytes()
+    damaged = bytearray(data)
+    damaged[data.rindex(b"zstd", 0, len(data) // 2) + 50] ^= 1  # in what a chunk packs, not in an index
+    contents = {
+        "damaged": (bytes(damaged), "damaged: "),
+        "text": (b"nothing of the kind", "not an MCAP file"),
+        "empty": (b"", "not a recording"),
+        "other": (data.replace(b"q2r2_control", b"q9r9_control"), "not a recording of q2r2 run --record"),
+    }
+    for name, (content, _) in contents.items():
+        (tmp_path / f"{name}.mcap").write_bytes(content)
+    said = {tmp_path / f"{name}.mcap": what for name, (_, what) in contents.items()}
+    for file, what in {**said, tmp_path / "none.mcap": "no such file", tmp_path: "has 4 files .mcap"}.items():
         with pytest.raises(RecordingError, match=what) as error:
             pytest.fail(f"{file} was replayed: {replay(file)}")
         assert "\n" not in str(error.value)
         assert str(file) in str(error.value)
-
-
-def test_a_cell_with_other_joints_cannot_replay(circle: Path) -> None:
     one_arm = cell().model_copy(update={"arms": {"left": cell().arms["left"]}})
     with pytest.raises(RecordingError, match="other arms or joints"):
         replay(circle, one_arm)

@@ -21,10 +21,9 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.haptics import FAULT
 from q2r2_control.types import HapticFeedback
-from tests.recording.runs import ROOT, pipeline, read_elsewhere, record, writer_of
+from tests.recording.runs import ROOT, ended_line, pipeline, read_elsewhere, record, writer_of
 from tests.support.processes import alive, children, wait_until
 
 pytestmark = pytest.mark.slow
@@ -32,21 +31,14 @@ pytestmark = pytest.mark.slow
 WRITTEN_LATER = 60.0  # [s] of simulated time, which a listener ends
 
 
-class Script:
-    """A listener that does one step after the other, and then ends the run. Simulated time waits for it."""
+def script(loop: Pipeline, steps: Callable[[Recorder], Iterator[None]]) -> Callable[[Recorder], None]:
+    """Steps of a recorded run, which then ends: each lasts until it yields, and is resumed at the next tick."""
 
-    def __init__(self, loop: Pipeline, steps: Callable[[Recorder], Iterator[None]]) -> None:
-        self._loop, self._steps = loop, steps
+    def begin(recorder: Recorder) -> None:
+        left = steps(recorder)
+        loop.listeners.append(lambda tick: loop.stop() if next(left, loop) is loop else None)
 
-    def __call__(self, recorder: Recorder) -> None:
-        """When recording has begun."""
-        self._left = self._steps(recorder)
-        self._loop.listeners.append(self._step)
-
-    def _step(self, tick: Tick) -> None:
-        """A step lasts until its generator yields; it is resumed at each tick."""
-        if next(self._left, self) is self:
-            self._loop.stop()
+    return begin
 
 
 def test_while_the_writer_is_stopped_the_loop_goes_on_and_what_is_lost_is_counted(tmp_path: Path) -> None:
@@ -67,12 +59,11 @@ def test_while_the_writer_is_stopped_the_loop_goes_on_and_what_is_lost_is_counte
             calm = calm + 1 if recorder.overflows == lost else 0
 
     loop = pipeline()
-    summary = record(tmp_path, loop, WRITTEN_LATER, waits=False, room=400_000, during=Script(loop, stopped_for_a_while))
+    summary = record(tmp_path, loop, WRITTEN_LATER, waits=False, room=400_000, during=script(loop, stopped_for_a_while))
     assert summary.fault is None
     assert summary.lost_ticks == recorders[0].overflows >= 100
     assert summary.ticks > 100
-    assert summary.file is not None
-    file = Path(summary.file)
+    file = file_in(tmp_path)
     found = read_elsewhere(file, tmp_path)
     assert found["/q2r2/tick"]["count"] == summary.ticks
     chunks = list(Recording(file).chunks())
@@ -81,69 +72,48 @@ def test_while_the_writer_is_stopped_the_loop_goes_on_and_what_is_lost_is_counte
     assert {*numbers[1:][np.diff(numbers) > 1].tolist()} <= with_states, "the state is there again behind each gap"
     result = replay(file)
     assert result.difference is None
-    assert result.ended_by is not None
-    assert "ticks were lost here" in result.ended_by
+    assert "ticks were lost here" in str(result.ended_by)
     assert not alive(writer_of(recorders[0]).pid)
 
 
-def test_a_writer_that_is_killed_is_one_line_and_leaves_what_it_wrote(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("what", ["the process that writes it was ended by SIGKILL", "File too large"])
+def test_a_writer_that_is_killed_or_whose_disk_is_full_ends_the_recording_alone_and_leaves_what_it_wrote(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, what: str
 ) -> None:
-    def killed(recorder: Recorder) -> Iterator[None]:
+    felt: list[HapticFeedback] = []
+
+    def broken(recorder: Recorder) -> Iterator[None]:
+        recorder.record_outcome = loop.record_outcome
         while not recorder.written.ticks:
             yield
-        os.kill(writer_of(recorder).pid, signal.SIGKILL)
+        if what.endswith("SIGKILL"):
+            os.kill(writer_of(recorder).pid, signal.SIGKILL)
+        else:
+            size = file_in(tmp_path).stat().st_size
+            resource.prlimit(writer_of(recorder).pid, resource.RLIMIT_FSIZE, (size + 100, size + 100))
         while not caplog.records:
             yield
         for _ in range(100):
             yield
 
     loop = pipeline()
-    with caplog.at_level(logging.WARNING):
-        summary = record(tmp_path, loop, WRITTEN_LATER, during=Script(loop, killed))
-    (line,) = [entry.getMessage() for entry in caplog.records]
-    assert line == f"recording ended, the run goes on: {summary.fault}"
-    assert summary.fault == f"{summary.file}: the process that writes it was ended by SIGKILL"
-    assert summary.lost_ticks > 100
-    assert summary.file is not None
-    result = replay(Path(summary.file))
-    assert result.difference is None
-    assert result.ticks >= summary.ticks > 0
-
-
-def test_a_full_disk_ends_the_recording_and_not_the_run_and_leaves_what_fits(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    felt: list[HapticFeedback] = []
-
-    def full_disk(recorder: Recorder) -> Iterator[None]:
-        recorder.record_outcome = loop.record_outcome
-        while not recorder.written.ticks:
-            yield
-        size = file_in(tmp_path).stat().st_size
-        resource.prlimit(writer_of(recorder).pid, resource.RLIMIT_FSIZE, (size + 100, size + 100))
-        while not caplog.records:
-            yield
-        for _ in range(10):
-            yield
-
-    loop = pipeline()
     loop.input.send_haptic = felt.append  # type: ignore[method-assign, assignment]
     with caplog.at_level(logging.WARNING):
-        summary = record(tmp_path, loop, WRITTEN_LATER, during=Script(loop, full_disk))
-    assert summary.fault == f"{summary.file}: File too large"
-    (line,) = [entry.getMessage() for entry in caplog.records]
-    assert line == f"recording ended, the run goes on: {summary.fault}"
+        summary = record(tmp_path, loop, WRITTEN_LATER, during=script(loop, broken))
+    assert ended_line(caplog) == summary.fault == f"{summary.file}: {what}"
     assert {pulse.hand for pulse in felt if (pulse.frequency, pulse.amplitude) == FAULT[:2]} == {"left", "right"}
-    assert summary.ticks > 0
-    assert summary.lost_ticks > 0
-    assert read_elsewhere(file_in(tmp_path), tmp_path)["/q2r2/tick"]["count"] == summary.ticks
+    assert summary.lost_ticks > 100
+    result = replay(file_in(tmp_path))
+    assert result.difference is None
+    assert result.ticks >= summary.ticks > 0
+    if not what.endswith("SIGKILL"):
+        assert read_elsewhere(file_in(tmp_path), tmp_path)["/q2r2/tick"]["count"] == summary.ticks
 
 
 def test_a_writer_that_hangs_at_the_end_is_not_waited_for_longer_than_that(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("q2r2_control.recording.base_recorder.PATIENCE", 0.1)
+    monkeypatch.setattr("q2r2_control.recording.recorder.PATIENCE", 0.1)
     pids: list[int] = []
 
     def hang(recorder: Recorder) -> None:
@@ -163,8 +133,10 @@ def file_in(folder: Path) -> Path:
 RUN = """
 import sys
 from pathlib import Path
+from q2r2_control.judging.episode_judge import EpisodeJudge
 from tests.recording.runs import pipeline, record
 loop = pipeline()
+EpisodeJudge(lambda: None, print).start()
 count = 0
 def tell(tick):
     global count
@@ -179,7 +151,6 @@ PATH = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 @contextmanager
 def started(*command: str, cwd: Path = ROOT, env: Mapping[str, str] = PATH) -> Iterator[subprocess.Popen[str]]:
-    """A run in a process group of its own."""
     running = subprocess.Popen(
         [sys.executable, *command], cwd=cwd, env=env, process_group=0,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -206,19 +177,20 @@ def test_what_a_killed_run_leaves_opens_and_is_replayed(tmp_path: Path, both: bo
         while int(running.stdout.readline()) < 100:
             pass
         wait_until(lambda: has_ticks(tmp_path))
-        (writer,) = children(running.pid)
+        helpers = children(running.pid)
+        assert len(helpers) == 2
         if both:  # the writer first, which would notice the run's end
-            os.kill(writer, signal.SIGKILL)
+            for helper in helpers:
+                os.kill(helper, signal.SIGKILL)
         running.kill()
         running.wait()
-        wait_until(lambda: not alive(writer))
+        wait_until(lambda: not any(map(alive, helpers)))
     file = file_in(tmp_path)
     assert Recording(file).closed is not both
     result = replay(file)
     assert result.difference is None
     assert result.ticks > 0
-    assert result.ended_by is not None
-    assert "its process was killed" in result.ended_by
+    assert "its process was killed" in str(result.ended_by)
     if not both:
         found = read_elsewhere(file.parent, tmp_path)
         assert set(found) >= {"/joint_states", "/robot_description", "/q2r2/state"}

@@ -26,10 +26,9 @@ from std_msgs.msg import String
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.judging.judge import judge
-from q2r2_control.recording.episode_spans import read_spans
-from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.messages import RECORDER_EVENTS
+from q2r2_control.recording.reader import Recording, read_spans
 from q2r2_control.recording.ros_recording import open_recording
-from q2r2_control.recording.ros_topics import RECORDER_EVENTS
 from q2r2_control.recording.writer import FLUSH_PERIOD
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
 from q2r2_control.ros.nodes.recorder import HANDOVER_PERIOD

@@ -16,7 +16,7 @@ import yaml
 from rosbags.typesys import Stores, get_typestore
 
 from q2r2_control import Robot
-from q2r2_control.recording.topics import Topic, run_topics
+from q2r2_control.recording.messages import Topic, run_topics
 from tests.ros.cell import PATIENT, start_controller, start_robot
 from tests.ros.conftest import need_ros
 from tests.ros.processes import PATIENCE, ROOT, Processes, as_arguments, wait_until

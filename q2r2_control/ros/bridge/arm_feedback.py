@@ -18,8 +18,7 @@ from std_msgs.msg import ColorRGBA, Float64MultiArray, String
 from visualization_msgs.msg import Marker
 
 from q2r2_control.events import Event
-from q2r2_control.recording.ros_topics import arm_events, arm_flags, asked_target
-from q2r2_control.recording.topics import WORLD
+from q2r2_control.recording.messages import WORLD, arm_events, arm_flags, asked_target
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.gripper_client import GripperClient
 from q2r2_control.ros.bridge.hand_topics import HandIntake

@@ -26,8 +26,7 @@ from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.loop.arm_conditions import ArmConditions
 from q2r2_control.loop.control_loop import ControlLoop
-from q2r2_control.recording.ros_topics import CONTROLLER_TICK
-from q2r2_control.recording.topics import REFERENCE
+from q2r2_control.recording.messages import CONTROLLER_TICK, REFERENCE
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import LATCHED_QOS, RECORDED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
-from q2r2_control.recording.ros_topics import RECORDER
+from q2r2_control.recording.messages import RECORDER
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge import messages as convert
 from q2r2_control.ros.monitoring import Publishers, node_of

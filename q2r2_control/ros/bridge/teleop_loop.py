@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.recording.ros_topics import RECORDER
+from q2r2_control.recording.messages import RECORDER
 from q2r2_control.ros.base_node import STEADY
 from q2r2_control.teleop.arm_states import HOLDING
 from q2r2_control.teleop.both_arms import EpisodeMarks

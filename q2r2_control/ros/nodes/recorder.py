@@ -25,10 +25,17 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.recording.about import ROS, About, as_yaml, program
-from q2r2_control.recording.base_recorder import ROOM, ROOM_WITH_PICTURES, MessageRecorder
-from q2r2_control.recording.messages import Message
-from q2r2_control.recording.ros_topics import RECORDER_EVENTS, arm_events, heard_on, is_latched, is_reliable, ros_topics
-from q2r2_control.recording.topics import Topic
+from q2r2_control.recording.messages import (
+    RECORDER_EVENTS,
+    Message,
+    Topic,
+    arm_events,
+    heard_on,
+    is_latched,
+    is_reliable,
+    ros_topics,
+)
+from q2r2_control.recording.recorder import ROOM, ROOM_WITH_PICTURES, MessageRecorder
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, RECORDED_QOS, STEADY, WARN, BaseNode
 from q2r2_control.ros.bridge.messages import age

@@ -1,0 +1,128 @@
+"""A table and an HDF5 file have the numbers of the dataset."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control.errors import RecordingError
+from q2r2_control.export import formats
+from q2r2_control.export.episodes import EpisodeVectors
+from q2r2_control.export.formats import FORMATS, SOURCES, join_shards, video_key
+from tests.cli.command import q2r2
+from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
+
+HEAD = [
+    *(f"{feature}.{name}" for feature, names in NAMES.items() for name in names),
+    *("next.done", "next.success", "timestamp", "frame_index", "task"),
+]
+
+
+def read(file: Path) -> list[dict[str, str]]:
+    with file.open(newline="") as stream:
+        reader = csv.DictReader(stream)
+        rows = list(reader)
+    assert reader.fieldnames == HEAD
+    return rows
+
+
+def export(name: str, episodes: Sequence[EpisodeVectors], folder: Path, recordings: Sequence[str]) -> Path:
+    files = [folder / f"{recording}.{number}" for number, recording in enumerate(recordings)]
+    for episode, file in zip(episodes, files, strict=False):
+        FORMATS[name].write(episode, file)
+    FORMATS[name].join(files, folder / "made")
+    return folder / "made"
+
+
+def test_each_recording_has_a_table_with_a_line_for_each_frame(tmp_path: Path) -> None:
+    made = export("csv", EPISODES, tmp_path, ["run-1", "run-2", "run-3"])
+    assert sorted(file.name for file in made.iterdir()) == ["run-1.csv", "run-2.csv", "run-3.csv"]
+    rows = read(made / "run-2.csv")
+    values = [[row[f"action.{name}"] for name in NAMES["action"]] for row in rows]
+    np.testing.assert_array_equal(np.array(values, dtype=np.float32), EPISODES[1].vectors["action"])
+    assert [int(row["frame_index"]) for row in rows] == list(range(25))
+    assert {row["task"] for row in rows} == {"circle"}
+    assert rows[-1]["next.done"] == "True"
+    succeeded = [row["next.success"] for row in read(made / "run-1.csv")]
+    assert [frame for frame, said in enumerate(succeeded) if said == "True"] == [EPISODES[0].frames - 1]
+
+
+def test_two_recordings_of_one_name_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"run\.mcap: two recordings have this name"):
+        export("csv", EPISODES, tmp_path, ["run", "run"])
+
+
+def test_each_episode_is_an_hdf5_file_of_what_act_asks_for_with_the_next_action(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
+    positions = ("left_A1", "left_gripper")
+    names = {"observation.state": positions, "observation.velocity": positions[:1], "action": positions}
+    episodes = []
+    for number, plain in enumerate(EPISODES[:2]):
+        numbers = plain.vectors["action"]
+        vectors = {name: numbers[:, : len(labels)] * (1 + at) for at, (name, labels) in enumerate(names.items())}
+        episodes.append(replace(with_pictures(plain, number), names=names, vectors=vectors))
+    made = export("hdf5", episodes, tmp_path, ["a", "b"])
+    for number, episode in enumerate(episodes):
+        with h5py.File(made / f"episode_{number}.hdf5") as file:
+            state, pictures = file["observations/qpos"], file[f"observations/images/{CAMERA}"]
+            np.testing.assert_array_equal(state, episode.vectors["observation.state"])
+            np.testing.assert_array_equal(file["observations/qvel"], episode.vectors["observation.velocity"])
+            actions = episode.vectors["action"]
+            np.testing.assert_array_equal(file["action"], [*actions[1:], actions[-1]])
+            np.testing.assert_array_equal(pictures, list(episode.cameras[CAMERA]))
+            assert pictures.chunks == (1, HEIGHT, WIDTH, 3)
+            assert list(state.attrs["names"]) == list(positions)
+            assert list(state.attrs["units"]) == ["rad", "0 closed .. 1 open"]
+            assert list(file["observations/qvel"].attrs["units"]) == ["rad/s"]
+            about = dict(file.attrs)
+            assert (about["fps"], about["task"], about["cell"]) == (30, episode.task, "two_arms")
+            assert (about["recording"], about["note_operator"]) == (f"run-{number + 1}.mcap", "Ada")
+            assert (about["sim"], about["action_ahead_frames"], about.get("success")) == (1, 1, episode.success)
+
+
+ACTION = {"dtype": "float32", "shape": [2], "names": ["left_A1", "left_A2"]}
+OTHER_ACTION = {**ACTION, "names": ["left_A1", "left_A3"]}
+VIDEO = {"dtype": "video", "shape": [48, 64, 3]}
+
+
+def shard(folder: Path, recording: str, cell: str, features: dict[str, Any]) -> Path:
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps({"robot_type": cell, "features": features}))
+    (folder / SOURCES).write_text(json.dumps([{"recording": recording}]))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("cell", "features", "what"),
+    [
+        pytest.param("one_arm", {"action": ACTION}, r"of cell one_arm, but a\.mcap of two_arms", id="another cell"),
+        pytest.param("two_arms", {"action": OTHER_ACTION}, r"action has not the numbers", id="another joint"),
+        pytest.param("two_arms", {"action": ACTION, video_key(CAMERA): VIDEO}, "has not the cameras", id="a camera"),
+    ],
+)
+def test_episodes_of_different_robots_are_not_one_dataset(
+    cell: str, features: dict[str, Any], what: str, tmp_path: Path
+) -> None:
+    shards = [
+        shard(tmp_path / "a", "a.mcap", "two_arms", {"action": ACTION}),
+        shard(tmp_path / "b", "b.mcap", cell, features),
+    ]
+    with pytest.raises(RecordingError, match=rf"b\.mcap: {what}"):
+        join_shards(shards, tmp_path / "made")
+    assert not (tmp_path / "made").exists()
+
+
+def test_without_lerobot_one_line_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats, "find_spec", lambda name: None)
+    (tmp_path / "a.mcap").touch()
+    result = q2r2("export", "lerobot", str(tmp_path / "a.mcap"), "--output", str(tmp_path / "out"))
+    assert result.exit_code == 2
+    assert result.stderr == "q2r2: export lerobot needs lerobot: pip install 'q2r2_control[lerobot]'\n"
+    assert not list(tmp_path.glob("out*"))
