@@ -33,7 +33,6 @@ class ReasonKind(StrEnum):
     CARRY_ENDED = "carry_ended", "the other arm was stopped"
     RESET_SERVICE = "reset_service", "the reset service"
     PAUSE_SERVICE = "pause_service", "the pause service"
-
     # The way home.
     HOMING = "homing", "way home"
     HOMING_ARRIVED = "homing_arrived", "at home"
@@ -42,7 +41,6 @@ class ReasonKind(StrEnum):
     HOMING_INTERRUPTED = "homing_interrupted", "the way home was interrupted"
     HOMING_ENDED = "homing_ended", "the way home was ended"
     HOMING_FAULT = "homing_fault", "on the way home: {cause}"
-
     # The recording.
     EPISODE_BEGINS = "episode_begins", "episode begins"
     EPISODE_ENDS = "episode_ends", "episode ends"
@@ -51,14 +49,12 @@ class ReasonKind(StrEnum):
     EPISODE_DISCARDED = "episode_discarded", "episode discarded"
     MARK = "mark", "mark"
     VERDICT = "verdict", "verdict on episode {episode}: {line}"
-
     # Requests of a program.
     HOME_REQUESTED = "home_requested", "a program asks for the way home"
     SETTINGS_REQUESTED = "settings_requested", "a program changes settings: {changes}"
     CONTROL_REQUESTED = "control_requested", "a program changes control: {changes}"
     SETTINGS_CHANGED = "settings_changed", "settings changed"
     CONTROL_CHANGED = "control_changed", "control changed"
-
     # Refusals: nothing changed. Those of the first group have a cause.
     NOT_ENGAGED = "not_engaged", "not engaged: {cause}"
     NOT_HOMING = "not_homing", "not homing: {cause}"
@@ -67,7 +63,6 @@ class ReasonKind(StrEnum):
     NO_RECORDING = "no_recording", "not recorded: this run has no recording"
     RECORDING_ENDED = "recording_ended", "not recorded any more: {text}"
     NO_EPISODE = "no_episode", "not discarded: no episode has begun"
-
     # Faults of a hand and its data.
     POSE_SILENT = "pose_silent", "no pose for {timeout:g} s"
     POSE_GAP = "pose_gap", "no pose for {gap:.3f} s"
@@ -87,7 +82,6 @@ class ReasonKind(StrEnum):
     CLOCK_NOT_FINITE = "clock_not_finite", "the clock is not finite"
     CLOCK_WENT_BACK = "clock_went_back", "the clock went back by {duration:.3f} s"
     LINKED = "linked", "linked to {arm}: {cause}"
-
     # Obstacles to a request.
     TOOL_UNKNOWN = "tool_unknown", "the tool's pose is not known"
     CONTROLS_HELD = "controls_held", "{controls} held since the hand was first heard of: let go first"
@@ -100,7 +94,6 @@ class ReasonKind(StrEnum):
     TOOL_HELD_UP = "tool_held_up", "a tool is held up on the way to its target"
     ARMS_MUST_HOLD = "arms_must_hold", "stance, axes and controls may be changed while both arms hold"
     CONTROL_REFUSED = "control_refused", "{text}"
-
     # Obstacles that ROS nodes find; their text is in the detail.
     NO_SUBSCRIBER = "no_subscriber", "{text}"  # of an arm's targets
     NO_TOOL_POSE = "no_tool_pose", "the tool's pose is not known: {text}"
@@ -109,7 +102,6 @@ class ReasonKind(StrEnum):
     SEVERAL_PUBLISHERS = "several_publishers", "{text}"
     CONTROLLER_REFUSES = "controller_refuses", "{text}"
     BAD_JOINT_STATES = "bad_joint_states", "{text}"
-
     # What supervision finds.
     NO_STATES_YET = "no_states_yet", "no joint states yet{source}"
     STATES_SILENT = "states_silent", "no joint states{source} for {age:.3f} s; allowed: {timeout:g}"
@@ -153,7 +145,6 @@ class ReasonKind(StrEnum):
     TARGET_LATE = "target_late", "{late:.2f} s late; its sender or this node stood still"
     TARGET_FRAME = "target_frame", "frame_id {frame!r}; allowed: {allowed!r}"
     TARGET_NOT_A_POSE = "target_not_a_pose", "not a finite pose with a unit quaternion"
-
     OTHER = "other", "{text}"  # a sentence made elsewhere, which nothing decides by
 
 
@@ -172,7 +163,7 @@ class Reason:
 
     @classmethod
     def of(cls, kind: ReasonKind, cause: Reason | None = None, **detail: Any) -> Reason:
-        """The reason of this ``kind`` with its ``detail`` by name."""
+        """With its ``detail`` by name."""
         return cls(kind, detail, cause)
 
     @classmethod
@@ -182,7 +173,6 @@ class Reason:
 
     @property
     def root(self) -> Reason:
-        """The first cause."""
         return self if self.cause is None else self.cause.root
 
     def as_json(self) -> dict[str, Any]:
@@ -213,7 +203,6 @@ class Event:
 
     @property
     def kind(self) -> ReasonKind:
-        """The kind of its reason."""
         return self.reason.kind
 
     def as_json(self) -> dict[str, Any]:

@@ -13,7 +13,6 @@ _LIMITS = {LimitKind.POSITION: "position", LimitKind.VELOCITY: "velocity", Limit
 
 
 def sentence(reason: Reason) -> str:
-    """One line, in present English."""
     fields: dict[str, Any] = {name: _text(value) for name, value in reason.detail.items()}
     if reason.cause is not None:
         fields["cause"] = sentence(reason.cause)

@@ -10,7 +10,7 @@ from std_msgs.msg import Bool, ColorRGBA
 from visualization_msgs.msg import Marker
 
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.loop.arm_conditions import ArmConditions
+from q2r2_control.loop.control_loop import ArmConditions
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers
