@@ -74,7 +74,6 @@ class CarryMode:
 
     @property
     def lasts(self) -> bool:
-        """Whether both arms still carry."""
         return self.leader.state is ArmState.ENGAGED and self._follower.state is ArmState.CARRIED
 
     def end(self, now: float, reason: Reason) -> None:
@@ -117,11 +116,9 @@ class BothArms:
         self.arm_of_hand = {hands[name]: name for name in self.arms}
 
     def any_in(self, *states: ArmState) -> bool:
-        """Whether an arm is in one of these states."""
         return any(arm.state in states for arm in self.arms.values())
 
     def all_in(self, states: Collection[ArmState]) -> bool:
-        """Whether every arm is in one of these states."""
         return all(arm.state in states for arm in self.arms.values())
 
     def change(self, cause: Cause, now: float, reason: Reason) -> None:

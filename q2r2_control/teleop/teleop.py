@@ -142,12 +142,15 @@ class Teleop:
             self._commanded |= (carried := carry.targets(now, expected, expected if around.in_step else {}))
         targets = {}
         for name, arm in self._arms.items():
-            pose, hand, leader = carried.get(name), None, arm if carry is None else carry.leader
+            pose = hand = None
+            if carry is not None:
+                pose = carried[name]
+            elif arm.state is ArmState.ENGAGED:
+                self._commanded[name] = pose = se3_of(arm.target(now, around.expected(name, arm.offset)))
             if arm.state is ArmState.ENGAGED:
-                if carry is None:
-                    self._commanded[name] = pose = se3_of(arm.target(now, around.expected(name, arm.offset)))
                 hand = arm.motion.filtered
-            targets[name] = ArmTarget(pose, arm.gripper, *leader.motion.slip, arm.offset, hand)
+            slip, slip_angle = (arm if carry is None else carry.leader).motion.slip
+            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.offset, hand)
         return targets
 
     def home(self, now: float) -> None:
