@@ -9,132 +9,148 @@ from typing import Any
 
 
 class ReasonKind(StrEnum):
-    """Why an arm changed its state, or did not; what became of a request; what is wrong. Values are stable."""
+    """Why an arm changed its state, or did not; what became of a request; what is wrong. Values are stable.
+
+    Each has the ``template`` of its sentence: fields of the reason's detail, and ``cause``, the sentence of its cause.
+    """
+
+    template: str
+
+    def __new__(cls, value: str, template: str = "") -> ReasonKind:
+        kind = str.__new__(cls, value)
+        kind._value_, kind.template = value, template
+        return kind
 
     # An operator's controls.
-    PRESSED = "pressed"
-    COMMANDED = "commanded"  # an action that is for both arms
-    DEAD_MAN_HELD = "dead_man_held"
-    DEAD_MAN_RELEASED = "dead_man_released"
-    ALIGNMENT_CHORD = "alignment_chord"
-    ALIGNED = "aligned"
-    CARRY_BEGAN = "carry_began"  # this arm's hand moves both tools
-    CARRIED_BY = "carried_by"
-    CARRY_ENDED = "carry_ended"
-    RESET_SERVICE = "reset_service"
-    PAUSE_SERVICE = "pause_service"
-
+    PRESSED = "pressed", "{control}"
+    COMMANDED = "commanded", "{action} ({control})"  # an action that is for both arms
+    DEAD_MAN_HELD = "dead_man_held", "dead man held"
+    DEAD_MAN_RELEASED = "dead_man_released", "dead man let go"
+    ALIGNMENT_CHORD = "alignment_chord", "alignment chord"
+    ALIGNED = "aligned", "aligned anew"
+    CARRY_BEGAN = "carry_began", "carries both tools"
+    CARRIED_BY = "carried_by", "carries with the {arm} arm"
+    CARRY_ENDED = "carry_ended", "the other arm was stopped"
+    RESET_SERVICE = "reset_service", "the reset service"
+    PAUSE_SERVICE = "pause_service", "the pause service"
     # The way home.
-    HOMING = "homing"
-    HOMING_ARRIVED = "homing_arrived"
-    HOMING_HELD_UP = "homing_held_up"
-    HOMING_NO_WAY = "homing_no_way"
-    HOMING_INTERRUPTED = "homing_interrupted"
-    HOMING_ENDED = "homing_ended"
-    HOMING_FAULT = "homing_fault"
-
+    HOMING = "homing", "way home"
+    HOMING_ARRIVED = "homing_arrived", "at home"
+    HOMING_HELD_UP = "homing_held_up", "held up by {by}"
+    HOMING_NO_WAY = "homing_no_way", "no free way was found"
+    HOMING_INTERRUPTED = "homing_interrupted", "the way home was interrupted"
+    HOMING_ENDED = "homing_ended", "the way home was ended"
+    HOMING_FAULT = "homing_fault", "on the way home: {cause}"
     # The recording.
-    EPISODE_BEGINS = "episode_begins"
-    EPISODE_ENDS = "episode_ends"
-    EPISODE_SUCCEEDED = "episode_succeeded"
-    EPISODE_FAILED = "episode_failed"
-    EPISODE_DISCARDED = "episode_discarded"
-    MARK = "mark"
-    VERDICT = "verdict"
-
+    EPISODE_BEGINS = "episode_begins", "episode begins"
+    EPISODE_ENDS = "episode_ends", "episode ends"
+    EPISODE_SUCCEEDED = "episode_succeeded", "episode succeeded"
+    EPISODE_FAILED = "episode_failed", "episode failed"
+    EPISODE_DISCARDED = "episode_discarded", "episode discarded"
+    MARK = "mark", "mark"
+    VERDICT = "verdict", "verdict on episode {episode}: {line}"
     # Requests of a program.
-    HOME_REQUESTED = "home_requested"
-    SETTINGS_REQUESTED = "settings_requested"
-    CONTROL_REQUESTED = "control_requested"
-    SETTINGS_CHANGED = "settings_changed"
-    CONTROL_CHANGED = "control_changed"
-
+    HOME_REQUESTED = "home_requested", "a program asks for the way home"
+    SETTINGS_REQUESTED = "settings_requested", "a program changes settings: {changes}"
+    CONTROL_REQUESTED = "control_requested", "a program changes control: {changes}"
+    SETTINGS_CHANGED = "settings_changed", "settings changed"
+    CONTROL_CHANGED = "control_changed", "control changed"
     # Refusals: nothing changed. Those of the first group have a cause.
-    NOT_ENGAGED = "not_engaged"
-    NOT_HOMING = "not_homing"
-    NOT_CARRIED = "not_carried"
-    NOT_CHANGED = "not_changed"
-    NO_RECORDING = "no_recording"
-    RECORDING_ENDED = "recording_ended"
-    NO_EPISODE = "no_episode"
-
+    NOT_ENGAGED = "not_engaged", "not engaged: {cause}"
+    NOT_HOMING = "not_homing", "not homing: {cause}"
+    NOT_CARRIED = "not_carried", "not carried: {cause}"
+    NOT_CHANGED = "not_changed", "not changed: {cause}"
+    NO_RECORDING = "no_recording", "not recorded: this run has no recording"
+    RECORDING_ENDED = "recording_ended", "not recorded any more: {text}"
+    NO_EPISODE = "no_episode", "not discarded: no episode has begun"
     # Faults of a hand and its data.
-    POSE_SILENT = "pose_silent"
-    POSE_GAP = "pose_gap"
-    INPUTS_SILENT = "inputs_silent"
-    POSE_WITHOUT_STAMP = "pose_without_stamp"
-    POSE_UNUSABLE = "pose_unusable"
-    NO_POSE = "no_pose"
-    HAND_FROZEN = "hand_frozen"
-    HAND_FRAME_MOVED = "hand_frame_moved"
-    HAND_JUMPED = "hand_jumped"
-    HAND_ROTATION_JUMPED = "hand_rotation_jumped"
-    HAND_TOO_FAST = "hand_too_fast"
-    HAND_TURNS_TOO_FAST = "hand_turns_too_fast"
-    CONNECTION_LOST = "connection_lost"
-    LOOP_STALLED = "loop_stalled"
-    NODE_STALLED = "node_stalled"
-    CLOCK_NOT_FINITE = "clock_not_finite"
-    CLOCK_WENT_BACK = "clock_went_back"
-    LINKED = "linked"  # the other arm has a fault, which is the cause
-
+    POSE_SILENT = "pose_silent", "no pose for {timeout:g} s"
+    POSE_GAP = "pose_gap", "no pose for {gap:.3f} s"
+    INPUTS_SILENT = "inputs_silent", "no button data for {timeout:g} s"
+    POSE_WITHOUT_STAMP = "pose_without_stamp", "a pose without a receipt time"
+    POSE_UNUSABLE = "pose_unusable", "a pose that is not finite or not a rotation"
+    NO_POSE = "no_pose", "the newest pose is not usable"
+    HAND_FROZEN = "hand_frozen", "the hand's pose is frozen"
+    HAND_FRAME_MOVED = "hand_frame_moved", "both hands moved as one, as when their frame moves: align"
+    HAND_JUMPED = "hand_jumped", "the hand jumped {distance:.3f} m"
+    HAND_ROTATION_JUMPED = "hand_rotation_jumped", "the hand's rotation jumped {angle:.2f} rad"
+    HAND_TOO_FAST = "hand_too_fast", "the hand moved at {speed:.1f} m/s"
+    HAND_TURNS_TOO_FAST = "hand_turns_too_fast", "the hand turned at {speed:.0f} rad/s"
+    CONNECTION_LOST = "connection_lost", "connection lost"
+    LOOP_STALLED = "loop_stalled", "the control loop stood still for {duration:.3f} s"
+    NODE_STALLED = "node_stalled", "this node stood still for {duration:.2f} s"
+    CLOCK_NOT_FINITE = "clock_not_finite", "the clock is not finite"
+    CLOCK_WENT_BACK = "clock_went_back", "the clock went back by {duration:.3f} s"
+    LINKED = "linked", "linked to {arm}: {cause}"
     # Obstacles to a request.
-    TOOL_UNKNOWN = "tool_unknown"
-    CONTROLS_HELD = "controls_held"
-    STOPPED = "stopped"
-    ALIGNING = "aligning"
-    CARRYING = "carrying"
-    ENGAGE_FIRST = "engage_first"
-    ONE_ARM = "one_arm"
-    OTHER_ARM_BUSY = "other_arm_busy"
-    TOOL_HELD_UP = "tool_held_up"
-    ARMS_MUST_HOLD = "arms_must_hold"
-    CONTROL_REFUSED = "control_refused"
-
+    TOOL_UNKNOWN = "tool_unknown", "the tool's pose is not known"
+    CONTROLS_HELD = "controls_held", "{controls} held since the hand was first heard of: let go first"
+    STOPPED = "stopped", "stopped, {control} goes on"
+    ALIGNING = "aligning", "an alignment is not over"
+    CARRYING = "carrying", "two arms carry"
+    ENGAGE_FIRST = "engage_first", "engage the arm first"
+    ONE_ARM = "one_arm", "this program drives one arm only"
+    OTHER_ARM_BUSY = "other_arm_busy", "the other arm is {state}"
+    TOOL_HELD_UP = "tool_held_up", "a tool is held up on the way to its target"
+    ARMS_MUST_HOLD = "arms_must_hold", "stance, axes and controls may be changed while both arms hold"
+    CONTROL_REFUSED = "control_refused", "{text}"
     # Obstacles that ROS nodes find; their text is in the detail.
-    NO_SUBSCRIBER = "no_subscriber"  # of an arm's targets
-    NO_TOOL_POSE = "no_tool_pose"
-    NO_TRANSFORM = "no_transform"
-    HAND_SILENT = "hand_silent"
-    SEVERAL_PUBLISHERS = "several_publishers"
-    CONTROLLER_REFUSES = "controller_refuses"
-    BAD_JOINT_STATES = "bad_joint_states"
-
+    NO_SUBSCRIBER = "no_subscriber", "{text}"  # of an arm's targets
+    NO_TOOL_POSE = "no_tool_pose", "the tool's pose is not known: {text}"
+    NO_TRANSFORM = "no_transform", "no transform from {frame} to {world} on /tf"
+    HAND_SILENT = "hand_silent", "{text}"
+    SEVERAL_PUBLISHERS = "several_publishers", "{text}"
+    CONTROLLER_REFUSES = "controller_refuses", "{text}"
+    BAD_JOINT_STATES = "bad_joint_states", "{text}"
     # What supervision finds.
-    NO_STATES_YET = "no_states_yet"
-    STATES_SILENT = "states_silent"
-    STATE_NOT_FINITE = "state_not_finite"
-    STATE_JUMPED = "state_jumped"
-    JOINT_STATES = "joint_states"  # are not good, for the cause
-    OFF_REFERENCE = "off_reference"
-    TOO_CLOSE = "too_close"
-    LEFT_BEHIND = "left_behind"
-    RUN_ENDED = "run_ended"
-    STOP_SERVICE = "stop_service"
-    ACTIVATED = "activated"
-    HOMING_OUTCOME = "homing_outcome"
-    CONTROLLER_PHASE = "controller_phase"  # in which it follows no targets
-    CONTROLLER_PAUSED = "controller_paused"
-    ARMS_HOMING = "arms_homing"
-    ARMS_BRAKING = "arms_braking"
-    STREAM_AWAY = "stream_away"  # from the tool, where it begins or goes on
-    PUBLISHER_CHANGED = "publisher_changed"
-    TWO_PUBLISHERS = "two_publishers"
-    TARGETS_CEASED = "targets_ceased"
-    TARGETS_LINKED = "targets_linked"  # hold because those of the other arm do, for the cause
-    TARGET_LATE = "target_late"
-    TARGET_FRAME = "target_frame"
-    TARGET_NOT_A_POSE = "target_not_a_pose"
+    NO_STATES_YET = "no_states_yet", "no joint states yet{source}"
+    STATES_SILENT = "states_silent", "no joint states{source} for {age:.3f} s; allowed: {timeout:g}"
+    STATE_NOT_FINITE = (
+        "state_not_finite",
+        "measured {quantity} of {joint} = {value} for more than {bridged:g} ms; allowed: finite numbers",
+    )
+    STATE_JUMPED = "state_jumped", "{joint} jumped by {distance:.3f} rad"
+    JOINT_STATES = "joint_states", "joint states: {cause}"
+    OFF_REFERENCE = (
+        "off_reference",
+        "{joint} is {deviation:.3f} rad from its reference for {time:.1f} s; "
+        "allowed: {allowed:g} rad for {allowed_time:g} s",
+    )
+    TOO_CLOSE = (
+        "too_close",
+        "measured: {pair} are {distance:.4f} m apart; "
+        "allowed: {allowed:.4f}, {key} {kept:g} less distance_tolerance {tolerance:g}",
+    )
+    LEFT_BEHIND = (
+        "left_behind",
+        "{arm}: the tool is {distance:.3f} m and {angle:.2f} rad from where it was led; begins anew where it is",
+    )
+    RUN_ENDED = "run_ended", "the run has ended"
+    STOP_SERVICE = "stop_service", "stopped by ~/stop; ~/reset activates again"
+    ACTIVATED = "activated", "active: the reference starts at the measured posture"
+    HOMING_OUTCOME = "homing_outcome", "homing ended: {cause}"
+    CONTROLLER_PHASE = "controller_phase", "the controller is {phase}"  # in which it follows no targets
+    CONTROLLER_PAUSED = "controller_paused", "the controller is paused"
+    ARMS_HOMING = "arms_homing", "the arms are on their way home"
+    ARMS_BRAKING = "arms_braking", "the arms are braking"
+    STREAM_AWAY = (
+        "stream_away",
+        "the stream is {distance:.3f} m and {angle:.2f} rad from the tool; to be followed it has to begin anew "
+        "within {engage_distance:g} m and {engage_angle:g} rad",
+    )
+    PUBLISHER_CHANGED = "publisher_changed", "another publisher took over{source}; the targets have to begin anew"
+    TWO_PUBLISHERS = "two_publishers", "two publishers at a time{source}; allowed: one"
+    TARGETS_CEASED = "targets_ceased", "{arm}: targets{source} have ceased, the arm holds"
+    TARGETS_LINKED = "targets_linked", "{arm}: the arm holds because it is linked to {other}: {cause}"
+    TARGET_LATE = "target_late", "{late:.2f} s late; its sender or this node stood still"
+    TARGET_FRAME = "target_frame", "frame_id {frame!r}; allowed: {allowed!r}"
+    TARGET_NOT_A_POSE = "target_not_a_pose", "not a finite pose with a unit quaternion"
+    OTHER = "other", "{text}"  # a sentence made elsewhere, which nothing decides by
 
-    OTHER = "other"  # a sentence made elsewhere, which nothing decides by
 
-
-REFUSALS = frozenset(
-    {
-        *(ReasonKind.NOT_ENGAGED, ReasonKind.NOT_HOMING, ReasonKind.NOT_CARRIED),
-        *(ReasonKind.NOT_CHANGED, ReasonKind.NO_RECORDING, ReasonKind.RECORDING_ENDED, ReasonKind.NO_EPISODE),
-    }
-)
+_K = ReasonKind
+_NOT_DONE = {_K.NOT_ENGAGED, _K.NOT_HOMING, _K.NOT_CARRIED, _K.NOT_CHANGED}
+REFUSALS = frozenset({*_NOT_DONE, _K.NO_RECORDING, _K.RECORDING_ENDED, _K.NO_EPISODE})
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +163,7 @@ class Reason:
 
     @classmethod
     def of(cls, kind: ReasonKind, cause: Reason | None = None, **detail: Any) -> Reason:
-        """The reason of this ``kind`` with its ``detail`` by name."""
+        """With its ``detail`` by name."""
         return cls(kind, detail, cause)
 
     @classmethod
@@ -157,7 +173,6 @@ class Reason:
 
     @property
     def root(self) -> Reason:
-        """The first cause."""
         return self if self.cause is None else self.cause.root
 
     def as_json(self) -> dict[str, Any]:
@@ -188,7 +203,6 @@ class Event:
 
     @property
     def kind(self) -> ReasonKind:
-        """The kind of its reason."""
         return self.reason.kind
 
     def as_json(self) -> dict[str, Any]:

@@ -19,17 +19,15 @@ Array = npt.NDArray[np.float64]
 
 SIDES = ("left", "right")
 Interval = tuple[float, float]  # least and greatest
-# Position [m] and quaternion x y z w, in floats: for what is done with poses at every tick.
-Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]  # position [m], quaternion x y z w
 ALL_OF_THE_WAY: Interval = (0.0, 1.0)  # of a gripper's opening, 0 closed .. 1 fully open
 
 LONGEST_DT = 0.1  # [s] of a tick; after a longer gap nothing moves further than in this time
-
 _IDENTITY = pin.SE3.Identity()
 
 
 def pose_of(rotation: Array, translation: Array) -> pin.SE3:
-    """The pose of a rotation (3, 3) and a translation (3,) [m], in half the time that ``pin.SE3`` takes."""
+    """The pose of a rotation (3, 3) and a translation (3,) [m], faster than ``pin.SE3``."""
     pose = _IDENTITY.copy()
     pose.rotation, pose.translation = rotation, translation
     return pose
@@ -59,7 +57,7 @@ class HandInputs:
 
 @dataclass(frozen=True, slots=True)
 class DeviceControls:
-    """The buttons and axes that each hand of an input device has, by the names of :class:`HandInputs`."""
+    """Buttons and axes of each hand of an input device, by the names of :class:`HandInputs`."""
 
     buttons: tuple[str, ...]
     axes: tuple[str, ...]
@@ -82,8 +80,7 @@ class HandFault(StrEnum):
 class HandSample:
     """One reading of one hand. Numbers are as received: nothing has been checked or normalised yet.
 
-    Pose and inputs travel in separate messages; each sample carries the newest of both with its own receipt time, so
-    that a stream that stops is noticed even while the other goes on.
+    Pose and inputs travel in separate messages. Each has its own receipt time, so that a stream that stops is noticed.
     """
 
     hand: str
@@ -104,7 +101,7 @@ class HapticFeedback:
     amplitude: float
 
 
-@dataclass(slots=True)  # not frozen, as all that every tick makes anew: that would cost up to half a microsecond
+@dataclass(slots=True)
 class RobotState:
     """Measurements of the plant, in the joint order of ``Robot.model``."""
 
@@ -123,7 +120,7 @@ class CommandMode(StrEnum):
     TORQUE = "torque"
 
 
-@dataclass(slots=True)  # not frozen, as above
+@dataclass(slots=True)
 class Command:
     """A command to the plant, in the joint order of ``Robot.model``."""
 
@@ -160,7 +157,7 @@ class ActiveLimit(NamedTuple):
     names: tuple[str, ...]  # of the joint, or of both geometries of a pair
 
 
-@dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
+@dataclass(slots=True)
 class StepReport:
     """Outcome and reasons of one control tick. Distances in metres, joints by name."""
 
@@ -178,13 +175,12 @@ class StepReport:
     unsolved: int = 0  # bit i: the QP of substep i had no solution, or too late, and the stop went on
 
 
-@dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
+@dataclass(slots=True)
 class Reference:
     """Joint motion that the QP allows, once per tick.
 
-    Within a substep of the controller (``max_substep``) acceleration is constant, but in one of a stop, where a joint
-    may come to rest in between. So ``a`` leads from the last tick's velocity to ``v``, while ``q`` is not in general
-    where that acceleration alone would lead.
+    ``a`` leads from the last tick's velocity to ``v``, but ``q`` is not in general where it alone would lead, since
+    acceleration changes between substeps.
     """
 
     q: Array  # (nv,) [rad]
@@ -193,7 +189,7 @@ class Reference:
     report: StepReport
 
 
-@dataclass(slots=True)  # not frozen, as above
+@dataclass(slots=True)
 class ArmTarget:
     """The teleop layer's target for one arm."""
 
@@ -201,12 +197,12 @@ class ArmTarget:
     gripper: float  # opening, 0 closed .. 1 fully open
     slip: float = 0.0  # how far the target has slipped along with a tool held up, since engaging [m]
     slip_angle: float = 0.0  # the same of the rotation [rad]
-    offset: Array | None = None  # (3,) of the tool, see teleop.steady_state_offset [m]; None: none
+    offset: Array | None = None  # (3,) of the tool, from its command [m]; None: none
     filtered_hand: Pose | None = None  # the pose of its hand, filtered, that the target is made of
 
     @property
     def hand(self) -> pin.SE3 | None:
-        """``filtered_hand`` for those who ask for more than floats."""
+        """``filtered_hand`` as a pose."""
         if self.filtered_hand is None:
             return None
         position, quaternion = self.filtered_hand

@@ -1,13 +1,11 @@
 """Compliance in position mode: the measured wrench displaces the target that the QP follows.
 
-In the tick it stands between teleop and control:  target -> Admittance.update -> displaced target -> QP.  The QP keeps
-every limit and distance whatever is asked of it, so the displacement needs no bounds but those for the operator's
-sake. Only the QP sees the displaced target: recordings and the teleop layer go on with the operator's own.
+The QP keeps every limit and distance whatever is asked of it, so the displacement needs no bounds but those for the
+operator's sake. Only the QP sees the displaced target: recordings and the teleop layer go on with the operator's own.
 
-The law and its reasons stand in admittance_law.py. What the tool shows is the admittance in series with the servos
-below it: a tool held by soft servos moves by their own give besides. Against a stiff body the loop closes through QP
-and servos with their delay: with the defaults a simulated arm leans quietly on 10 kN/m, and on 30 kN/m with twice the
-damping ratio or four times the mass. What the tool carries without its model knowing counts as a push downwards.
+The tool shows the admittance in series with the servos below it. Against a stiff body the loop closes through QP and
+servos with their delay: with the defaults a simulated arm leans quietly on 10 kN/m, and on 30 kN/m with twice the
+damping ratio or four times the mass. A load that the model does not know counts as a push downwards.
 """
 
 from __future__ import annotations
@@ -25,9 +23,9 @@ from q2r2_control.robot.robot import Arm, Robot
 from q2r2_control.types import Array, RobotState
 
 _METRES = np.array([1.0, 1.0, 1.0, *[ROTATION_LENGTH] * 3])
-# Of J with rotations times ROTATION_LENGTH: a direction below it counts as singular, since a torque error of 0.1 Nm
-# is worth 2 N there [m].
+# Of J, in metres throughout: below it a direction counts as singular. A torque error of 0.1 Nm is worth 2 N there [m].
 _SINGULAR = 0.05
+_NOTHING = 1e-9  # below it a displacement counts as over [m, rad, per second]
 
 
 def estimate_wrench(J: Array, tau: Array) -> Array:
@@ -65,7 +63,7 @@ def oscillate(x: Array, v: Array, frequency: float, damping_ratio: float, dt: fl
     """Exact x and v after ``dt`` [s] of  x'' + 2 xi w x' + w^2 x = 0,  w the undamped ``frequency`` [rad/s]."""
     fall = damping_ratio * frequency
     spread = frequency * math.sqrt(abs(damping_ratio**2 - 1.0))
-    # e^-fall t times cos or cosh, and sin or sinh over spread; written so that nothing overflows.
+    # e^-fall t times cos or cosh, and sin or sinh over spread, without overflow.
     if spread * dt < 1e-6:
         cosine = math.exp(-fall * dt)
         sine = cosine * dt
@@ -77,10 +75,6 @@ def oscillate(x: Array, v: Array, frequency: float, damping_ratio: float, dt: fl
         cosine = 0.5 * (slow + fast)
         sine = 0.5 * (slow - fast) / spread
     return (cosine + fall * sine) * x + sine * v, (cosine - fall * sine) * v - frequency**2 * sine * x
-
-
-# Below it a displacement counts as over [m, rad, per second].
-_NOTHING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +115,7 @@ class Admittance:
         ``state.tau_external`` (nv,) is J' F of the wrench F that the environment exerts on the tool; None counts as
         no touch. With no touch and the last displacement gone the targets come back as they are.
 
-        An arm whose target is missing or None is not displaced, and its displacement ends at once: the arm holds where
-        it is, and a new target, which starts where the tool is, must not be displaced by what is there already.
+        The displacement of an arm whose target is missing or None ends at once: a new target starts where the tool is.
         Torques or a posture that are not finite hold the last wrench; a dt that is not positive and finite moves
         nothing; the report says so. A target that is not finite stays so, for the controller to refuse.
         """
@@ -170,6 +163,5 @@ class Admittance:
             away, v[part] = oscillate(x[part] - rest, v[part], math.sqrt(stiffness / inertia), law.damping_ratio, dt)
             x[part], v[part] = stop_at_limit(rest + away, v[part], limit)
             pushed |= bool(rest.any())
-        over = not pushed and np.abs(x).max() < _NOTHING and np.abs(v).max() < _NOTHING
-        if over or not follows:
+        if not follows or (not pushed and max(np.abs(x).max(), np.abs(v).max()) < _NOTHING):
             x[:], v[:] = 0.0, 0.0

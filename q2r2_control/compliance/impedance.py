@@ -6,15 +6,14 @@ e is the way from the measured tool to that of the reference, e' the difference 
 of :func:`inertia_and_damping`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
 
 **Feed-forward M a_r.** Seen from the tool an arm weighs what its rotors weigh geared up, 20 to 140 kg for a robot of
-22 kg. Without feed-forward the spring would have to give the force for every acceleration and would have to yield for
-it, 30 mm at 1 m/s^2; with it the spring bears only what the model does not know, and may be soft. It vanishes with the
-reference's acceleration, so that it does nothing to the stiffness that a push at rest feels.
+22 kg. Without feed-forward the spring would have to yield for every acceleration, 30 mm at 1 m/s^2; with it the spring
+bears only what the model does not know, and may be soft. A push at rest feels none of it.
 
 **Torque rate.** A full stop at 10 rad/s^2 takes 70 Nm more in a joint that moves the whole arm. As long as the torque
 rises to that the tool leaves the reference, and with it the distances that the reference keeps.
 
-**Payload.** What grippers hold is part of M, C and g while they do. Its mass comes and goes on a straight line over
-0.3 s, so that no torque jumps.
+**Payload.** A held object is part of M, C and g. Its mass comes and goes on a straight line over 0.3 s, so that no
+torque jumps.
 
 **Time.** A reference is due at the end of its tick, the state is measured at its start. So the spring is about the
 reference of the tick before, which is due now, while the acceleration is the one that leads to the newest.
@@ -50,9 +49,9 @@ from q2r2_control.types import LONGEST_DT, Array, Reference, RobotState
 _PAYLOAD_TIME = 0.3  # over which a payload's mass comes or goes [s]
 
 
-@dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
+@dataclass(slots=True)
 class ImpedanceReport:
-    """What one tick did and why. Joints and arms by name."""
+    """Outcome of one tick. Joints and arms by name."""
 
     errors: dict[str, Array]  # arm -> (6,) way to the reference after clipping [m, rad], world axes
     clipped: tuple[str, ...]  # arms that are further from their reference than the clip allows
@@ -79,33 +78,22 @@ class ImpedanceController:
     """
 
     def __init__(self, robot: Robot, settings: ImpedanceSettings | None = None) -> None:
-        self.robot = robot
-        self.settings = settings or ImpedanceSettings()
-        self._arms = tuple(robot.arms)
-        self._limit = self.settings.torque_scale * robot.torque_limit
+        self.robot, self._arms = robot, tuple(robot.arms)
+        self.settings = settings = settings or ImpedanceSettings()
+        self._limit = settings.torque_scale * robot.torque_limit
         self._payloads = {arm: held for arm, held in robot.objects.by_arm.items() if held.config.mass > 0.0}
         self._borne = dict.fromkeys(self._payloads, 0.0)  # share of each payload's mass
         self._wanted_borne = dict(self._borne)
-        settings = self.settings
-        model = ImpedanceModel(
-            chain=chain_of(robot.model),
-            tools=tools_of(robot),
-            limits=PositionLimits(
-                lower=robot.position_lower,
-                upper=robot.position_upper,
-                stiffness=settings.limit_stiffness,
-                damping=settings.limit_damping,
-                distance=settings.limit_distance,
-            ),
-            largest_error=np.array([settings.max_position_error, settings.max_rotation_error]),
-        )
+        spring = settings.limit_stiffness, settings.limit_damping, settings.limit_distance
+        limits = PositionLimits(robot.position_lower, robot.position_upper, *spring)
+        largest_error = np.array([settings.max_position_error, settings.max_rotation_error])
+        model = ImpedanceModel(chain_of(robot.model), tools_of(robot), limits, largest_error)
         values = [float(getattr(settings, name)) for name in LIVE_IMPEDANCE]
         self._springs = np.tile(values, (len(self._arms), 1))  # in force
         self._kernel_data = ImpedanceData.empty(model, self._springs)
         self._pointers = pointer_to(model), pointer_to(self._kernel_data)
         self._impedance_torque = bound(impedance_torque, *self._pointers)
-        # A copy, to which payloads are added.
-        self._model = robot.model.copy()
+        self._model = robot.model.copy()  # to which payloads are added
         self._pinocchio_data = self._model.createData()
         self._wanted_springs = self._springs.copy()  # at the end of a ramp
         self._ramp_rate = np.zeros_like(self._springs)
@@ -155,16 +143,14 @@ class ImpedanceController:
     def change(self, values: Mapping[str, float], arm: str | None = None) -> None:
         """Go by other stiffness and damping of one arm or of all, by name as in ``LIVE_IMPEDANCE``.
 
-        On a straight line over ``ramp_time``, and no jump: stiffness is energy in a spring that is stretched. The
-        damping follows the stiffness, so that a damping ratio stays that is not changed itself. Raises
+        On a straight line over ``ramp_time``, since stiffness is energy in a spring that is stretched. Raises
         :class:`ConfigError`, and changes nothing, for another name, a value out of range or an arm that does not exist.
         """
         if arm is not None and arm not in self._arms:
             raise ConfigError(f"impedance: no arm {arm!r:.40}; arms: {', '.join(self._arms)}")
-        for name, value in values.items():
-            if name not in LIVE_IMPEDANCE:
-                allowed = ", ".join(LIVE_IMPEDANCE)
-                raise ConfigError(f"impedance: {name} = {value!r:.40}: while a controller runs: {allowed}")
+        for name in values.keys() - set(LIVE_IMPEDANCE):
+            allowed = ", ".join(LIVE_IMPEDANCE)
+            raise ConfigError(f"impedance: {name} = {values[name]!r:.40}: while a controller runs: {allowed}")
         try:
             ImpedanceSettings.model_validate(dict(values), strict=True)
         except ValidationError as error:
@@ -191,39 +177,30 @@ class ImpedanceController:
         """
         time = min(float(dt), LONGEST_DT) if dt > 0.0 else 0.0
         if self._ramping:
-            self._ramp(time)
+            reach, springs = self._ramp_rate * time, self._springs
+            springs[:] += np.minimum(np.maximum(self._wanted_springs - springs, -reach), reach)
+            self._ramping = bool((springs != self._wanted_springs).any())
         if self._borne != self._wanted_borne:
             self._bear(time / _PAYLOAD_TIME)
-        a = self._next_reference(reference)
+        data, due, a = self._kernel_data, self._due, reference.a
+        data.wanted[:] = due
+        if plausible(reference.q, reference.v, reference.a):
+            due[0], due[1] = reference.q, reference.v
+        else:
+            due[1], a = 0.0, np.zeros(len(self._limit))
         usable = plausible(state.q, state.v) and (extra is None or plausible(extra))
         if usable and self._law(state, a):
-            data = self._kernel_data
             self._usable_q = state.q.copy()
             torque = data.torque if extra is None else data.torque + extra
-            report = ImpedanceReport(
-                errors=dict(zip(self._arms, data.error.copy(), strict=True)),
-                clipped=_those(self._arms, data.clipped),
-                saturated=(),
-                rate_limited=(),
-                repelled=_those(self.robot.joint_names, data.repulsion),
-                held=False,
-            )
+            errors = dict(zip(self._arms, data.error.copy(), strict=True))
+            clipped, repelled = _those(self._arms, data.clipped), _those(self.robot.joint_names, data.repulsion)
+            report = ImpedanceReport(errors, clipped, (), (), repelled, held=False)
         else:
             torque, report = self.gravity(self._usable_q), ImpedanceReport({}, (), (), (), (), held=True)
         change = self.settings.torque_rate_limit * time
         self._commanded, saturated, late = bound_torque(torque, self._commanded, self._limit, change)
         report.saturated, report.rate_limited = (_those(self.robot.joint_names, which) for which in (saturated, late))
         return TorqueCommand(self._commanded.copy(), report)
-
-    def _next_reference(self, newest: Reference) -> Array:
-        """Let posture and speed that are due now be wanted, keep the ``newest``, and return its acceleration."""
-        wanted, due = self._kernel_data.wanted, self._due
-        wanted[:] = due
-        if not plausible(newest.q, newest.v, newest.a):
-            due[1] = 0.0
-            return np.zeros(len(self._limit))
-        due[0], due[1] = newest.q, newest.v
-        return newest.a
 
     def _law(self, state: RobotState, a: Array) -> bool:
         """Torque of springs, postures and feed-forward, without bounds; False where no number comes of it."""
@@ -236,12 +213,6 @@ class ImpedanceController:
         except np.linalg.LinAlgError:
             return False
 
-    def _ramp(self, time: float) -> None:
-        reach, springs = self._ramp_rate * time, self._springs
-        springs[:] += np.minimum(np.maximum(self._wanted_springs - springs, -reach), reach)
-        self._ramping = bool((springs != self._wanted_springs).any())
-
 
 def _those(names: tuple[str, ...], which: BoolArray | Array) -> tuple[str, ...]:
-    """The names at which ``which`` is not 0."""
     return tuple(compress(names, which.tolist()))

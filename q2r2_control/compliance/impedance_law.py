@@ -2,7 +2,6 @@
 
 Task vectors (6,) are linear, then angular, in world axes at the tool's origin; J (6, n) is that Jacobian of an arm's n
 joints, M (n, n) their inertia. Stiffness [N/m, Nm/rad], damping [Ns/m, Nms/rad], task inertia [kg, kg m^2].
-:class:`ImpedanceController` calls them. They are NumPy, compiled, which takes a third of the time.
 """
 
 from __future__ import annotations
@@ -69,8 +68,8 @@ def inertia_and_damping(mobility: Array, stiffness: Array) -> tuple[Array, Array
     K^1/2 J M^-1 J' K^1/2 = U diag(lambda) U' gives Q' = K^1/2 U diag(lambda)^-1/2, and with it Lambda = Q' Q.
 
     Near a singular posture some lambda vanishes, and Lambda and the damping force would grow without bound. There
-    lambda, the square of a mode's frequency, is raised to that of 1000 kg. All others stay exact, other than with a
-    damping term on the diagonal, which would make the projector that is built with Lambda leak everywhere.
+    lambda, the square of a mode's frequency, is raised to that of 1000 kg. All others stay exact; a damping term on the
+    diagonal would make the projector that is built with Lambda leak everywhere.
     """
     root = np.sqrt(stiffness)
     values, vectors = np.linalg.eigh(mobility * np.outer(root, root))
@@ -86,16 +85,6 @@ def consistent_force(inertia: Array, J: Array, M_inverse: Array, torque: Array) 
     N = I - J' Lambda J M^-1 (Khatib 1987, eq. 51).
     """
     return inertia @ (J @ (M_inverse @ torque))
-
-
-@numpy_kernel
-def posture_torque(inertia: Array, way: Array, speed: Array, stiffness: float, damping_ratio: float) -> Array:
-    """Torque (n,) towards a posture that is ``way`` (n,) [rad] off and moves by ``speed`` (n,) [rad/s] faster.
-
-    Each joint's damping has the ratio for the ``inertia`` (n,) that it moves by itself.
-    """
-    damping = 2.0 * damping_ratio * np.sqrt(stiffness * inertia)
-    return stiffness * way + damping * speed
 
 
 class ImpedanceModel(NamedTuple):
@@ -165,8 +154,9 @@ def impedance_torque(model_pointer: KernelPointer, data_pointer: KernelPointer) 
         stiffness = np.repeat(values[:2], 3)
         inertia, damping = inertia_and_damping(J @ M_inverse @ J.T, stiffness)
         force = stiffness * data.error[i] + values[2] * (damping @ (data.wanted_twist[i] - J @ v))
-        posture = posture_torque(own_inertia, wanted_q - q, wanted_v - v, values[3], values[4])
-        posture *= model.tools.member[i]
+        # Each joint's damping has the ratio for the inertia that it moves by itself.
+        posture_damping = 2.0 * values[4] * np.sqrt(values[3] * own_inertia)
+        posture = (values[3] * (wanted_q - q) + posture_damping * (wanted_v - v)) * model.tools.member[i]
         force -= consistent_force(inertia, J, M_inverse, posture)
         data.torque[:] += posture + J.T @ force
     data.repulsion[:] = limit_repulsion(model.limits, q, v, wanted_q)
@@ -210,9 +200,8 @@ def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array) -
 def bound_torque(tau: Array, last: Array, limit: Array, change: float) -> tuple[Array, BoolArray, BoolArray]:
     """``tau`` (nv,) within +-``limit`` (nv,) and no further than ``change`` from ``last`` (nv,), all [Nm].
 
-    First the torque is saturated, then it approaches what remains by at most ``change``. Both bounds hold afterwards
-    whenever ``last`` is within the limit: the result lies between ``last`` and the saturated torque, hence within the
-    limit too. The other two (nv,) say which joints were saturated and which could not change fast enough.
+    Both bounds hold whenever ``last`` is within the limit: the result lies between ``last`` and the saturated torque,
+    hence within the limit too. The other two (nv,) say which joints were saturated, which could not change fast enough.
     """
     within = np.minimum(np.maximum(tau, -limit), limit)
     bounded = np.minimum(np.maximum(within, last - change), last + change)

@@ -2,16 +2,36 @@
 
 In the tick it comes after the QP, beside the impedance:  tau = impedance + gravity and Coriolis + wall,  from the
 measured q and v of the same tick and before torques are saturated. The reference keeps its distances by itself; an arm
-that is pushed away from it meets this wall. The law, and why it is stable, stands in repulsion_kernels.py.
+that is pushed away from it meets this wall.
+
+**The law.** Each monitored pair closer by the depth x than the distance that it keeps presses itself apart with
+
+    F = min(k x, F_max) - c(x) d',    clipped to [0, F_max],    tau += (dd/dq)' F,
+
+d' the rate of distance, c the damping of ratio xi at the pair's effective mass m = 1 / (g' M^-1 g), g = dd/dq
+(Khatib, IJRR 1987), rising from 0 to its value in the first two millimetres. So the torque is continuous in q and v,
+never pulls two bodies together, and its elastic part is the gradient of  U = sum k x^2 / 2:  the wall gives back at
+most what was put in. Distances are those of smooth_distance.py, so that bodies that lie along each other do not make
+the torque switch from end to end.
+
+**Why many pairs do not add up to an unstable stiffness.** All pairs act through the same joints. With K = sum k g g'
+and D = sum c g g' the fastest mode of M^-1 K is no faster than the trace, sum k / m, and that of M^-1 D no faster than
+sum c / m. Held over a period h, a mode with stiffness w^2 and damping 2 z is stable exactly when
+h w^2 / 2 < 2 z < 2 / h  (Colgate and Schenkel, 1997, for the lower bound). With T = 2 ms, the longest period, the
+stiffness of all pairs is scaled down together where sum k / m would exceed 0.25 / T^2, and the damping where
+sum c / m would exceed 0.5 / T, a quarter of what is stable: enough for one period of delay and for masses wrong by a
+factor of two. Then c > h k / 2 for every pair while no more than 16 are scaled down together, but for the first
+hundredths of a millimetre, where c is still rising. A pair's share in the sums fades in over two millimetres outside
+the shell, so that the scale does not jump. It only makes the wall softer; where it acts (never for two iiwa 7 with the
+default stiffness) the torque is the gradient of U but for the scale's own slope.
 
 **What it can take.** d_min is the distance that a pair keeps. At rest a force of k d_min or F_max, whichever is less.
 In motion it takes up at most the energy F_max d_min for each pair, beside what the joints take; bodies that meet with
 more than that are slowed down, but touch. So fingers that may come within a millimetre touch at a push of 10 N.
 
-**Fingers** are the same bodies here as in the controller, at the openings that it has accepted: a wall around all of
-their way would push the arms out of postures that the reference may take. A body that has grown meets no pair at the
-reference, and what it makes the wall push where the arm is elsewhere comes at the rate of torques that the impedance
-allows.
+**Fingers** are the same bodies as in the controller, at the openings that it has accepted: a wall around all of their
+way would push the arms out of postures that the reference may take. A body that has grown meets no pair at the
+reference; elsewhere its push comes at the rate of torques that the impedance allows.
 """
 
 from __future__ import annotations
@@ -19,19 +39,28 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.repulsion_kernels import RepulsionData, RepulsionModel, find_near, repulsion_torque
 from q2r2_control.config.control import ControllerSettings, WallSettings
-from q2r2_control.control.geometry.collision import collision_model_of
+from q2r2_control.control.cholesky import factorise
+from q2r2_control.control.geometry.closest_points import clamp
+from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, collision_model_of, update_placements
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
-from q2r2_control.control.jit import bound, pointer_to
+from q2r2_control.control.geometry.kinematics import IntArray
+from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_smooth
+from q2r2_control.control.jit import KernelPointer, bound, kernel, pointee, pointer_to
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval
 
+_LONGEST_PERIOD = 0.002  # T [s]
+_STIFFEST = 0.25 / _LONGEST_PERIOD**2  # of sum k / m [1/s^2]
+_MOST_DAMPED = 0.5 / _LONGEST_PERIOD  # of sum c / m [1/s]
+_BAND = 0.002  # over which damping fades in inside the shell, and a pair's share in the sums outside it [m]
+_IMMOBILE = 1e-9  # [1/kg]
 # Of the sum of radii and the distance that a pair keeps: the smoothing length of distances, 0.3 mm of error at most.
 _SMOOTHING = 0.07
 # Cores closer than this part of the radii are measured as they are: so deep, the smoothing would weaken the force.
@@ -40,9 +69,131 @@ _DEEP = 0.25
 _SOFT = 0.5
 
 
-@dataclass(slots=True)  # not frozen: that would cost half a microsecond a tick
+class RepulsionModel(NamedTuple):
+    """What does not change between ticks."""
+
+    collision: CollisionModel
+    smoothing: Array  # (p,) [m^2]
+    deep: Array  # (p,) distance from which it is measured as it is [m]
+    shell: Array  # (p,) distance that the pair keeps [m]
+    stiffness: float  # [N/m]
+    damping_ratio: float
+    maximum_force: float  # [N]
+
+
+class RepulsionData(NamedTuple):
+    """One tick's measurement and arrays written anew."""
+
+    measured: Array  # (2, nv) q and v
+    M: Array  # (nv, nv) mass matrix, read from its upper triangle; overwritten
+    collision: CollisionData  # at q
+    near: IntArray  # (p,) pairs in the shell or just outside
+    depth: Array  # (p,) of them [m]
+    rows: Array  # (p, nv) gradients of their distances
+    mobility: Array  # (p,) 1 / m [1/kg]
+    force: Array  # (p,) [N]
+    row: Array  # (nv,)
+    tau: Array  # (nv,)
+
+    @classmethod
+    def empty(cls, model: RepulsionModel) -> RepulsionData:
+        pairs, nv = len(model.collision.pairs.first), len(model.collision.chain.parent) - 1
+        return cls(
+            measured=np.zeros((2, nv)),
+            M=np.eye(nv),
+            collision=CollisionData.empty(model.collision),
+            near=np.zeros(pairs, dtype=np.int64),
+            depth=np.zeros(pairs),
+            rows=np.zeros((pairs, nv)),
+            mobility=np.zeros(pairs),
+            force=np.zeros(pairs),
+            row=np.zeros(nv),
+            tau=np.zeros(nv),
+        )
+
+
+@kernel
+def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tuple[int, int, float]:
+    """Depths and gradients of the pairs in the shell or just outside.
+
+    Returns how many these are, the closest pair of all and its distance; -1 where q or v is not finite.
+    """
+    model, data = pointee(model_pointer), pointee(data_pointer)
+    if not np.isfinite(data.measured.sum()):
+        return -1, 0, np.nan
+    update_placements(model.collision, data.collision, data.measured[0])
+    count, closest, least = 0, 0, np.inf
+    for p in range(model.collision.pairs.first.shape[0]):
+        if at_least(model.collision, data.collision, p) >= max(least, model.shell[p] + _BAND):
+            continue
+        distance = measure(model.collision, data.collision, p)
+        if distance < least:
+            least, closest = distance, p
+        # The smooth distance is no smaller.
+        if distance >= model.shell[p] + _BAND:
+            continue
+        if distance > model.deep[p]:
+            distance = measure_smooth(model.collision, data.collision, p, model.smoothing[p])
+        data.near[count] = p
+        data.depth[count] = model.shell[p] - distance
+        distance_row(model.collision, data.collision, p, data.rows[count])
+        count += 1
+    return count, closest, least
+
+
+@kernel
+def repulsion_torque(model_pointer: KernelPointer, data_pointer: KernelPointer, count: int) -> float:
+    """Add up the torques of the ``count`` pairs found near; returns the energy stored in the wall [J]."""
+    model, data, v = pointee(model_pointer), pointee(data_pointer), pointee(data_pointer).measured[1]
+    depth, mobility, force = data.depth, data.mobility, data.force
+    factorise(data.M)
+    total = 0.0
+    for i in range(count):
+        mobility[i] = _mobility(data.M, data.rows[i], data.row)
+        total += model.stiffness * mobility[i] * clamp(1.0 + depth[i] / _BAND, 0.0, 1.0)
+    stiffness = model.stiffness * min(1.0, _STIFFEST / max(total, _IMMOBILE))
+    total = 0.0
+    for i in range(count):
+        # c = 2 xi sqrt(k m), thus c / m = 2 xi sqrt(k / m)
+        share = clamp(depth[i] / _BAND, 0.0, 1.0)
+        total += share * 2.0 * model.damping_ratio * np.sqrt(stiffness * mobility[i])
+    damping = 2.0 * model.damping_ratio * min(1.0, _MOST_DAMPED / max(total, _IMMOBILE))
+    data.tau[:] = 0.0
+    energy = 0.0
+    softest = model.maximum_force / stiffness  # depth from which the force is constant
+    for i in range(count):
+        force[i] = 0.0
+        x = depth[i]
+        if x <= 0.0 or mobility[i] <= _IMMOBILE:
+            continue
+        rate = 0.0
+        for j in range(v.shape[0]):
+            rate += data.rows[i, j] * v[j]
+        elastic = stiffness * min(x, softest)
+        damped = damping * np.sqrt(stiffness / mobility[i]) * clamp(x / _BAND, 0.0, 1.0) * rate
+        force[i] = clamp(elastic - damped, 0.0, model.maximum_force)
+        energy += elastic * (x - 0.5 * min(x, softest))
+        for j in range(v.shape[0]):
+            data.tau[j] += force[i] * data.rows[i, j]
+    return energy
+
+
+@kernel
+def _mobility(factor: Array, row: Array, out: Array) -> float:
+    """Inverse of the effective mass along ``row``, g' M^-1 g = |L^-1 g|^2 [1/kg]."""
+    total = 0.0
+    for i in range(row.shape[0]):
+        value = row[i]
+        for k in range(i):
+            value -= factor[i, k] * out[k]
+        out[i] = value / factor[i, i]
+        total += out[i] * out[i]
+    return total
+
+
+@dataclass(slots=True)
 class WallReport:
-    """What the wall does in one tick."""
+    """The wall's action in one tick."""
 
     tau: Array  # (nv,) to be added to the commanded torque [Nm]
     pressing: tuple[tuple[str, str], ...]  # geometry names of the pairs that the wall pushes apart
@@ -67,22 +218,14 @@ class MeasuredSeparation:
         self._radii = radius[pairs.first] + radius[pairs.second]
         self._shell, self._smoothing, self._deep = (np.zeros_like(self._radii) for _ in range(3))
         self.set_kept_distances(kept_distances(robot, settings).values)
-        model = RepulsionModel(
-            collision=collision,
-            smoothing=self._smoothing,
-            deep=self._deep,
-            shell=self._shell,
-            stiffness=law.stiffness,
-            damping_ratio=law.damping_ratio,
-            maximum_force=law.maximum_force,
-        )
+        by_pair = self._smoothing, self._deep, self._shell
+        model = RepulsionModel(collision, *by_pair, law.stiffness, law.damping_ratio, law.maximum_force)
         self._fingers = FingerOpenings(robot, collision.bodies)
         self._kernel_data = RepulsionData.empty(model)
         self._measured = self._kernel_data.measured.reshape(-1)  # a view
         self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(self._kernel_data)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
-        indices = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
-        self._pair_names = [(names[first], names[second]) for first, second in indices]
+        self._pair_names = [(names[one], names[other]) for one, other in zip(pairs.first, pairs.second, strict=True)]
         # Every kernel runs once here, so that none is compiled in mid-motion.
         self._find_near = bound(find_near, self._model_pointer, self._data_pointer)
         self._repulsion_torque = bound(repulsion_torque, self._model_pointer, self._data_pointer, 0)
@@ -110,22 +253,17 @@ class MeasuredSeparation:
 
         Never raises because of a number: where one is not finite nothing can be known, and no torque is given.
         """
-        count, closest, distance = self._find(q, v)
+        np.concatenate((q, v), out=self._measured)
+        count, closest, distance = self._find_near(self._model_pointer, self._data_pointer)
         if count < 0:
             return WallReport(self._no_torque, (), 0.0, 0.0, ("", ""), math.nan)
-        energy = self._press(count) if count else 0.0
         pair = self._pair_names[closest] if self._pair_names else ("", "")
+        data, energy = self._kernel_data, 0.0
+        if count:
+            data.M[:] = pin.crba(self._model, self._data, data.measured[0])
+            energy = float(self._repulsion_torque(self._model_pointer, self._data_pointer, count))
         if not energy:
             return WallReport(self._no_torque, (), 0.0, 0.0, pair, distance)
-        force = self._kernel_data.force[:count]
-        pressing = tuple(self._pair_names[self._kernel_data.near[i]] for i in np.flatnonzero(force > 0.0))
-        return WallReport(self._kernel_data.tau.copy(), pressing, float(force.max()), energy, pair, distance)
-
-    def _find(self, q: Array, v: Array) -> tuple[int, int, float]:
-        np.concatenate((q, v), out=self._measured)
-        found: tuple[int, int, float] = self._find_near(self._model_pointer, self._data_pointer)
-        return found
-
-    def _press(self, count: int) -> float:
-        self._kernel_data.M[:] = pin.crba(self._model, self._data, self._kernel_data.measured[0])
-        return float(self._repulsion_torque(self._model_pointer, self._data_pointer, count))
+        force = data.force[:count]
+        pressing = tuple(self._pair_names[data.near[i]] for i in np.flatnonzero(force > 0.0))
+        return WallReport(data.tau.copy(), pressing, float(force.max()), energy, pair, distance)

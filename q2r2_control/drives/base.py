@@ -1,4 +1,4 @@
-"""What every mode of driving a plant has: from tool targets and a reference to a command."""
+"""Modes of driving a plant, by position, velocity or torque: from tool targets and a reference to a command."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Openings = dict[str, float]
 
 @dataclass(slots=True)
 class DriveReport:
-    """What the mode's own laws did in one tick; None for those of the other modes, or not enabled."""
+    """Outcome of the mode's own laws in one tick; None for those of the other modes, or not enabled."""
 
     impedance: ImpedanceReport | None = None
     wall: WallReport | None = None
@@ -33,7 +33,7 @@ class DriveReport:
 
 
 class Drive(ABC):
-    """One mode of driving a plant. What stops the arms is not decided here but in ``supervision``."""
+    """One mode of driving a plant."""
 
     mode: CommandMode
     report: DriveReport  # of the last tick
@@ -92,11 +92,11 @@ def holding_command(q: Array, grippers: Openings) -> Command:
     return Command(CommandMode.POSITION, q, zero, zero, grippers)
 
 
-# Velocity mode: how fast the measured position is brought back to the reference [1/s]. A plant that answers with a
-# delay T is stable below about 1 / T; at 10 /s that leaves 100 ms.
+# Of the way from the measured position back to the reference [1/s]. A plant that answers with a delay T is stable below
+# about 1 / T, here 100 ms.
 FEEDBACK_GAIN = 10.0
-# A measurement that did not change for more ticks than this is old: the arm has moved on since.
-_FRESH_TICKS = 3
+_FRESH_TICKS = 3  # a measurement that did not change for longer is old: the arm has moved on since
+_STILL = 1e-2  # of an arm on its spring [rad/s]
 
 
 class PositionDrive(Drive):
@@ -109,7 +109,6 @@ class PositionDrive(Drive):
         self.report = DriveReport()
 
     def reset(self, state: RobotState) -> None:
-        """See :meth:`Drive.reset`."""
         self.report = DriveReport()
         if self.admittance is None:
             return
@@ -118,7 +117,6 @@ class PositionDrive(Drive):
         self.admittance.reset()
 
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
-        """See :meth:`Drive.displaced`."""
         if self.admittance is None:
             return targets
         displaced = self.admittance.update(targets, state, dt)
@@ -128,15 +126,13 @@ class PositionDrive(Drive):
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
     ) -> Command:
-        """See :meth:`Drive.command`: what was measured does not matter."""
         return position_command(reference, grippers)
 
 
 class VelocityDrive(PositionDrive):
-    """The reference's velocity, and what brings the measured position back to it:  v = v_ref + k (q_ref - q).
+    """The reference's velocity, and feedback of the measured position:  v = v_ref + k (q_ref - q),  within the limits.
 
-    Within the velocity limits. Without a state to trust, or with one that is some ticks old, there is no feedback, so
-    that an old measurement does not drive the arms.
+    Without a state to trust, or with one that is some ticks old, there is no feedback.
     """
 
     mode = CommandMode.VELOCITY
@@ -148,14 +144,12 @@ class VelocityDrive(PositionDrive):
         self._stamp, self._ticks = -math.inf, 0  # of the newest state, and since then
 
     def reset(self, state: RobotState) -> None:
-        """See :meth:`Drive.reset`."""
         super().reset(state)
         self._stamp, self._ticks = state.stamp, 0
 
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
     ) -> Command:
-        """See :meth:`Drive.command`."""
         v = reference.v
         self._ticks = 0 if state.stamp != self._stamp else self._ticks + 1
         self._stamp = state.stamp
@@ -165,21 +159,17 @@ class VelocityDrive(PositionDrive):
         return Command(self.mode, reference.q, bounded, np.zeros_like(reference.q), grippers)
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        """See :meth:`Drive.last_command`: a velocity outlives its sender on many plants, so the last one is zero."""
+        # A velocity outlives its sender on many plants.
         zero = np.zeros_like(self._limit)
         return Command(self.mode, np.nan_to_num(state.q), zero, zero, grippers)
-
-
-_STILL = 1e-2  # of an arm on its spring [rad/s]
 
 
 class TorqueDrive(Drive):
     """Turns references into torques. Targets stay as they are: the spring is the compliance.
 
     **Without a state to trust.** A spring about a posture that was measured long ago could push anywhere. A plant with
-    position servos (``has_servos``), which measure by themselves, follows the reference by those, so that the arms come
-    to rest with it. Otherwise the command is gravity's torque at the newest measured posture: many drivers
-    repeat the last command for ever, and gravity's does no harm.
+    position servos (``has_servos``), which measure by themselves, follows the reference by those. Otherwise the command
+    is gravity's torque at the newest measured posture: many drivers repeat the last command for ever.
     """
 
     mode = CommandMode.TORQUE
@@ -193,33 +183,29 @@ class TorqueDrive(Drive):
         self._believed = self._reference = robot.home  # the last posture and reference (nv,) [rad]
 
     def reset(self, state: RobotState) -> None:
-        """See :meth:`Drive.reset`."""
         self.report = DriveReport()
         self._believed = self._reference = state.q
         self.impedance.reset(state)
 
     def set_openings(self, openings: Mapping[str, Interval]) -> None:
-        """See :meth:`Drive.set_openings`: the wall's fingers are the controller's."""
         self.wall.set_openings(openings)
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:
-        """See :meth:`Drive.set_holding`: the impedance bears it. The wall knows no objects: they may touch."""
         self.impedance.set_holding(holding)
 
     def set_kept_distances(self, kept: Array) -> None:
-        """See :meth:`Drive.set_kept_distances`: the wall begins there."""
         self.wall.set_kept_distances(kept)
 
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
     ) -> Command:
-        """See :meth:`Drive.command`. A state that is not finite is bridged with the last gravity torque."""
         self._reference = reference.q
         if not trusted:
             self.report = DriveReport()
             if self._has_servos:
                 return position_command(reference, grippers)
-            return Command(self.mode, reference.q, reference.v, self.gravity(self._posture(state)), grippers)
+            gravity = self.impedance.gravity(self._posture(state))
+            return Command(self.mode, reference.q, reference.v, gravity, grippers)
         wall = self.wall.update(state.q, state.v)
         torque = self.impedance.step(reference, state, dt, wall.tau)
         self.report = DriveReport(torque.report, wall)
@@ -227,21 +213,17 @@ class TorqueDrive(Drive):
             self._believed = state.q
         return Command(self.mode, reference.q, reference.v, torque.tau, grippers)
 
-    def gravity(self, q: Array) -> Array:
-        """What bears the arms at a posture ``q`` (nv,) [rad]: torques (nv,) [Nm]."""
-        return self.impedance.gravity(q)
-
     def at_rest(self, state: RobotState) -> bool:
-        """See :meth:`Drive.at_rest`. What cannot be seen is not waited for."""
+        # An unseen motion is not waited for.
         seen = np.isfinite(state.q).all() and np.isfinite(state.v).all()
         return not seen or float(np.abs(state.v).max()) <= _STILL
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        """See :meth:`Drive.last_command`: a torque that nobody renews holds nothing, position servos do."""
+        # A torque that nobody renews holds nothing, position servos do.
         if self._has_servos:
             return holding_command(state.q if np.isfinite(state.q).all() else self._reference, grippers)
         q = self._posture(state)
-        return Command(self.mode, q, np.zeros_like(q), self.gravity(q), grippers)
+        return Command(self.mode, q, np.zeros_like(q), self.impedance.gravity(q), grippers)
 
     def _posture(self, state: RobotState) -> Array:
         """The newest measured posture that was a posture."""

@@ -1,13 +1,15 @@
-"""One tick of control, from measured joints and targets to a command: the same for the pipeline and the ROS node."""
+"""One tick of control, from measured joints and targets to a command, and the conditions that a hand feels."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.compliance.admittance import estimate_wrench
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import Drive, DriveReport
 from q2r2_control.events import Reason
@@ -16,7 +18,8 @@ from q2r2_control.supervision.joint_watch import ExternalArms, WatchSettings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.types import Array, Command, Reference, RobotState
+from q2r2_control.teleop.haptics import ArmCondition
+from q2r2_control.types import Array, Command, LimitKind, Reference, RobotState, StepReport
 
 _PROVEN = Phase.ACTIVE, Phase.BRAKING  # in other phases no opening of a gripper is proven
 
@@ -37,8 +40,7 @@ class ControlLoop:
     """Supervision, controller, grippers and drive, in the order that one tick needs.
 
     In each tick: :meth:`pace`, :meth:`observe` for each measured state that came, and :meth:`step`. Times are the
-    caller's [s]. What an arm's gripper holds, and how far its fingers are open, is known before the controller's step,
-    since the step has to be proven with them.
+    caller's [s]. Held objects and finger openings are known before the controller's step, which is proven with them.
     """
 
     def __init__(
@@ -69,18 +71,13 @@ class ControlLoop:
         self._limiter: GripperLimiter | None = None  # while the controller's reference is where the arms are
         self._kept: Array = controller.kept_distances  # that the drive was told of [m]
         self.holding: dict[str, bool] = {}  # of each arm that has an object, whether its gripper holds it
-        self._granted: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and that was granted
+        self.granted_openings: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and granted
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
 
     @property
     def held_grippers(self) -> dict[str, tuple[str, str]]:
         """Arm -> pair of bodies that keeps its gripper from being commanded as wanted."""
         return {} if self._limiter is None else self._limiter.held
-
-    @property
-    def granted_openings(self) -> dict[str, tuple[float, float]]:
-        """Arm -> opening that was wanted last, and that was granted."""
-        return self._granted
 
     def pace(self, gap: float) -> float:
         """Time [s] for the reference to move by, ``gap`` [s] after the last tick; see :meth:`TickPacer.step`."""
@@ -99,7 +96,7 @@ class ControlLoop:
         self, arm: str, wanted: float, commanded: float, openings: Mapping[str, float], now: float
     ) -> None:
         """Let a gripper that was ``commanded`` to an opening by another program stay as it is."""
-        self._granted[arm] = wanted, commanded
+        self.granted_openings[arm] = wanted, commanded
         if self._limiter is not None:
             self._limiter.resume({arm: commanded}, openings, now)
 
@@ -115,11 +112,15 @@ class ControlLoop:
         """Move on by ``dt`` [s].
 
         ``state`` is the newest measured one, which was observed; ``targets`` are tool poses in the world frame, None:
-        the arm holds. An arm whose targets come as messages is not among them: :meth:`Supervisor.take_target` has got
-        those. ``grippers`` are wanted openings, ``openings`` the measured ones, 0 closed .. 1 fully open.
+        the arm holds. An arm whose targets come as messages is not among them. ``grippers`` are wanted openings,
+        ``openings`` the measured ones, 0 closed .. 1 fully open.
         """
-        supervisor = self.supervisor
-        refusals = self._update_targets(targets, now)
+        supervisor, refusals = self.supervisor, {}
+        for arm, pose in targets.items():
+            if pose is None:
+                supervisor.targets.release(arm)
+            elif refusal := supervisor.update_target(arm, pose, now):
+                refusals[arm] = refusal
         commanded = self.limit_grippers(grippers, openings, now)
         was_inactive = supervisor.phase is Phase.INACTIVE
         reference = supervisor.tick(now, dt)
@@ -142,13 +143,14 @@ class ControlLoop:
     ) -> dict[str, float]:
         """The openings to be commanded; also finds out whether the grippers hold something.
 
-        While the arms do not move, nothing is proven: a gripper gets what it wants, for instance to let go of
-        something. But one that was held does not go on in that direction because the arms were stopped.
+        While the arms do not move, nothing is proven: a gripper gets what it wants, for instance to let go. But one
+        that was held does not go on in that direction because the arms were stopped.
         """
         if not self._owns_plant and self.supervisor.phase not in _PROVEN:
             self._limiter, self.holding = None, {}
         if self._limiter is None:
-            commanded = {arm: without_proof(opening, self._granted.get(arm)) for arm, opening in wanted.items()}
+            granted = self.granted_openings
+            commanded = {arm: without_proof(opening, granted.get(arm)) for arm, opening in wanted.items()}
         else:
             commanded = self._limiter.limit(wanted, measured, now)
             if self._limiter.changed:
@@ -156,29 +158,20 @@ class ControlLoop:
             if self._grasps.update(commanded, measured, now):
                 self._tell_holding()
         for arm, opening in commanded.items():
-            self._granted[arm] = wanted[arm], opening
+            self.granted_openings[arm] = wanted[arm], opening
         return commanded
 
     def _tell_holding(self) -> None:
         self.holding = self.controller.holding
         self.drive.set_holding(self.holding)
 
-    def _update_targets(self, targets: Mapping[str, pin.SE3 | None], now: float) -> dict[str, Reason]:
-        refusals = {}
-        for arm, pose in targets.items():
-            if pose is None:
-                self.supervisor.targets.release(arm)
-            elif refusal := self.supervisor.update_target(arm, pose, now):
-                refusals[arm] = refusal
-        return refusals
-
     def _begin(self, state: RobotState, openings: Mapping[str, float], now: float) -> None:
-        """The controller was reset at ``state``: bodies and drive begin there too, with the weight of what is held."""
+        """The controller was reset at ``state``: bodies and drive begin there too, with the weight of held objects."""
         self._grasps.tell_again()
         self._limiter = GripperLimiter(self.controller, self._delay)
         self._tell_holding()
         self.drive.reset(state)
-        self._limiter.resume({arm: granted for arm, (_, granted) in self._granted.items()}, openings, now)
+        self._limiter.resume({arm: granted for arm, (_, granted) in self.granted_openings.items()}, openings, now)
         self._kept = self.controller.kept_distances
         self.drive.set_openings(self.controller.openings)
         self.drive.set_kept_distances(self._kept)
@@ -189,3 +182,42 @@ def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
     if before is None or before[0] == before[1]:
         return wanted
     return min(wanted, before[1]) if before[0] > before[1] else max(wanted, before[1])
+
+
+_LIMIT_LASTS = 0.5  # a joint counts as at its limit for so long after it last was: limits bind on and off [s]
+
+
+class ArmConditions:
+    """Looks at a controller and at what was measured. Times are the loop's [s]."""
+
+    def __init__(self, controller: CartesianController) -> None:
+        robot = controller.robot
+        self._controller, self._robot = controller, robot
+        self._data = robot.model.createData()
+        self._joints = {arm: {robot.joint_names[j] for j in robot.arms[arm].joints} for arm in robot.arms}
+        self._limited: dict[str, float] = {}  # when a joint last was at its position limit [s]
+
+    def note(self, report: StepReport, now: float) -> None:
+        """Remember which limits held up a step; of every tick."""
+        for kind, names in report.binding:
+            if kind is LimitKind.POSITION:
+                self._limited[names[0]] = now
+
+    def look(self, state: RobotState, now: float) -> Mapping[str, ArmCondition]:
+        """Of every arm, at ``now``."""
+        return {arm: self.look_at(arm, state, now) for arm in self._joints}
+
+    def look_at(self, arm: str, state: RobotState, now: float) -> ArmCondition:
+        """Of one arm, at ``now``; less often than every tick, since distances take their time."""
+        self._limited = {name: t for name, t in self._limited.items() if now - t <= _LIMIT_LASTS}
+        limited = frozenset(self._joints[arm] & self._limited.keys())
+        return ArmCondition(self._controller.spare_distance(arm), limited, self._contact_force(arm, state))
+
+    def _contact_force(self, arm: str, state: RobotState) -> float | None:
+        """As an admittance estimates it [N]; None where nothing is measured."""
+        if state.tau_external is None or not np.isfinite((state.tau_external, state.q)).all():
+            return None
+        chosen = self._robot.arms[arm]
+        J = pin.computeFrameJacobian(self._robot.model, self._data, state.q, chosen.frame_id, pin.LOCAL_WORLD_ALIGNED)
+        wrench = estimate_wrench(J[:, chosen.joints], state.tau_external[chosen.joints])
+        return math.hypot(*wrench[:3].tolist())

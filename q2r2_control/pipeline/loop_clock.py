@@ -48,20 +48,16 @@ class LoopClock:
         return time.monotonic() if self._realtime else self.now
 
     def wall_time(self) -> float:
-        """Real time since the run began [s], in simulated time too."""
+        """Real time since the run began [s]."""
         return time.perf_counter() - self._wall_start
 
 
 class PlantClock:
-    """A plant stamps its states by a clock of its own, and one that hangs repeats its last state.
-
-    That state is as old as the time that the plant was given since.
-    """
+    """Stamps a plant's states by the loop's clock; a repeated one is as old as the time that the plant got since."""
 
     def __init__(self, state: RobotState) -> None:
         """``state``: the first one."""
-        self._stamp = state.stamp
-        self._unanswered = 0.0  # time that the plant was given since it had a newer state [s]
+        self._stamp, self._unanswered = state.stamp, 0.0  # and the time given since it had a newer state [s]
 
     def give(self, dt: float) -> None:
         """The plant is let go on by ``dt`` [s]."""
@@ -72,5 +68,4 @@ class PlantClock:
         passed = state.stamp - self._stamp
         if passed != 0.0:
             self._stamp, self._unanswered = state.stamp, 0.0
-        # Written out, since dataclasses.replace takes three times as long.
         return RobotState(state.q, state.v, state.tau, state.tau_external, now - self._unanswered), passed

@@ -20,8 +20,7 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
 from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock
-from q2r2_control.pipeline.operator_side import OperatorSide
-from q2r2_control.pipeline.pending_requests import PendingRequests
+from q2r2_control.pipeline.operator_side import OperatorSide, PendingRequests
 from q2r2_control.pipeline.run_recorder import RunRecorder
 from q2r2_control.plants.base import Plant, check_mode, make_plant
 from q2r2_control.process.scheduling import few_garbage_collections, stop_on_signals
@@ -37,10 +36,8 @@ from q2r2_control.types import LONGEST_DT, ArmTarget, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
 STOPPING = "stopping"  # state of every arm while the run ends
-# Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
-_STOP_ALLOWANCE = 1.0  # [s]
+_STOP_ALLOWANCE = 1.0  # after full braking, for an arm that still recovers into its limits [s]
 _REST = 1e-6  # of the reference [rad/s]
-
 _logger = logging.getLogger(__name__)
 
 
@@ -53,12 +50,7 @@ class Pipeline:
     """
 
     def __init__(
-        self,
-        config: Config,
-        robot: Robot,
-        input: Input,
-        plant: Plant,
-        mode: CommandMode | str = CommandMode.POSITION,
+        self, config: Config, robot: Robot, input: Input, plant: Plant, mode: CommandMode | str = CommandMode.POSITION
     ) -> None:
         config.teleop.bindings.check_device(input.controls)
         self.config, self.robot, self.input, self.plant = config, robot, input, plant
@@ -92,7 +84,6 @@ class Pipeline:
 
     @property
     def supervisor(self) -> Supervisor:
-        """The supervisor of this run."""
         return self.loop.supervisor
 
     def stop(self) -> None:
@@ -167,10 +158,9 @@ class Pipeline:
         self.loop = ControlLoop(self.controller, self.drive, 1.0 / self.config.loop_rate_hz, streams, watch)
 
     def _begin(self, realtime: bool) -> None:
-        """Every run begins here, so that a benchmark can put its clocks into it."""
         self._following = True
         self._targets = {arm: ArmTarget(None, OPEN) for arm in self.robot.arms}
-        self._grippers = {arm: target.gripper for arm, target in self._targets.items()}  # commanded
+        self._grippers = dict.fromkeys(self.robot.arms, OPEN)  # commanded
         self.plant.reset()
         self._state = self.plant.state()  # the newest one
         self._clock = self.make_clock(realtime)
@@ -198,7 +188,7 @@ class Pipeline:
         self._bring_to_rest()
         if fault := self.supervisor.state_fault:
             raise PlantError(sentence(fault))
-        return self._recorder.summary(self._clock, self.loop.pacer)
+        return self._recorder.finish(self._clock, self.loop.pacer)
 
     def _bring_to_rest(self) -> None:
         """Tick without input and targets until all stands still; no fault of an input can prevent it."""
@@ -213,8 +203,7 @@ class Pipeline:
                 velocity = np.abs(self.tick().reference.v)
         finally:
             # From the last state that came: a plant that has lost its sensors still takes commands.
-            command = self.drive.last_command(self._state, self._grippers)
-            if command is not None:
+            if (command := self.drive.last_command(self._state, self._grippers)) is not None:
                 self.plant.apply(command)
 
     def tick(self) -> Tick:
@@ -266,18 +255,14 @@ class Pipeline:
             admittance=step.report.admittance,
         )
         if self._following:
-            self._operator.feedback.update(tick)
+            self._operator.vibrate(tick)
         self._recorder.add(tick)
         return tick
 
     def _measured_tools(self, state: RobotState) -> dict[str, pin.SE3]:
-        """Measured tool poses, world frame."""
-        model = self.robot.model
-        pin.forwardKinematics(model, self._data, state.q)
-        return {
-            name: pin.updateFramePlacement(model, self._data, arm.frame_id).copy()
-            for name, arm in self.robot.arms.items()
-        }
+        model, data, arms = self.robot.model, self._data, self.robot.arms
+        pin.forwardKinematics(model, data, state.q)
+        return {name: pin.updateFramePlacement(model, data, arm.frame_id).copy() for name, arm in arms.items()}
 
     def _control(self, state: RobotState, openings: Mapping[str, float], now: float, dt: float) -> LoopStep:
         """From measurements and targets to a command. While a run ends, the operator asks for nothing."""

@@ -16,15 +16,17 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.events import Event
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import ArmTarget, HandSample, Reference
+from q2r2_control.types import ArmTarget, HandSample
 from q2r2_control.wording import sentence
 
 _BINS = 100_000
+EVENTS_KEPT = 10_000  # the newest ones; a broken button can cause more
+_REST = 1e-3  # [rad/s]
 
 
 @dataclass(frozen=True, slots=True)
 class Percentiles:
-    """Of a duration; p50 and p99 to one part in a thousand of the histogram's unit, None: nothing was measured."""
+    """Of a duration; p50 and p99 to a thousandth of the histogram's unit, None: nothing was measured."""
 
     p50: float | None
     p99: float | None
@@ -89,17 +91,9 @@ class TorqueSummary:
             self.off_reference_s[arm] += dt
 
 
-EVENTS_KEPT = 10_000  # the newest ones; a broken button can cause more
-_REST = 1e-3  # [rad/s]
-
-
 @dataclass(slots=True)
 class ArmSummary:
-    """One arm, gathered over the ticks in which it was engaged.
-
-    Errors are between the measured tool and the operator's target. They include lag, limits, the other arm, and how far
-    the tool yields to a push, by impedance or by admittance.
-    """
+    """One arm, over the ticks in which it was engaged. Errors: of the measured tool against the operator's target."""
 
     engaged_s: float = 0.0
     position_error_mm_rms: float | None = None  # None: never engaged
@@ -141,15 +135,12 @@ class RunSummary:
     events: list[Event]
 
     def as_json(self) -> dict[str, Any]:
-        """Data for ``json.dumps``."""
         data = asdict(self)
         data["events"] = [event.as_json() | {"reason": sentence(event.reason)} for event in self.events]
         return data
 
 
 class _ArmStatistics:
-    """Gathers the summary of one arm."""
-
     def __init__(self, name: str) -> None:
         self._name = name
         self.summary = ArmSummary()
@@ -188,63 +179,38 @@ class _ArmStatistics:
     def finished(self) -> ArmSummary:
         if not self._ticks:
             return self.summary
-        position, rotation = np.sqrt(self._squares / self._ticks).tolist()
-        return replace(
-            self.summary, position_error_mm_rms=1e3 * position, rotation_error_deg_rms=math.degrees(rotation)
-        )
-
-
-class _JointExtremes:
-    """How near a run's reference came to the joints' limits. Numbers that are not numbers are passed over."""
-
-    def __init__(self, robot: Robot, control: ControllerSettings) -> None:
-        self._room_below, self._room_above = robot.position_lower, robot.position_upper
-        self._position_margin = control.position_margin
-        self._velocity_limit = control.velocity_scale * robot.velocity_limit
-        self._acceleration_limit = robot.capped_acceleration(control.acceleration_limit)
-        self._speed, self._acceleration = np.zeros(robot.model.nv), np.zeros(robot.model.nv)
-        self._lowest, self._highest = np.full(robot.model.nv, np.inf), np.full(robot.model.nv, -np.inf)
-
-    def add(self, reference: Reference) -> None:
-        np.fmax(self._speed, np.abs(reference.v), out=self._speed)
-        np.fmax(self._acceleration, np.abs(reference.a), out=self._acceleration)
-        np.fmin(self._lowest, reference.q, out=self._lowest)
-        np.fmax(self._highest, reference.q, out=self._highest)
-
-    def figures(self) -> dict[str, float]:
-        """Velocity and acceleration to their limits, and the room to position limits [rad]: the worst of all."""
-        room = np.minimum(self._lowest - self._room_below, self._room_above - self._highest).min()
-        return {
-            "max_velocity_ratio": float((self._speed / self._velocity_limit).max()),
-            "max_acceleration_ratio": float((self._acceleration / self._acceleration_limit).max()),
-            "min_position_margin_rad": float(room - self._position_margin) if np.isfinite(room) else 0.0,
-        }
+        position, rotation = np.sqrt(self._squares / self._ticks) * (1e3, math.degrees(1.0))
+        return replace(self.summary, position_error_mm_rms=float(position), rotation_error_deg_rms=float(rotation))
 
 
 class RunStatistics:
     """Gathers a :class:`RunSummary`."""
 
     def __init__(self, robot: Robot, control: ControllerSettings) -> None:
-        self.robot = robot
+        self.robot, self._control = robot, control
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self._compute_times, self._latency = Histogram(1e-3), Histogram(1e-3)
         self._arms = {name: _ArmStatistics(name) for name in robot.arms}
         self._torque: TorqueSummary | None = None
-        self._extremes = _JointExtremes(robot, control)
+        self._speed, self._acceleration = np.zeros(robot.model.nv), np.zeros(robot.model.nv)
+        self._lowest, self._highest = np.full(robot.model.nv, np.inf), np.full(robot.model.nv, -np.inf)
         self._newest: Tick | None = None
         self._ticks, self._duration = 0, 0.0
         self._distance, self._pair = math.inf, ("", "")
         self._fallback = self._uncertified = self._rejected = 0
 
     def add(self, tick: Tick) -> None:
-        """Count one tick."""
-        report = tick.reference.report
+        reference, report = tick.reference, tick.reference.report
         self._newest = tick
         self._ticks += 1
         self._duration += tick.dt
         self._compute_times.add(tick.compute_time)
         self.events.extend(tick.events)
-        self._extremes.add(tick.reference)
+        # Numbers that are not finite are passed over.
+        np.fmax(self._speed, np.abs(reference.v), out=self._speed)
+        np.fmax(self._acceleration, np.abs(reference.a), out=self._acceleration)
+        np.fmin(self._lowest, reference.q, out=self._lowest)
+        np.fmax(self._highest, reference.q, out=self._highest)
         if report.closest_distance < self._distance:
             self._distance, self._pair = report.closest_distance, report.closest_pair
         self._fallback += report.fallback
@@ -261,37 +227,31 @@ class RunStatistics:
         if samples:
             self._latency.add(now - max(max(sample.pose_stamp, sample.inputs_stamp) for sample in samples))
 
-    def summary(
-        self,
-        wall_time: float,
-        missed_ticks: int = 0,
-        stretched: float = 0.0,
-        lateness: Percentiles = NOTHING_MEASURED,
-        overruns: int = 0,
-    ) -> RunSummary:
-        """The run so far.
-
-        ``wall_time`` and ``stretched`` [s] are what it took and how late the motion is; ``lateness`` [us] and
-        ``overruns``: see :class:`LoopClock`.
-        """
+    def summary(self, wall_time: float) -> RunSummary:
+        """The run so far, which took ``wall_time`` [s], as if no tick had been late."""
+        robot, control = self.robot, self._control
+        acceleration_limit = robot.capped_acceleration(control.acceleration_limit)
+        room = np.minimum(self._lowest - robot.position_lower, robot.position_upper - self._highest).min()
         moves = self._newest is not None and bool(np.abs(self._newest.reference.v).max() >= _REST)
         return RunSummary(
             ticks=self._ticks,
             duration_s=self._duration,
             loop_rate_hz=self._ticks / wall_time if wall_time > 0 else 0.0,
             tick_us=self._compute_times.percentiles(1e-6),
-            lateness_us=lateness,
+            lateness_us=NOTHING_MEASURED,
             input_to_command_ms=self._latency.percentiles(1e-3),
             arms={name: arm.finished() for name, arm in self._arms.items()},
             min_distance_mm=1e3 * self._distance if self._distance < math.inf else None,
             closest_pair=self._pair if self._distance < math.inf else None,
-            **self._extremes.figures(),
+            max_velocity_ratio=float((self._speed / (control.velocity_scale * robot.velocity_limit)).max()),
+            max_acceleration_ratio=float((self._acceleration / acceleration_limit).max()),
+            min_position_margin_rad=float(room - control.position_margin) if np.isfinite(room) else 0.0,
             fallback_ticks=self._fallback,
             uncertified_ticks=self._uncertified,
             rejected_targets=self._rejected,
-            overruns=overruns,
-            missed_ticks=missed_ticks,
-            stretched_s=stretched,
+            overruns=0,
+            missed_ticks=0,
+            stretched_s=0.0,
             at_rest=not moves,
             torque=self._torque,
             events=list(self.events),

@@ -22,7 +22,7 @@ class RunStart:
     state: RobotState
 
 
-@dataclass(slots=True)  # not frozen, as all that every tick makes anew
+@dataclass(slots=True)
 class Tick:
     """All that came in and went out in one tick, for the listeners; nobody changes it."""
 
@@ -48,10 +48,8 @@ class Tick:
     impedance: ImpedanceReport | None = None  # of torque mode
     wall: WallReport | None = None  # of torque mode
     admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
-    # arm -> pair of bodies that keeps its gripper from being commanded as wanted
-    held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)
-    # arm whose gripper has an object -> whether it holds it
-    holding: dict[str, bool] = field(default_factory=dict)
+    held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)  # see :attr:`ControlLoop.held_grippers`
+    holding: dict[str, bool] = field(default_factory=dict)  # arm whose gripper has an object -> whether it holds it
 
     def tracking_error(self, arm: str) -> tuple[float, float]:
         """Distance [m] and angle [rad] of an arm's tool from its target; NaN where it has none."""

@@ -23,6 +23,9 @@ _HYSTERESIS = 0.02  # a trigger that trembles by less moves nothing
 _PICK_UP = 0.05  # how near the trigger has to come to the gripper
 
 
+OPEN, CLOSED = 1.0, 0.0
+
+
 class AnalogGripper:
     """The opening that a trigger asks for, 0 closed .. 1 fully open.
 
@@ -34,8 +37,7 @@ class AnalogGripper:
         """``speed``: greatest, in openings a second."""
         bound = (binding.control for binding in bindings.bound() if binding.action is Action.GRIPPER_ANALOG)
         self._control = next(bound, None)
-        self._speed = speed
-        self._at = -math.inf
+        self._speed, self._at = speed, -math.inf
         self.forget()
 
     def forget(self) -> None:
@@ -64,14 +66,8 @@ class AnalogGripper:
         return opening + min(max(self._wanted - opening, -step), step)
 
 
-OPEN, CLOSED = 1.0, 0.0
-
-
 class ArmTeleop:
-    """Teleoperation of one arm by one hand.
-
-    Every transition to ENGAGED anchors hand and tool at their current poses, see :class:`HandMotion`.
-    """
+    """Teleoperation of one arm by one hand. Engaging anchors both at their current poses, see :class:`HandMotion`."""
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
         self.arm = arm
@@ -85,7 +81,7 @@ class ArmTeleop:
         self._use_controls(settings)
         self._inputs_stamp = -math.inf  # of the newest reading of the controls [s]
         self._presses: list[Press] = []
-        self._gripped: bool | None = None  # the dead man was just held, or let go
+        self.gripped: bool | None = None  # the dead man was just held, or let go
         self._aligned_at = 0.0
 
     def _use_controls(self, settings: TeleopSettings) -> None:
@@ -94,10 +90,7 @@ class ArmTeleop:
         self._gestures = GestureRecognizer(settings)
 
     def configure(self, settings: TeleopSettings, last: pin.SE3 | None, now: float) -> None:
-        """Other settings from now on; an engaged arm goes on from its ``last`` target, so it does not jump.
-
-        Those of the controls may be changed while the arm holds only: what is pressed now is forgotten.
-        """
+        """Other settings, of the controls only while the arm holds; an engaged one goes on from its ``last`` target."""
         if of_controls(settings) != of_controls(self._settings):
             self._use_controls(settings)
         self._settings = settings
@@ -116,23 +109,18 @@ class ArmTeleop:
         stamp = min(sample.inputs_stamp, now)
         if -math.inf < stamp and self._inputs_stamp <= stamp:  # an older reading was overtaken, and says nothing
             self._inputs_stamp = stamp
-            self._read_controls(sample.inputs, stamp)
+            self._presses += self._gestures.receive(sample.inputs, stamp)
+            before = self._held.actions
+            self._held.receive(sample.inputs)
+            self._analog.receive(sample.inputs, self.gripper)
+            if Action.DEAD_MAN in before ^ self._held.actions:
+                self.gripped = Action.DEAD_MAN in self._held.actions
         usable, fault = self._gate.receive(sample, now)
         if usable and fault is None and self._gate.pose is not None:
-            self.motion.observe(self._gate.pose)
-            if self.state is ArmState.ENGAGED:
-                self.motion.add(self._gate.pose, self._gate.stamp, now)
+            self.motion.add(self._gate.pose, self._gate.stamp, now, self.state is ArmState.ENGAGED)
         if usable and self.state is ArmState.ALIGNING:
             return None  # realigning makes the pose jump, and the arm is not following
         return fault
-
-    def _read_controls(self, inputs: HandInputs, stamp: float) -> None:
-        self._presses += self._gestures.receive(inputs, stamp)
-        before = self._held.actions
-        self._held.receive(inputs)
-        self._analog.receive(inputs, self.gripper)
-        if Action.DEAD_MAN in before ^ self._held.actions:
-            self._gripped = Action.DEAD_MAN in self._held.actions
 
     def watchdog(self, now: float) -> Reason | None:
         """The fault of a stream that has stopped, or None."""
@@ -144,36 +132,27 @@ class ArmTeleop:
         return None
 
     def change(self, cause: Cause, now: float, reason: Reason) -> None:
-        """Follow a cause from outside of this arm: any but those that engage, which need the tool.
-
-        Presses that began before do not count.
-        """
+        """Follow a cause that needs no tool, as those that engage do. Presses that began before do not count."""
         self._gestures.cancel()
         self._presses.clear()
-        self._gripped = None
+        self.gripped = None
         self._go(cause, now, reason)
         if self.state is ArmState.STOPPED:
             self._analog.forget()
 
     def record_event(self, now: float, reason: Reason) -> None:
-        """What the operator should know while the state stays."""
+        """News for the operator while the state stays."""
         self.events.append(Event(now, self.arm, self.state, self.state, reason))
 
     def take_presses(self, now: float) -> list[Press]:
         """Gestures since the last call; those that nobody gives to :meth:`act` are lost."""
-        presses = self._presses + self._gestures.due(now)
-        self._presses = []
+        presses, self._presses = self._presses + self._gestures.due(now), []
         if (stuck := self._gestures.take_stuck(now)) is not None:
             self.record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=stuck))
         return presses
 
-    @property
-    def grips(self) -> bool:
-        """Whether the dead man was just taken hold of."""
-        return bool(self._gripped)
-
     def forget(self) -> None:
-        """Drop everything received: poses are forgotten, buttons count as held until they are seen released."""
+        """Drop everything received; controls count as held until they are seen released."""
         self._gate.reset()
         self.motion.forget()
         self._inputs_stamp = -math.inf
@@ -181,36 +160,30 @@ class ArmTeleop:
         self._held.forget()
         self._analog.forget()
         self._presses.clear()
-        self._gripped = None
+        self.gripped = None
 
     def act(self, presses: Iterable[Press], around: ArmMeasurements, now: float, chord: bool) -> None:
         """Change the state by this hand's gestures, and by chords; ``chord``: whether a hand holds one."""
-        if self._gripped is False:
+        if self.gripped is False:
             self._go(Cause.LET_GO, now, Reason(ReasonKind.DEAD_MAN_RELEASED))
         if chord:
-            self._align(now)
+            self._aligned_at = now
+            # The other hand's chord does not say what this one's press is.
+            if self.state is not ArmState.PAUSING or self.chord:
+                self._go(Cause.CHORD, now, Reason(ReasonKind.ALIGNMENT_CHORD))
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
             self._engage(Cause.ALIGNED, around, now, Reason(ReasonKind.ALIGNED))
-        elif self._gripped:
+        elif self.gripped:
             self._engage(Cause.ENGAGE, around, now, Reason(ReasonKind.DEAD_MAN_HELD))
-        self._gripped = None
+        self.gripped = None
         for press in presses:
             self._press(press, around, now)
         if self.state is not ArmState.STOPPED:
             self.gripper = self._analog.opening(self.gripper, now)
 
     def target(self, now: float, expected: Pose | None = None) -> Pose:
-        """Where the tool of an engaged arm should be at ``now`` in the world frame, or the frame that it carries.
-
-        ``expected``: where it is to be measured by the controller's reference, from which no target is farther than
-        the leash.
-        """
+        """Of the tool of an engaged arm, or the frame that it carries, at ``now``; see :meth:`HandMotion.target`."""
         return self.motion.target(self._gate.pose, expected, self._shares(), now)
-
-    def _align(self, now: float) -> None:
-        self._aligned_at = now
-        if self.state is not ArmState.PAUSING or self.chord:  # the other hand's chord does not say what this press is
-            self._go(Cause.CHORD, now, Reason(ReasonKind.ALIGNMENT_CHORD))
 
     def _press(self, press: Press, around: ArmMeasurements, now: float) -> None:
         control, gesture = press
@@ -228,7 +201,6 @@ class ArmTeleop:
             self._engage(Cause.ENGAGE, around, now, reason)
 
     def _engage(self, cause: Cause, around: ArmMeasurements, now: float, reason: Reason) -> None:
-        """Engage where ``cause`` would, if nothing is in the way; else say what is."""
         if next_state(self.state, cause) is self.state:
             return
         obstacle, anchor = around.obstacles.get(self.arm) or self.watchdog(now), around.anchor(self.arm)
@@ -239,15 +211,15 @@ class ArmTeleop:
         else:
             self.offset = anchor.offset
             self.motion.anchor(self._gate.pose, floats_of(anchor.tool), self._shares(), now)
+        refusal = Reason(ReasonKind.NOT_ENGAGED, cause=obstacle)
         if obstacle is None:
             self._go(cause, now, reason)
         elif self.state is ArmState.ALIGNING:
-            self._go(Cause.NOT_ALIGNED, now, Reason(ReasonKind.NOT_ENGAGED, cause=obstacle))
+            self._go(Cause.NOT_ALIGNED, now, refusal)
         else:
-            self.record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=obstacle))
+            self.record_event(now, refusal)
 
     def _shares(self) -> Shares:
-        """Of the scales, by what is held."""
         held = self._held.actions
         share = self._settings.precision_scale if Action.PRECISION in held else 1.0
         return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
@@ -260,10 +232,9 @@ class ArmTeleop:
 
 
 def pressed(control: str) -> Reason:
-    """That a control of a hand was used."""
     return Reason.of(ReasonKind.PRESSED, control=f"{control} button" if control in BUTTONS else control)
 
 
 def of_controls(settings: TeleopSettings) -> tuple[object, ...]:
-    """What the hands' controls mean."""
+    """Settings of the hands' controls."""
     return settings.bindings, settings.chord_window, settings.hold_time, settings.gripper_speed

@@ -1,4 +1,4 @@
-"""The states of an arm, and what leads from one to another: the table of the code, and of the docs."""
+"""The states of an arm, and the causes that lead from one to another: the table of the code, and of the docs."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from q2r2_control.events import REFUSALS, Event
 
 
 class ArmState(StrEnum):
-    """Only an engaged arm follows its hand, a carried one that of the other arm, and one that goes home moves by
-    itself; in every other state it holds.
-    """
+    """In every state but ENGAGED, CARRIED and HOMING an arm holds."""
 
     IDLE = "idle"  # was never engaged
     ENGAGED = "engaged"

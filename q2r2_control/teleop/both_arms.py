@@ -1,4 +1,4 @@
-"""What is for both arms, whichever hand asks for it: the stop, the way home, carrying, the recording."""
+"""Actions for both arms, whichever hand asks: the stop, the way home, carrying, the recording."""
 
 from __future__ import annotations
 
@@ -16,23 +16,15 @@ from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
 from q2r2_control.teleop.carry import CarriedTools, RelationKeeper
 from q2r2_control.teleop.gestures import Press
 from q2r2_control.teleop.hand_motion import Anchor, ArmMeasurements
+from q2r2_control.types import SIDES
 
-_OUTCOMES = {
-    Action.RECORD_SUCCESS: ReasonKind.EPISODE_SUCCEEDED,
-    Action.RECORD_FAILURE: ReasonKind.EPISODE_FAILED,
-}
+_OUTCOMES = {Action.RECORD_FAILURE: ReasonKind.EPISODE_FAILED, Action.RECORD_SUCCESS: ReasonKind.EPISODE_SUCCEEDED}
 
 
 class EpisodeMarks:
     """Turns the controls of the recording into events, which are in the recording as all events are."""
 
-    actions = (
-        Action.RECORD_DISCARD,
-        Action.RECORD_FAILURE,
-        Action.RECORD_SUCCESS,
-        Action.RECORD_TOGGLE,
-        Action.RECORD_MARK,
-    )
+    actions = (Action.RECORD_DISCARD, *_OUTCOMES, Action.RECORD_TOGGLE, Action.RECORD_MARK)
 
     def __init__(self) -> None:
         self.recorded = False  # whether there is a recording
@@ -40,7 +32,7 @@ class EpisodeMarks:
         self.any = False  # whether there is an episode that could be discarded
 
     def apply(self, action: Action) -> ReasonKind:
-        """Follow a control; returns the event's kind. What became of an episode ends it."""
+        """Follow a control; returns the event's kind. An episode's outcome ends it."""
         if not self.recorded:
             return ReasonKind.NO_RECORDING
         if action is Action.RECORD_MARK:
@@ -71,8 +63,8 @@ class CarryMode:
     """One hand moves both tools. What ends it ends it for both arms, or the one would pull at what both hold."""
 
     def __init__(self, leader: ArmTeleop, follower: ArmTeleop, tools: _Poses, now: float) -> None:
-        """``tools``: where both arms' tools are, or are asked to be; world frame."""
-        self._leader, self._follower = leader, follower
+        """``tools``: see :class:`CarriedTools`."""
+        self.leader, self._follower = leader, follower
         self._tools = CarriedTools(tools)
         self._keeper = RelationKeeper()
         self._box = follower.motion.workspace()
@@ -82,23 +74,21 @@ class CarryMode:
 
     @property
     def lasts(self) -> bool:
-        """Whether both arms still carry."""
-        return self._leader.state is ArmState.ENGAGED and self._follower.state is ArmState.CARRIED
+        return self.leader.state is ArmState.ENGAGED and self._follower.state is ArmState.CARRIED
 
     def end(self, now: float, reason: Reason) -> None:
-        """Whichever arm still follows holds."""
-        for arm in (self._leader, self._follower):
+        """The arm that still follows holds."""
+        for arm in (self.leader, self._follower):
             arm.change(Cause.CARRY_ENDS, now, reason)
 
     def targets(self, now: float, expected: _Poses, at_once: _Poses) -> dict[str, pin.SE3]:
-        """Of both arms, in the world frame.
+        """Of both arms, in the world frame, as the arguments.
 
-        ``expected``: where the tools are to be by the controller's reference, world frame. ``at_once``: where it had
-        both at one moment, which corrects their relation; empty: not known.
+        ``expected``: the tools by the controller's reference. ``at_once``: the same at one moment, or empty.
         """
-        tools, leader, follower = self._tools, self._leader.arm, self._follower.arm
+        tools, leader, follower = self._tools, self.leader.arm, self._follower.arm
         slowest = tools.slowest(tools.frames_of(expected))
-        tools.frame = frame = se3_of(self._leader.target(now, None if slowest is None else floats_of(slowest)))
+        tools.frame = frame = se3_of(self.leader.target(now, None if slowest is None else floats_of(slowest)))
         targets = tools.at(frame)
         if len(frames := tools.frames_of(at_once)) == len(targets):
             self._keeper.note(frames[leader], frames[follower], now)
@@ -106,19 +96,9 @@ class CarryMode:
         targets[follower] = se3_of((self._box.clip(position), rotation))
         return targets
 
-    @property
-    def slip(self) -> tuple[float, float]:
-        """Of the targets, see :attr:`HandMotion.slip`."""
-        return self._leader.motion.slip
-
-
-# Why arms do not carry.
-_ENGAGE, _UNKNOWN = Reason(ReasonKind.ENGAGE_FIRST), Reason(ReasonKind.TOOL_UNKNOWN)
-_ALONE = Reason(ReasonKind.ONE_ARM)
-
 
 class BothArms:
-    """The arms of one operator, and which hand drives which."""
+    """The arms of one operator, and the hands that drive them."""
 
     def __init__(self, settings: TeleopSettings, names: Iterable[str]) -> None:
         self.arms = {name: ArmTeleop(name, settings) for name in names}
@@ -129,24 +109,16 @@ class BothArms:
         self.assign_hands(settings.stance)
 
     def use(self, settings: TeleopSettings) -> None:
-        """Go by these settings from now on."""
         self._bindings, self._leash = settings.bindings, settings.leash.carried()
 
     def assign_hands(self, stance: Stance) -> None:
-        """Let the hands drive the arms as ``stance`` says."""
-        same = stance is Stance.SIDE_BY_SIDE
-        self.arm_of_hand = {name if same else _other(name): name for name in self.arms}
-
-    def hand_of(self, name: str) -> str:
-        """The hand that drives an arm."""
-        return next(hand for hand, arm in self.arm_of_hand.items() if arm == name)
+        hands = dict(zip(SIDES, SIDES if stance is Stance.SIDE_BY_SIDE else reversed(SIDES), strict=True))
+        self.arm_of_hand = {hands[name]: name for name in self.arms}
 
     def any_in(self, *states: ArmState) -> bool:
-        """Whether an arm is in one of these states."""
         return any(arm.state in states for arm in self.arms.values())
 
     def all_in(self, states: Collection[ArmState]) -> bool:
-        """Whether every arm is in one of these states."""
         return all(arm.state in states for arm in self.arms.values())
 
     def change(self, cause: Cause, now: float, reason: Reason) -> None:
@@ -157,7 +129,8 @@ class BothArms:
     def act(self, around: ArmMeasurements, now: float) -> dict[str, list[Press]]:
         """Do what the hands ask for both arms; returns the presses that are left for each."""
         presses = {name: arm.take_presses(now) for name, arm in self.arms.items()}
-        if not any(presses.values()) and not any(arm.grips or arm.chord for arm in self.arms.values()):
+        grips = any(arm.gripped or arm.chord for arm in self.arms.values())
+        if not grips and not any(presses.values()):
             return presses  # as at most ticks
         for action in self.marks.actions:
             if (name := self._asked(presses, action)) is not None:
@@ -166,10 +139,12 @@ class BothArms:
             cause = Cause.GO_ON if self.all_in({ArmState.STOPPED}) else Cause.STOP
             self.change(cause, now, self._reason(Action.STOP))
         elif self.any_in(ArmState.STOPPED):
-            self._refuse_while_stopped(presses, now)
+            for name, listed in presses.items():
+                wanted = {self._bindings.action_of(*press) for press in listed if press.gesture is not Gesture.DOWN}
+                if wanted - set(self.marks.actions):
+                    self.arms[name].record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=self._stopped()))
         elif self.any_in(ArmState.HOMING):
-            begun = any(press.gesture is Gesture.DOWN for listed in presses.values() for press in listed)
-            if begun or any(arm.grips or arm.chord for arm in self.arms.values()):
+            if grips or any(press.gesture is Gesture.DOWN for listed in presses.values() for press in listed):
                 self.change(Cause.PRESS, now, Reason(ReasonKind.HOMING_INTERRUPTED))
         elif (asked_by := self._asked(presses, Action.HOME)) is not None:
             self.home(now, asked_by, around.obstacles.get(asked_by))
@@ -182,10 +157,7 @@ class BothArms:
         return {name: [] for name in self.arms}
 
     def home(self, now: float, asked_by: str | None, problem: Reason | None = None) -> None:
-        """Both arms shall go home; the hand of the arm ``asked_by`` has to be there on the way, None: no hand.
-
-        A ``problem``, or another thing in the way, becomes an event.
-        """
+        """Both arms shall go home, with the hand of the arm ``asked_by``; a ``problem`` becomes an event."""
         if self.any_in(ArmState.ALIGNING):
             problem = problem or Reason(ReasonKind.ALIGNING)
         if self.any_in(ArmState.STOPPED):
@@ -195,13 +167,11 @@ class BothArms:
         if problem is None and asked_by is not None:
             problem = self.arms[asked_by].watchdog(now)
         self.asks_home = asked_by
+        if problem is None:
+            self.change(Cause.HOME, now, Reason(ReasonKind.HOMING) if asked_by is None else self._reason(Action.HOME))
+            return
         for arm in self.arms.values():
-            if problem is not None:
-                arm.record_event(now, Reason(ReasonKind.NOT_HOMING, cause=problem))
-            else:
-                arm.change(
-                    Cause.HOME, now, Reason(ReasonKind.HOMING) if asked_by is None else self._reason(Action.HOME)
-                )
+            arm.record_event(now, Reason(ReasonKind.NOT_HOMING, cause=problem))
 
     def end_carry(self, now: float, reason: Reason) -> None:
         """If two arms carry, both hold."""
@@ -214,24 +184,21 @@ class BothArms:
         if arm.state is not ArmState.ENGAGED:
             if arm.state not in AT_REST:
                 return Reason.of(ReasonKind.OTHER_ARM_BUSY, state=str(arm.state))
-            if arm.arm in around.obstacles:
-                return around.obstacles[arm.arm]
-            return around.anchor(arm.arm) or _UNKNOWN
+            return around.obstacles.get(arm.arm) or around.anchor(arm.arm) or Reason(ReasonKind.TOOL_UNKNOWN)
         if around.lag(arm.arm, arm.offset) >= (self._leash.distance or math.inf):
             return Reason(ReasonKind.TOOL_HELD_UP)
         target = around.targets.get(arm.arm)
-        return _UNKNOWN if target is None else Anchor(target, arm.offset)
+        return Reason(ReasonKind.TOOL_UNKNOWN) if target is None else Anchor(target, arm.offset)
 
     def _begin_carry(self, name: str, around: ArmMeasurements, now: float) -> None:
-        """The hand of the arm ``name`` moves both tools."""
         leader = self.arms[name]
         other = next((arm for arm in self.arms.values() if arm is not leader), None)
         taken = {arm.arm: self._take_up(arm, around) for arm in (leader, other) if arm is not None}
         problem = next((found for found in taken.values() if isinstance(found, Reason)), None)
         if leader.state is not ArmState.ENGAGED:
-            problem = _ENGAGE
+            problem = Reason(ReasonKind.ENGAGE_FIRST)
         elif other is None and problem is None:
-            problem = _ALONE
+            problem = Reason(ReasonKind.ONE_ARM)
         if problem is not None:
             leader.record_event(now, Reason(ReasonKind.NOT_CARRIED, cause=problem))
         elif other is not None:
@@ -240,7 +207,6 @@ class BothArms:
             self.carry = CarryMode(leader, other, {arm: anchor.tool for arm, anchor in anchors.items()}, now)
 
     def _ends_carry(self, presses: Mapping[str, Sequence[Press]]) -> Reason | None:
-        """What of this tick's controls ends it, or None."""
         if any(arm.chord for arm in self.arms.values()):
             return Reason(ReasonKind.ALIGNMENT_CHORD)
         for control, gesture in (press for listed in presses.values() for press in listed):
@@ -248,15 +214,6 @@ class BothArms:
             if (pauses and gesture is Gesture.DOWN) or self._bindings.action_of(control, gesture) is Action.CARRY:
                 return pressed(control)
         return None
-
-    def _refuse_while_stopped(self, presses: Mapping[str, Sequence[Press]], now: float) -> None:
-        wanted = {
-            name: [self._bindings.action_of(*press) for press in listed if press.gesture is not Gesture.DOWN]
-            for name, listed in presses.items()
-        }
-        for name, actions in wanted.items():
-            if set(actions) - set(self.marks.actions):
-                self.arms[name].record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=self._stopped()))
 
     def _asked(self, presses: Mapping[str, Sequence[Press]], action: Action) -> str | None:
         """The arm whose hand asked for ``action``, or None."""
@@ -270,7 +227,3 @@ class BothArms:
 
     def _stopped(self) -> Reason:
         return Reason.of(ReasonKind.STOPPED, control=self._bindings.words_of(Action.STOP))
-
-
-def _other(side: str) -> str:
-    return "right" if side == "left" else "left"

@@ -1,9 +1,8 @@
 """Two tools that one hand moves as one body, about the point between them: two arms that carry one box.
 
-The hand is anchored to a frame in the middle between both tools, turned as the world, and both tools keep the pose in
-it that they had when the carrying began. So nothing jumps when it begins, and the targets' relation is exact while it
-lasts. That of the tools is as good as both arms follow: where one is held up, the frame waits for it on a leash that is
-shorter than that of one arm, so that what is carried is neither torn nor crushed.
+The hand is anchored to a frame in the middle between both tools, turned as the world, and both tools keep their poses
+in it. So nothing jumps when it begins, and the targets' relation is exact while it lasts. Where an arm is held up, the
+frame waits for it on a leash that is shorter than that of one arm, so that the load is neither torn nor crushed.
 """
 
 from __future__ import annotations
@@ -17,9 +16,7 @@ from q2r2_control.quaternions import Vector, floats_of, se3_of
 from q2r2_control.teleop.leash import Workspace
 from q2r2_control.types import LONGEST_DT, Array, Pose, pose_of
 
-# Of keeping the relation [1/s]. A loop of the first order that is late by T is stable with a gain below pi/(2 T): T may
-# be 0.07 s.
-_GAIN = 20.0
+_GAIN = 20.0  # of keeping the relation [1/s]: a first-order loop is stable below pi/(2 T), late by T, here 0.07 s
 _MOST = 0.01, 0.05  # that it shifts a target by [m], [rad]
 
 
@@ -31,11 +28,6 @@ class CarriedTools:
         middle = np.mean([tool.translation for tool in tools.values()], axis=0)
         self.frame = pose_of(np.eye(3), middle)  # where it is asked to be
         self._in_frame = {arm: self.frame.actInv(tool) for arm, tool in tools.items()}
-
-    @property
-    def lever(self) -> float:
-        """From the frame to the tools [m]."""
-        return max(float(np.linalg.norm(tool.translation)) for tool in self._in_frame.values())
 
     def frames_of(self, tools: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
         """Where each of ``tools`` has the frame."""
@@ -55,19 +47,17 @@ class CarriedTools:
 
     def _away(self, frame: pin.SE3) -> float:
         """How far a frame is, as a tool feels it [m]."""
+        lever = max(float(np.linalg.norm(tool.translation)) for tool in self._in_frame.values())
         turn = float(np.linalg.norm(pin.log3(frame.rotation @ self.frame.rotation.T)))
-        return float(np.linalg.norm(frame.translation - self.frame.translation)) + self.lever * turn
+        return float(np.linalg.norm(frame.translation - self.frame.translation)) + lever * turn
 
 
 class RelationKeeper:
     """Moves the frame of the tool that is carried so that both tools keep their relation, not only their targets.
 
-    Both arms follow a target some millimetres late, and each in its own way. What they have in common bends nothing;
-    by what the carried one is behind the leading one, or ahead, its frame is shifted, as an integral:
+    Each arm follows its target some millimetres late, in its own way. The carried one's frame is shifted by c,
 
-        dc/dt = g (frame of the leading tool - frame of the carried tool),  |c| bounded.
-
-    A target's own velocity is fed forward, so the tool goes where the shift goes, and the loop is of first order.
+        dc/dt = g (frame of the leading tool - frame of the carried tool),  |c| bounded:  a loop of first order.
     """
 
     def __init__(self) -> None:
@@ -101,7 +91,6 @@ class CarriedWorkspace:
         self.reset()
 
     def reset(self) -> None:
-        """See :meth:`Workspace.reset`."""
         self.slip = 0.0  # how much of the hand's way was not made [m]
         for box in self._boxes.values():
             box.reset()

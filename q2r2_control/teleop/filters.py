@@ -1,13 +1,9 @@
 """From irregular samples of a trembling hand to a smooth pose at every control tick, with one known delay.
 
-Two stages. :class:`Interpolator` plays the samples back a constant time after their receipt, so that the control loop
-sees straight lines instead of 13 ms steps. :class:`OneEuro` then takes the tremor out. Everything is in seconds and
-takes the dt of each tick, so neither the headset's rate nor the loop's changes what the operator feels.
-
-Rotations are filtered as rotations, by their logarithm, so q and -q are the same and nothing is averaged over signs.
-
-All of this runs at every control tick, for vectors of three: sums of three floats cost a tenth of NumPy's calls. So
-positions are three floats in here and rotations four, see :mod:`q2r2_control.quaternions`.
+:class:`Interpolator` plays the samples back a constant time after their receipt, so that the control loop sees straight
+lines instead of 13 ms steps. :class:`OneEuro` then takes the tremor out, and :class:`RestingPose` the noise of a hand
+that rests. Everything is in seconds and takes the dt of each tick, so neither the headset's rate nor the loop's changes
+what the operator feels. Rotations are filtered by their logarithm, so q and -q are the same.
 """
 
 from __future__ import annotations
@@ -20,16 +16,13 @@ from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.quaternions import IDENTITY, Quaternion, Vector, normalized, turn_between, turned_by
 from q2r2_control.types import Pose
 
-# Closer samples are merged: over so short a time receipt jitter would look like speed [s].
-_MIN_SPACING = 0.005
-_NO_TURN = (0.0, 0.0, 0.0)
+_MIN_SPACING = 0.005  # closer samples are merged: over so short a time receipt jitter would look like speed [s]
 
 
 class Interpolator:
     """Plays samples back ``delay`` seconds after their receipt, straight from each to the next.
 
-    When no sample comes for longer than ``delay``, it rests at the newest, and continues from there later: the output
-    is continuous for any samples, and nothing is extrapolated.
+    When no sample comes for longer than ``delay``, it rests at the newest: nothing is extrapolated.
     """
 
     def __init__(self, delay: float) -> None:
@@ -38,7 +31,6 @@ class Interpolator:
         self._velocity: tuple[Vector, Vector] | None = None  # from the first knot to the second; None: not known yet
 
     def reset(self, position: Vector, rotation: Quaternion, now: float) -> None:
-        """Rest at a pose."""
         self._knots, self._velocity = deque([(now - self.delay, position, rotation)]), None
 
     def add(self, position: Vector, rotation: Quaternion, stamp: float, now: float) -> None:
@@ -53,32 +45,24 @@ class Interpolator:
     def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
         """The position and rotation played back at ``now`` [s], which never goes back, and the turn since the last."""
         playhead, knots = now - self.delay, self._knots
-        last = knots[0][2]
-        passed = False
+        last, passed = knots[0][2], False
         while len(knots) > 1 and knots[1][0] <= playhead:
             knots.popleft()
             passed, self._velocity = True, None
-        start, (x, y, z), rotation = knots[0]
-        turn = _NO_TURN
+        (start, (x, y, z), rotation), turn = knots[0], (0.0, 0.0, 0.0)
         if len(knots) > 1:
-            linear, angular = self._velocity = self._velocity or _velocity(*knots[0], *knots[1])
-            dt = playhead - start
+            if self._velocity is None:
+                end, to, turned = knots[1]
+                rate, (a, b, c) = 1.0 / (end - start), turn_between(rotation, turned)
+                linear = rate * (to[0] - x), rate * (to[1] - y), rate * (to[2] - z)
+                self._velocity = linear, (rate * a, rate * b, rate * c)
+            (linear, angular), dt = self._velocity, playhead - start
             x, y, z = x + dt * linear[0], y + dt * linear[1], z + dt * linear[2]
             turn = dt * angular[0], dt * angular[1], dt * angular[2]
             rotation = turned_by(rotation, turn)
-        # What was played is where the next line starts, so a sample that replaces another cannot make the output step.
+        # The next line starts here, so a sample that replaces another cannot make the output step.
         knots[0] = playhead, (x, y, z), rotation
         return (x, y, z), rotation, turn_between(last, rotation) if passed else turn
-
-
-def _velocity(
-    start: float, position: Vector, rotation: Quaternion, end: float, to: Vector, turned: Quaternion
-) -> tuple[Vector, Vector]:
-    """Of a straight line from one knot to the next, about one fixed axis."""
-    rate = 1.0 / (end - start)
-    a, b, c = turn_between(rotation, turned)
-    linear = rate * (to[0] - position[0]), rate * (to[1] - position[1]), rate * (to[2] - position[2])
-    return linear, (rate * a, rate * b, rate * c)
 
 
 class OneEuro:
@@ -97,11 +81,10 @@ class OneEuro:
         self.reset()
 
     def reset(self) -> None:
-        """Start from rest."""
         self._velocity = (0.0, 0.0, 0.0)
 
     def correction(self, error: Sequence[float], step: Sequence[float], dt: float) -> Vector:
-        """What to add to the output over a tick of ``dt`` > 0 [s].
+        """The output's change over a tick of ``dt`` > 0 [s].
 
         ``error`` is input minus output before the tick, ``step`` input minus previous input; rotation vectors for
         rotations. Backward Euler: stable for every dt, and the lag at constant velocity is exact for any constant dt.
@@ -118,8 +101,7 @@ class OneEuro:
 class PoseFilter:
     """Interpolation and One-Euro filter of one hand's pose.
 
-    A hand that moves at constant velocity comes out :attr:`FilterSettings.delay` late, whatever its speed. Velocity
-    changes are followed within about 1 / (2 pi derivative_cutoff).
+    Constant velocity comes out :attr:`FilterSettings.delay` late; a change within about 1 / (2 pi derivative_cutoff).
     """
 
     def __init__(self, settings: FilterSettings) -> None:
@@ -160,3 +142,93 @@ class PoseFilter:
         position = last_x + shift[0], last_y + shift[1], last_z + shift[2]
         self._out = position, turned_by(last, turn)
         return self._out
+
+
+# A hand rests while the mean of its newest samples is this near to that of all since it came to rest, and no sample is
+# farther from it than a headset's noise makes one in thousands [m], [rad].
+_NEWEST, _DRIFTED, _FAR = 8, (0.35e-3, 2e-3), (1.0e-3, 5e-3)
+_LONGEST = 150  # samples of the mean: two seconds of a 75 Hz headset
+_TRUSTED = 10, 50  # the mean begins to count from so many samples on, and is all that counts from so many
+_LEAVING = 0.05  # the mean of a hand that moves again counts for so long, less and less [s]
+_TURNED = 0.3  # farther from its origin another rest begins: only short rotation vectors can be averaged [rad]
+
+_Sample = Sequence[float]  # position [m] and rotation vector from the origin [rad]; a few floats cost less than NumPy
+
+
+class RestingPose:
+    """Draws a filtered pose towards the mean of a hand that rests."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        self._origin = IDENTITY  # rotations are told as vectors from here
+        self._newest: deque[_Sample] = deque(maxlen=_NEWEST)
+        self._mean: _Sample = (0.0,) * 6
+        self._count = 0  # samples that are known of this rest
+        self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # the mean that is drawn to
+        self._leaving = False  # that mean is of a rest that is over
+        self._share, self._now = 0.0, 0.0
+
+    def add(self, pose: Pose) -> None:
+        position, rotation = pose
+        turn = turn_between(self._origin, rotation)
+        known = self._count > 0 and math.hypot(*turn) <= _TURNED
+        if not known:
+            self._origin, turn = rotation, (0.0, 0.0, 0.0)
+        sample = (*position, *turn)
+        if not known or self._away(sample, _FAR):
+            self._newest.clear()
+            self._newest.append(sample)
+            self._leave(sample, 1)
+            return
+        self._newest.append(sample)
+        self._count += 1
+        share = 1.0 / min(self._count, _LONGEST)
+        self._mean = [mean + share * (new - mean) for mean, new in zip(self._mean, sample, strict=True)]
+        if self._count > _NEWEST:
+            newest = [sum(values) / _NEWEST for values in zip(*self._newest, strict=True)]
+            if self._away(newest, _DRIFTED):
+                self._leave(newest, _NEWEST)
+
+    def begin(self, newest: Pose, now: float) -> Pose:
+        """Where the hand is at ``now`` [s]: at the mean if it rests, else at its ``newest`` pose."""
+        self._now, self._leaving, self._share = now, False, self._trusted
+        self._held = self._mean_pose() if self._share > 0.0 else newest
+        return self._held
+
+    def draw(self, pose: Pose, now: float) -> Pose:
+        """The filtered ``pose`` at ``now`` [s], drawn towards the mean as far as that is to be trusted."""
+        passed, self._now = max(now - self._now, 0.0) / _LEAVING, now
+        if self._leaving:
+            self._share = max(self._share - passed, 0.0)
+            self._leaving = self._share > 0.0
+        else:
+            self._share = min(self._trusted, self._share + passed)
+        if self._share == 0.0:
+            return pose  # as while a hand moves
+        if not self._leaving:
+            self._held = self._mean_pose()
+        share, ((x, y, z), rotation), ((to_x, to_y, to_z), to) = self._share, pose, self._held
+        a, b, c = turn_between(rotation, to)
+        position = x + share * (to_x - x), y + share * (to_y - y), z + share * (to_z - z)
+        return position, turned_by(rotation, (share * a, share * b, share * c))
+
+    @property
+    def _trusted(self) -> float:
+        least, most = _TRUSTED
+        return min(max((self._count - least) / (most - least), 0.0), 1.0)
+
+    def _mean_pose(self) -> Pose:
+        x, y, z, a, b, c = self._mean
+        return (x, y, z), turned_by(self._origin, (a, b, c))
+
+    def _away(self, sample: _Sample, bounds: tuple[float, float]) -> bool:
+        (x, y, z, a, b, c), (to_x, to_y, to_z, to_a, to_b, to_c) = self._mean, sample
+        return (
+            math.hypot(to_x - x, to_y - y, to_z - z) > bounds[0] or math.hypot(to_a - a, to_b - b, to_c - c) > bounds[1]
+        )
+
+    def _leave(self, mean: _Sample, count: int) -> None:
+        self._leaving = True
+        self._mean, self._count = mean, count

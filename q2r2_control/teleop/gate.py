@@ -13,17 +13,13 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.quaternions import Quaternion
 from q2r2_control.types import HandSample, Pose
 
-# Beyond this, doubles no longer resolve a tenth of a nanometre, and no tracking system reaches as far [m].
-_MAX_COORDINATE = 1e6
-# A quaternion with a norm outside this range is not a rotation with rounding errors.
-_QUATERNION_LENGTHS = (1e-6, 1e6)
-# Speeds are taken over at least this time. Messages that a network held up come within a millisecond of each other, and
-# then say nothing about a speed [s].
-_SPEED_WINDOW = 0.05
+_MAX_COORDINATE = 1e6  # no tracking system reaches as far [m]
+_QUATERNION_LENGTHS = (1e-6, 1e6)  # outside this range it is not a rotation with rounding errors
+_SPEED_WINDOW = 0.05  # of a speed, at least: messages that a network held up come within a millisecond [s]
 
 
 class PoseGate:
-    """Accepts usable poses of one hand, and says what is wrong with the others.
+    """Accepts usable poses of one hand, and gives the reason against the others.
 
     Time is receipt time: a stamp later than ``now`` counts as ``now``, so that it cannot disable the watchdog. A sample
     with an older stamp than the last was overtaken by a newer message, and is ignored.
@@ -31,8 +27,10 @@ class PoseGate:
 
     def __init__(self, settings: GateSettings) -> None:
         self.settings = settings
-        # The newest pose, in the input's frame; None when there is none or the newest was not usable.
-        self.pose: Pose | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        self.pose: Pose | None = None  # the newest, in the input's frame; None: there is none, or it was not usable
         self.stamp = -math.inf  # receipt time of the newest pose [s], usable or not; -inf before the first
         self._problem: Reason | None = None
         self._way: deque[tuple[float, Pose]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
@@ -42,22 +40,12 @@ class PoseGate:
         """Why no arm may be anchored to the newest pose, None where it may."""
         return None if self.pose is not None else self._problem or Reason(ReasonKind.NO_POSE)
 
-    def reset(self) -> None:
-        """Forget everything received."""
-        self.pose = None
-        self.stamp = -math.inf
-        self._problem = None
-        self._way.clear()
-
     def stale(self, now: float) -> bool:
         """Whether no pose was received for ``timeout``."""
         return now - self.stamp > self.settings.timeout
 
     def receive(self, sample: HandSample, now: float) -> tuple[bool, Reason | None]:
-        """Process one sample; returns whether its pose is new and usable, and what forbids to follow it, or None.
-
-        A pose after a jump is usable, since an arm may be anchored to it, but must not be followed.
-        """
+        """Whether a sample's pose is new and may be anchored to, as after a jump, and why not to follow it, or None."""
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):
             return False, Reason(ReasonKind.POSE_WITHOUT_STAMP)
@@ -70,8 +58,7 @@ class PoseGate:
         if pose is None:
             self._way.clear()
             return False, self._problem or Reason(ReasonKind.POSE_UNUSABLE)
-        jump = None if previous is None else self._jump(previous, pose, gap)
-        if jump is not None:
+        if jump := None if previous is None else self._jump(previous, pose, gap):
             self._way.clear()  # no speed is taken across it
         return True, jump or self._speed(pose, stamp)
 
@@ -88,7 +75,7 @@ class PoseGate:
         return None
 
     def _speed(self, pose: Pose, stamp: float) -> Reason | None:
-        """What is wrong with the hand's mean speed over the last ``_SPEED_WINDOW`` or a little more, or None."""
+        """The fault of the hand's mean speed over the last ``_SPEED_WINDOW`` or a little more, or None."""
         way = self._way
         way.append((stamp, pose))
         while len(way) > 1 and stamp - way[1][0] >= _SPEED_WINDOW:
@@ -107,7 +94,7 @@ class PoseGate:
 
 
 def _pose_of(sample: HandSample) -> Pose | None:
-    """The sample's pose with its quaternion normalised; None when that is not possible."""
+    """The sample's pose with its quaternion normalised, or None."""
     position, quaternion = _numbers(sample.position, 3), _numbers(sample.quaternion, 4)
     if position is None or quaternion is None or max(map(abs, position)) > _MAX_COORDINATE:
         return None
@@ -119,15 +106,11 @@ def _pose_of(sample: HandSample) -> Pose | None:
 
 
 def _numbers(values: object, size: int) -> list[float] | None:
-    """``values`` as ``size`` finite numbers, or None."""
     try:
         vector = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         return None
-    if vector.shape != (size,):
-        return None
-    numbers: list[float] = vector.tolist()
-    return numbers if all(map(math.isfinite, numbers)) else None
+    return vector.tolist() if vector.shape == (size,) and np.isfinite(vector).all() else None
 
 
 def _angle(one: Quaternion, other: Quaternion) -> float:

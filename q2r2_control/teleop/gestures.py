@@ -1,4 +1,4 @@
-"""What a hand does with its controls: taps and holds, told from the headset's alignment chord, and what is held."""
+"""A hand's controls: taps and holds, told from the headset's alignment chord, and actions that are held."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.types import HandInputs
 
-_STUCK_AFTER = 1.0  # that a control is held from the first reading on before somebody is told [s]
+_STUCK_AFTER = 1.0  # for so long a control is held from the first reading on before somebody is told [s]
 # A control is held from the first of these on and let go below the second, so that noise in between changes nothing.
 _HELD, _LET_GO = 0.6, 0.4
 
@@ -36,8 +36,8 @@ def _is_held(control: str, inputs: HandInputs, was_held: bool) -> bool:
 class HeldControls:
     """The actions of one hand that are held.
 
-    A control counts as held only once it was seen let go, so that one that is held while the connection comes up, or
-    was lost, does nothing. A reading that is not a number lets go.
+    A control counts as held only once it was seen let go, since the connection came up. A reading that is not a number
+    lets go.
     """
 
     def __init__(self, bindings: BindingSettings) -> None:
@@ -54,7 +54,6 @@ class HeldControls:
         self.actions: frozenset[Action] = frozenset()
 
     def receive(self, inputs: HandInputs) -> None:
-        """Process a new reading."""
         held = set()
         for control, action in self._controls:
             if not _is_held(control, inputs, action in self.actions):
@@ -77,11 +76,9 @@ class GestureRecognizer:
     """
 
     def __init__(self, settings: TeleopSettings) -> None:
-        bound = list(settings.bindings.bound())
+        bound = [binding for binding in settings.bindings.bound() if binding.action not in LASTING]
         holds = {binding.control for binding in bound if binding.gesture is Gesture.HOLD}
-        lasting = {binding.control for binding in bound if binding.action in LASTING}
         stops = {binding.control: binding.gesture for binding in bound if binding.action is Action.STOP}
-        others = {binding.control for binding in bound} - lasting
         self._controls = {
             control: _Control(
                 waits=settings.chord_window if control in BUTTONS else 0.0,
@@ -89,7 +86,7 @@ class GestureRecognizer:
                 stops=stops.get(control),
             )
             for control in (*BUTTONS, *HELD)
-            if control in BUTTONS or control in others
+            if control in BUTTONS or control in {binding.control for binding in bound}
         }
         self._buttons = [self._controls[control] for control in BUTTONS]
         self.forget()
@@ -153,9 +150,8 @@ class _Control:
     """One control's level, and its press while that may still become another gesture."""
 
     def __init__(self, waits: float, hold: float, stops: Gesture | None) -> None:
-        self._waits = waits  # for the other button [s]
-        self._hold = hold  # so long a press is a hold [s]; inf: it is bound to none
-        self._stops = stops  # the gesture that does
+        """``waits`` for the other button [s]; ``hold``: of a hold, inf: none [s]; ``stops``: the gesture that does."""
+        self._waits, self._hold, self._stops = waits, hold, stops
         self.forget()
 
     def forget(self) -> None:
@@ -164,7 +160,6 @@ class _Control:
         self.cancel()
 
     def mute(self) -> None:
-        """Of what has begun only a stop counts."""
         self._muted = True
         if self._stops is None:
             self.cancel()
@@ -177,13 +172,11 @@ class _Control:
         self.began, self._muted = stamp, False
 
     def released(self, stamp: float) -> Gesture | None:
-        """A press ends; returns the gesture that it was, if that is not over already."""
         if self.began is None:
             return None
         return self._end(Gesture.HOLD if stamp - self.began >= self._hold else Gesture.TAP)
 
     def due(self, now: float) -> Gesture | None:
-        """The gesture that is over at ``now`` [s] because time has passed, or None."""
         if self.began is None:
             return None
         held = now - self.began

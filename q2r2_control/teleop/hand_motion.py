@@ -1,4 +1,4 @@
-"""From the usable poses of one hand to targets: what lies between an anchor and the controller."""
+"""From the usable poses of one hand to targets."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Reason
 from q2r2_control.quaternions import floats_of
 from q2r2_control.teleop.carry import CarriedTools, CarriedWorkspace
-from q2r2_control.teleop.filters import PoseFilter
+from q2r2_control.teleop.filters import PoseFilter, RestingPose
 from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.teleop.relative import RelativeMotion
-from q2r2_control.teleop.rest import RestingPose
 from q2r2_control.types import Array, Pose, moved_by
 
 Shares = tuple[float, float]  # of the scales of positions and rotations
@@ -25,8 +24,7 @@ Shares = tuple[float, float]  # of the scales of positions and rotations
 class HandMotion:
     """One hand's motion as that of a tool, or of the frame between two tools that carry.
 
-    :meth:`anchor` anchors hand and tool at their current poses and starts the filter at rest there. There is no
-    catch-up motion, because no state holds what the hand did before.
+    There is no catch-up motion after :meth:`anchor`, because no state holds the hand's motion before.
     """
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
@@ -52,7 +50,6 @@ class HandMotion:
         self._workspace: Workspace | CarriedWorkspace = self.workspace()
 
     def workspace(self) -> Workspace:
-        """The box of this arm's targets."""
         return Workspace(self._settings.workspace.get(self._arm))  # type: ignore[call-overload]
 
     @property
@@ -60,17 +57,14 @@ class HandMotion:
         """How far the target has slipped along since the anchor, with the tool or along its workspace [m, rad]."""
         return self._leash.position.slip + self._workspace.slip, self._leash.rotation.slip
 
-    def observe(self, hand: Pose) -> None:
-        """A usable pose of the hand, whether its arm is engaged or not."""
-        self._rest.add(hand)
-
     def forget(self) -> None:
-        """Forget how the hand rested."""
         self._rest.forget()
 
-    def add(self, hand: Pose, stamp: float, now: float) -> None:
-        """A pose that may be followed, received at ``stamp`` [s]; an anchor has to come first."""
-        self._filter.add(hand, stamp, now)
+    def add(self, hand: Pose, stamp: float, now: float, engaged: bool) -> None:
+        """A usable pose of the hand, received at ``stamp`` [s]; followed if its arm is ``engaged``, so anchored."""
+        self._rest.add(hand)
+        if engaged:
+            self._filter.add(hand, stamp, now)
 
     def anchor(self, hand: Pose, tool: Pose, shares: Shares, now: float) -> None:
         """The newest pose of the ``hand`` and ``tool``, in the world, correspond from now on."""
@@ -92,8 +86,8 @@ class HandMotion:
     def target(self, newest: Pose | None, expected: Pose | None, shares: Shares, now: float) -> Pose:
         """Where the tool, or the frame, should be at ``now`` [s] in the world.
 
-        ``newest``: the hand's newest pose, or None; ``expected``: where the tool or the frame is to be measured by
-        the controller's reference, from which no target is farther than the leash, or None: then there is none.
+        ``newest``: the hand's newest pose; ``expected``: the tool or the frame by the controller's reference, which no
+        target is farther from than the leash. Without either there is no leash.
         """
         hand = self.filtered = self._hand(now)
         if expected is None or newest is None:
@@ -130,9 +124,9 @@ class Anchor(NamedTuple):
     offset: Array | None = None  # (3,) [m]; None: none
 
 
-@dataclass(slots=True)  # not frozen: that would cost half a microsecond a tick
+@dataclass(slots=True)
 class ArmMeasurements:
-    """What of the arms themselves counts in one tick; poses are in the world."""
+    """State of the arms themselves in one tick; poses are in the world."""
 
     tools: Mapping[str, pin.SE3]  # measured
     targets: Mapping[str, pin.SE3]  # the last ones
@@ -152,8 +146,7 @@ class ArmMeasurements:
 
     def expected(self, arm: str, offset: Array | None) -> Pose | None:
         """Where a tool with this offset is to be measured, by what is commanded. None: not known."""
-        commanded = None if self.commanded is None else self.commanded.get(arm)
-        if commanded is None:
+        if self.commanded is None or (commanded := self.commanded.get(arm)) is None:
             return None
         (x, y, z), rotation = pose = floats_of(commanded)
         if offset is None:

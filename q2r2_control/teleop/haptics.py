@@ -1,4 +1,4 @@
-"""Short vibrations that tell a hand about its arm: what they are, and when."""
+"""Short vibrations that tell a hand about its arm."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ VOCABULARY = (
     *(EPISODE_DISCARDED, EPISODE_REJECTED, STOPPED, FAULT),
 )
 
-_BEGINS = {
+_BEGINS: dict[str, Pulse] = {
     ArmState.ENGAGED: ENGAGED,
     ArmState.CARRIED: ENGAGED,
     ArmState.HOMING: HOMING,
@@ -71,7 +71,7 @@ _PAUSE = 0.05  # between two vibrations, so that they are felt as two [s]
 
 
 class ArmCondition(NamedTuple):
-    """What of an arm's surroundings and joints its hand feels."""
+    """Surroundings and joints of an arm, which its hand feels."""
 
     spare: float  # how much nearer it may come to what it has to keep away from; inf: nothing is there [m]
     limits: frozenset[str]  # joints at a position limit
@@ -79,10 +79,7 @@ class ArmCondition(NamedTuple):
 
 
 class HapticPulses:
-    """Vibrations of one arm's hand: see :data:`VOCABULARY`. What lasts is told once for each step that it grows by.
-
-    The app vibrates until the next message, so the end of a pulse is a message as well.
-    """
+    """Vibrations of one arm's hand, see :data:`VOCABULARY`; the end of each is a message, since the app goes on."""
 
     def __init__(self, settings: HapticSettings | None = None) -> None:
         self.strength = (settings or HapticSettings()).strength  # of all vibrations, 0: none
@@ -96,7 +93,7 @@ class HapticPulses:
         self._waiting: Pulse | None = None
 
     def tell(self, event: Event) -> None:
-        """Start the pulse for a change of the arm's state; that of a refused press is that of a fault."""
+        """Start the pulse for an event of the arm."""
         if is_fault(event):
             self._want(FAULT)
         elif event.source == event.destination:
@@ -105,7 +102,7 @@ class HapticPulses:
             elif event.kind is ReasonKind.VERDICT and (keep := event.reason.detail["keep"]) is not None:
                 self._want(EPISODE_KEPT if keep else EPISODE_REJECTED)
         elif event.destination in _BEGINS:
-            self._want(_BEGINS[ArmState(event.destination)])
+            self._want(_BEGINS[event.destination])
         elif event.source in (ArmState.ENGAGED, ArmState.CARRIED, ArmState.HOMING):
             self._want(PAUSED)
 
@@ -116,7 +113,7 @@ class HapticPulses:
             self._want(SLIP)
 
     def notice(self, condition: ArmCondition) -> None:
-        """What the arm comes near to, touches, and is limited by."""
+        """The arm comes near to something, touches it, or is limited by a joint."""
         nearness = max(_NEAR_FROM - condition.spare, 0.0)
         if self._nearness.grew(nearness):
             self._want(NEAR.grown(nearness / _NEAR_FROM))
@@ -133,7 +130,7 @@ class HapticPulses:
         self._grasps = holds
 
     def at(self, now: float, hand: str) -> HapticFeedback | None:
-        """What to send to ``hand``, which drives the arm at ``now`` [s], or None."""
+        """The vibration for ``hand``, which drives the arm at ``now`` [s], or None."""
         if self._ends is not None and now >= self._ends:
             self._ends, self._next = None, now + _PAUSE
             return HapticFeedback(self._felt_by, 0.0, 0.0)  # which may not drive the arm any more
@@ -158,7 +155,6 @@ class _Steps:
         self._step, self._counted = step, 0
 
     def grew(self, value: float) -> bool:
-        """Whether ``value`` is a step beyond what was counted; one that is no number is not."""
         if not math.isfinite(value):
             return False
         steps = int(value / self._step + 1e-9)

@@ -1,15 +1,13 @@
 """The leash between a tool and its target: it bounds how far a target gets from a tool that cannot follow.
 
-An arm that is stretched out, or blocked by the table or the other arm, cannot follow its hand. Without a leash the hand
-would have to come all the way back before the arm moves again. The leash is the farthest that a target gets from the
-tool: beyond it, the anchor of the relative motion shifts, so that the target stays where the leash ends and the hand
-moves it from there. Position and rotation have a leash each.
+An arm that is stretched out or blocked cannot follow its hand. Without a leash the hand would have to come all the way
+back before the arm moves again. Where a target would go beyond the leash, the anchor of the relative motion shifts, so
+that the target stays where the leash ends and the hand moves it from there. Position and rotation have a leash each.
 
 **Slack.** When a leash is taut, the tool is blocked in its direction, and the hand comes back by more than tremor, the
 target is put at the tool, which follows the hand from there. Whether the hand comes back is read from its unfiltered
 poses: when a hand stops, the filtered ones swing back by millimetres. Position and rotation are put there together: a
-blocked tool rests where the pulls of both balance, and would follow the one that is left. Stretched out to 0.1 m from
-its target, a tool was pulled back 50 mm by its rotation alone.
+blocked tool rests where the pulls of both balance, and would follow the one that is left, up to 50 mm.
 
 **Why the arm does not jump.** The only state of the controller is its reference, which is at rest while the tool is
 blocked; a target at the tool therefore asks for no motion. The controller also follows its target's own velocity, but
@@ -20,21 +18,20 @@ is short enough to make such a step.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 from q2r2_control.config.teleop import LeashSettings, WorkspaceSettings
 from q2r2_control.quaternions import Vector, turn_between, turned_by
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Interval, Pose
 
-# The way back that drops the slack: more than tremor of 0.2 mm and 0.2 degrees to either side, and than the noise of a
-# headset, 0.2 mm and 0.03 degrees, of which seven times lie between the farthest samples of a hand that rests.
+# The way back that drops the slack: more than tremor, 0.2 mm and 0.2 degrees to either side, and a headset's noise, of
+# which seven times 0.2 mm and 0.03 degrees lie between the farthest samples of a hand that rests.
 _WAY_BACK = 1.5e-3, 12e-3  # [m, rad]
-# Slower than this a tool counts as blocked. Stopping from there takes a fraction of a millimetre.
-_HELD_UP = 0.05, 0.2  # [m/s, rad/s]
-# A step faster than this is no motion of a target, whatever the controller's settings.
-_NO_MOTION = 10.0, 35.0  # [m/s, rad/s]
+_HELD_UP = 0.05, 0.2  # a slower tool counts as blocked; it stops within a fraction of a millimetre [m/s, rad/s]
+_NO_MOTION = 10.0, 35.0  # a faster step is no motion of a target, whatever the controller's settings [m/s, rad/s]
 _ROUNDING = 1e-9  # [m], and of a cosine
+
+_Tick = tuple[Pose, Pose, float]  # the tool, the newest hand and the time [s], which the next tick looks at
 
 
 class ComponentLeash:
@@ -52,16 +49,13 @@ class ComponentLeash:
         self._back = 0.0  # of the hand, since it was farthest
 
     def releases_slack(self, way: Vector, by_hand: Vector, by_tool: Vector, dt: float) -> bool:
-        """Whether the slack is to be dropped.
+        """Whether to drop the slack.
 
-        ``way`` is from the tool to the target; ``by_hand`` and ``by_tool`` are what the unfiltered hand and the tool
-        moved since the last call, ``dt`` [s] ago.
+        ``way``: from the tool to the target; ``by_hand``, ``by_tool``: of the unfiltered hand and the tool in ``dt``.
         """
         distance = math.hypot(*way)
-        if distance >= self._length:
-            self.taut = True
-        if distance < 0.5 * self._length:
-            self.taut = False  # the tool has followed by itself
+        # Below half of the length the tool has followed by itself.
+        self.taut = distance >= self._length or (self.taut and distance >= 0.5 * self._length)
         if not self.taut:
             self._back = 0.0
             return False
@@ -70,7 +64,6 @@ class ComponentLeash:
         return self._back > self._way_back and held_up and distance > self._no_motion * dt
 
     def drop(self, way: Vector) -> Vector:
-        """The way to a target that is put at the tool."""
         self.taut, self._back = False, 0.0
         self.slip += math.hypot(*way)
         return 0.0, 0.0, 0.0
@@ -96,16 +89,16 @@ class Leash:
         # A little less than the leash's, so that it is looked at in time; of the angle, the cosine of half of it.
         self._distance = math.inf if settings.distance is None else settings.distance - _ROUNDING
         self._cosine = -math.inf if settings.angle is None else math.cos(0.5 * settings.angle) + _ROUNDING
-        self._last: tuple[Pose, Pose, float] | None = None  # a _Tick, which is only made where it is looked at
+        self._last: _Tick | None = None
 
     def reset(self) -> None:
         """Slack, nothing slipped: for a new anchor."""
-        for component in self._components:
-            component.reset()
+        self.position.reset()
+        self.rotation.reset()
         self._last = None
 
     def anchor_anew(self) -> None:
-        """The hand was anchored anew where it is: its way since the last tick is not known; what has slipped stays."""
+        """The hand was anchored anew where it is, its way since the last tick is not known; the slip stays."""
         self._last = None
 
     def target(self, motion: RelativeMotion, hand: Pose, newest: Pose, tool: Pose, now: float) -> Pose:
@@ -119,7 +112,7 @@ class Leash:
         # The first target is the anchor, which must not move the arm wherever the plant says the tool is.
         if last is None or not (self.position.taut or self.rotation.taut or self._ends(tool, target)):
             return target
-        way, turn = self._pull(_ways(tool, target), _Tick(*last), _Tick(*this))
+        way, turn = self._pull(target, last, this)
         position, rotation = target = _put(target, tool, way, turn)
         if way is not None:
             motion.anchor_position(hand[0], position)
@@ -140,29 +133,20 @@ class Leash:
         # Of two unit quaternions the scalar product is the cosine of half the angle between them, but for its sign.
         return math.dist(start, end) >= self._distance or abs(a * x + b * y + c * z + d * w) <= self._cosine
 
-    def _pull(self, ways: tuple[Vector, Vector], last: _Tick, this: _Tick) -> list[Vector | None]:
+    def _pull(self, target: Pose, last: _Tick, this: _Tick) -> list[Vector | None]:
         """Ways from the tool to the target's new position and rotation, None for what the leash leaves alone."""
-        moves = zip(self._components, ways, _ways(last.newest, this.newest), _ways(last.tool, this.tool), strict=True)
-        # Both are asked, since each has to see every tick.
-        releases = [
-            component.releases_slack(way, by_hand, by_tool, this.now - last.now)
-            for component, way, by_hand, by_tool in moves
-        ]
+        (last_tool, last_newest, before), (tool, newest, now) = last, this
+        ways = _ways(tool, target)
+        moves = zip(self._components, ways, _ways(last_newest, newest), _ways(last_tool, tool), strict=True)
+        # All are asked, since each component has to see every tick.
+        dt = now - before
+        releases = [leash.releases_slack(way, by_hand, by_tool, dt) for leash, way, by_hand, by_tool in moves]
         if any(releases):
             return [component.drop(way) for component, way in zip(self._components, ways, strict=True)]
         return [component.hold(way) for component, way in zip(self._components, ways, strict=True)]
 
 
-class _Tick(NamedTuple):
-    """What of a tick the next one looks at."""
-
-    tool: Pose
-    newest: Pose
-    now: float  # [s]
-
-
 def _ways(start: Pose, end: Pose) -> tuple[Vector, Vector]:
-    """Position and rotation vector from one pose to another."""
     ((x, y, z), rotation), ((to_x, to_y, to_z), turned) = start, end
     return (to_x - x, to_y - y, to_z - z), turn_between(rotation, turned)
 
@@ -180,10 +164,7 @@ def _dot(one: Vector, other: Vector) -> float:
 
 
 class Workspace:
-    """Keeps one arm's targets in its box; None: there is no box.
-
-    A tool may be outside when its arm is engaged. Then the target goes no farther out than that.
-    """
+    """Keeps one arm's targets in its box, or no farther out than its tool was at the anchor; None: there is no box."""
 
     def __init__(self, settings: WorkspaceSettings | None) -> None:
         self._sides: tuple[Interval, ...] = () if settings is None else (settings.x, settings.y, settings.z)
@@ -195,10 +176,7 @@ class Workspace:
         self.slip = 0.0  # how much of the hand's way was not made since the reset [m]
 
     def hold(self, target: Pose) -> Vector | None:
-        """Where a target that is asked to be at ``target``, world frame, may be; None: there.
-
-        Asked at every tick; what it returns the hand has to be anchored to.
-        """
+        """The position, world frame, that ``target`` may have and the hand is to be anchored to; None: its own."""
         asked = target[0]
         if self._bounds is None:
             self._bounds = [(min(side[0], at), max(side[1], at)) for side, at in zip(self._sides, asked, strict=False)]

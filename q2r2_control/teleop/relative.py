@@ -25,12 +25,10 @@ from q2r2_control.quaternions import (
 )
 from q2r2_control.types import Array, Pose
 
-# Left and right change sign, forward and up do not.
-_REFLECTION = np.diag([1.0, -1.0, 1.0])
+_REFLECTION = np.diag([1.0, -1.0, 1.0])  # left and right change sign, forward and up do not
 # Past this angle the anchor moves along: a rotation vector has no continuous continuation past a full turn.
 _REANCHOR_ANGLE = 1.5 * math.pi
-# Two rotation vectors of one continuous motion are closer than this between two calls [rad].
-_CONTINUOUS = 1.0
+_CONTINUOUS = 1.0  # two rotation vectors of one continuous motion are closer than this between two calls [rad]
 
 
 class RelativeMotion:
@@ -60,17 +58,10 @@ class RelativeMotion:
         axes: Sequence[str] = ("+x", "+y", "+z"),
         axis_scales: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> None:
+        given = {"stance": stance, "position_scale": scale, "rotation_scale": rotation_scale}
+        given |= {"rotation_frame": rotation_frame, "axes": axes, "axis_scales": axis_scales}
         try:
-            settings = TeleopSettings.model_validate(
-                {
-                    "stance": stance,
-                    "position_scale": scale,
-                    "rotation_frame": rotation_frame,
-                    "rotation_scale": rotation_scale,
-                    "axes": axes,
-                    "axis_scales": axis_scales,
-                }
-            )
+            settings = TeleopSettings.model_validate(given)
         except ValidationError as error:
             fault = error.errors()[0]
             key = ".".join(str(part) for part in fault["loc"])
@@ -87,12 +78,10 @@ class RelativeMotion:
         self._turn_axes = _axes_of(self._turn_map)
         self._hand_position: Vector | None = None
         self._hand_rotation = self._hand_back = self._tool_rotation = self._turned_back = IDENTITY
-        self._tool_position = (0.0, 0.0, 0.0)
-        self._vector = (0.0, 0.0, 0.0)
+        self._tool_position = self._vector = (0.0, 0.0, 0.0)
 
     @classmethod
     def of(cls, settings: TeleopSettings) -> RelativeMotion:
-        """As an operator's settings say."""
         scales = settings.rotation_scale, settings.axes, settings.axis_scales
         return cls(settings.stance, settings.position_scale, settings.rotation_frame, *scales)
 
@@ -101,25 +90,21 @@ class RelativeMotion:
         self.anchor_floats(floats_of(hand), floats_of(tool))
 
     def anchor_floats(self, hand: Pose, tool: Pose) -> None:
-        """See :meth:`anchor`."""
         self.anchor_position(hand[0], tool[0])
         self.anchor_rotation(hand[1], tool[1])
 
     def rescale(self, position: float, rotation: float, hand: Pose, tool: Pose) -> None:
-        """From now on scale by these shares of the scales; ``hand`` and ``tool`` are anchored, so nothing jumps.
-
-        A share of 0 keeps the tool's position, or its rotation, where it is.
-        """
+        """From now on scale by these shares of the scales; ``hand`` and ``tool`` are anchored, so nothing jumps."""
         self._scale, self._rotation_scale = position * self._full[0], rotation * self._full[1]
         self._axes = self._scaled_axes()
         self.anchor_floats(hand, tool)
 
     def anchor_position(self, hand: Vector, tool: Vector) -> None:
-        """Make only the positions of ``hand`` and ``tool`` correspond from now on; rotations go on as they were."""
+        """Make only the positions correspond from now on; rotations go on as they were."""
         self._hand_position, self._tool_position = hand, tool
 
     def anchor_rotation(self, hand: Quaternion, tool: Quaternion) -> None:
-        """Make only the rotations of ``hand`` and ``tool`` correspond from now on; positions go on as they were."""
+        """Make only the rotations correspond from now on; positions go on as they were."""
         self._hand_rotation = normalized(hand)
         self._hand_back = inverse(self._hand_rotation)
         self._tool_rotation = tool = normalized(tool)
@@ -135,7 +120,6 @@ class RelativeMotion:
         return se3_of(self.target_floats(floats_of(hand)))
 
     def target_floats(self, hand: Pose) -> Pose:
-        """See :meth:`target`."""
         if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.target: call anchor(hand, tool) first")
         now, rotation = hand
@@ -148,14 +132,16 @@ class RelativeMotion:
         return position, turned
 
     def _turned_tool(self, hand: Quaternion) -> Quaternion:
-        """The tool's rotation for that of the hand."""
         # Not scaled, M R R0' M' Rtool0 = (M R M') (M R0' M' Rtool0), or Rtool0 M R0' R M' = (Rtool0 M R0' M') (M R M')
         # in the tool's frame; what does not depend on R is known since the anchor.
         if self._rotation_scale == 1.0:
             turn, tool = hand, self._turned_back
         else:
             back, tool = self._hand_back, self._tool_rotation
-            turn = self._scaled(product(back, hand) if self._in_tool_frame else product(hand, back))
+            turn = product(back, hand) if self._in_tool_frame else product(hand, back)
+            x, y, z = self._vector = _continued(rotation_vector(turn), self._vector)
+            scale = self._rotation_scale
+            turn = rotation_of((scale * x, scale * y, scale * z))
         turn = self._in_world(turn)
         return product(tool, turn) if self._in_tool_frame else product(turn, tool)
 
@@ -167,9 +153,8 @@ class RelativeMotion:
     def hand(self, tool: pin.SE3) -> pin.SE3:
         """The hand pose, in the input's frame, whose :meth:`target` is ``tool``: where an operator has to put the hand.
 
-        Of rotations beyond half a turn from the anchor the shorter one is taken. With a scale of 0, with which no hand
-        can move or turn the tool, the hand keeps its position or rotation. Raises :class:`Q2R2Error` when nothing has
-        been anchored.
+        Of rotations beyond half a turn from the anchor the shorter one is taken. With a scale of 0 the hand keeps its
+        position or rotation. Raises :class:`Q2R2Error` when nothing has been anchored.
         """
         if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.hand: call anchor(hand, tool) first")
@@ -187,11 +172,6 @@ class RelativeMotion:
 
     def _scaled_axes(self) -> list[tuple[int, float]]:
         return _axes_of(self._scale * self._axis_scales[:, None] * self._map)
-
-    def _scaled(self, turn: Quaternion) -> Quaternion:
-        x, y, z = self._vector = _continued(rotation_vector(turn), self._vector)
-        scale = self._rotation_scale
-        return rotation_of((scale * x, scale * y, scale * z))
 
 
 def _axes_of(matrix: Array) -> list[tuple[int, float]]:

@@ -12,7 +12,7 @@ from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
-from q2r2_control.teleop.both_arms import BothArms, EpisodeMarks
+from q2r2_control.teleop.both_arms import BothArms
 from q2r2_control.teleop.hand_motion import ArmMeasurements
 from q2r2_control.types import ArmTarget, HandSample
 
@@ -26,11 +26,10 @@ class Teleop:
     An engaged arm is stopped by: no pose or no button data for ``gate.timeout`` of receipt time, a pose that is not
     finite or not a rotation, a jump or a speed past the gate, a fault that the input found, a lost connection, a loop
     that stalled or a clock that went back by more than ``gate.timeout``; with ``linked`` the other arm too. Only a new
-    press engages again. The alignment chord of either hand stops both arms, ``linked`` or not, since it moves the frame
-    that both hands are measured in.
+    press engages again. The alignment chord of either hand stops both arms, since it moves the frame of both hands.
 
-    Of what is pressed at once, a stop comes first, then the alignment chord, then a pause, then the rest. What is
-    for both arms either hand may ask for. The way home is the caller's to go while :attr:`homing`.
+    Of presses at once, a stop comes first, then the alignment chord, then a pause, then the rest. Either hand may ask
+    for actions of both arms. The way home is the caller's to go while :attr:`homing`.
 
     No input makes :meth:`update` raise: samples of unknown hands, old, doubled or in bursts, and any ``now``.
     """
@@ -38,14 +37,14 @@ class Teleop:
     def __init__(self, settings: TeleopSettings, arms: Sequence[str]) -> None:
         self._pair = BothArms(settings, arms)
         self._arms = self._pair.arms
-        self._use(settings)
+        self.marks = self._pair.marks  # the operator's, of the recording
         self._commanded: dict[str, pin.SE3] = {}
         self._now: float | None = None
+        self._use(settings)
 
     def _use(self, settings: TeleopSettings) -> None:
-        self.settings = settings
+        self.settings, self.delay = settings, settings.filter.delay
         self._linked, self._stall = settings.linked, settings.gate.timeout
-        self.delay = settings.filter.delay
 
     def change(self, settings: TeleopSettings, now: float) -> Reason | None:
         """Other settings from now on, without a jump; returns why that is not possible now, or None.
@@ -70,7 +69,6 @@ class Teleop:
 
     @property
     def states(self) -> dict[str, ArmState]:
-        """State of every arm."""
         return {name: arm.state for name, arm in self._arms.items()}
 
     @property
@@ -80,22 +78,17 @@ class Teleop:
 
     @property
     def aligning(self) -> bool:
-        """Whether a hand holds the alignment chord: the frame may move that all hands are measured in."""
+        """Whether a hand holds the alignment chord."""
         return any(arm.chord for arm in self._arms.values())
 
     @property
     def homing(self) -> bool:
-        """Whether both arms are to be brought home, until :meth:`end_homing` or what stops them."""
+        """Whether both arms are to be brought home."""
         return self._pair.any_in(ArmState.HOMING)
-
-    @property
-    def marks(self) -> EpisodeMarks:
-        """What the operator says of the recording."""
-        return self._pair.marks
 
     def hand_of(self, arm: str) -> str:
         """The hand that drives ``arm``."""
-        return self._pair.hand_of(arm)
+        return next(hand for hand, driven in self._pair.arm_of_hand.items() if driven == arm)
 
     def take_events(self) -> list[Event]:
         """State changes and refused presses since the last call, in order of time."""
@@ -116,14 +109,11 @@ class Teleop:
         """One tick: process the samples and compute every arm's target.
 
         ``tools``: measured tool poses in the world frame. ``commanded``: those of the controller's reference, which the
-        leash is tied to; without it there is no leash. An arm is anchored as :class:`ArmMeasurements` says.
-        ``obstacles``: why an arm may not be engaged now, for reasons outside of this layer.
-        ``in_step``: whether ``commanded`` has all tools at one moment. While two arms carry, only such poses correct
-        their relation: those of two moments show a motion.
-        ``now`` [s] is the clock of the samples' stamps.
+        leash is tied to; without it there is no leash. ``obstacles``: reasons outside of this layer against engaging an
+        arm now. ``in_step``: ``commanded`` has all tools at one moment, so that it may correct the relation of tools
+        that carry. ``now`` [s] is the clock of the samples' stamps.
         """
-        clock_fault = self._clock(now)
-        now = self._now if self._now is not None else 0.0
+        now, clock_fault = self._clock(now)
         faults: dict[str, Reason] = {}
         for sample in samples:
             name = self._pair.arm_of_hand.get(sample.hand)
@@ -142,39 +132,29 @@ class Teleop:
         return self._targets(now, around)
 
     def _targets(self, now: float, around: ArmMeasurements) -> dict[str, ArmTarget]:
-        """Of every arm, by its state."""
-        if self._pair.carry is not None:
-            return self._carried_targets(now, around)
+        carry, carried = self._pair.carry, {}
+        if carry is not None and not carry.lasts:
+            self._pair.end_carry(now, Reason(ReasonKind.CARRY_ENDED))
+            carry = None
+        if carry is not None:
+            poses = {name: around.expected(name, arm.offset) for name, arm in self._arms.items()}
+            expected = {name: se3_of(pose) for name, pose in poses.items() if pose is not None}
+            self._commanded |= (carried := carry.targets(now, expected, expected if around.in_step else {}))
         targets = {}
         for name, arm in self._arms.items():
             pose = hand = None
-            if arm.state is ArmState.ENGAGED:
+            if carry is not None:
+                pose = carried[name]
+            elif arm.state is ArmState.ENGAGED:
                 self._commanded[name] = pose = se3_of(arm.target(now, around.expected(name, arm.offset)))
+            if arm.state is ArmState.ENGAGED:
                 hand = arm.motion.filtered
-            slip, slip_angle = arm.motion.slip
-            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.offset, hand)
-        return targets
-
-    def _carried_targets(self, now: float, around: ArmMeasurements) -> dict[str, ArmTarget]:
-        """Of every arm, while two carry or until one of them was stopped."""
-        assert self._pair.carry is not None
-        if not self._pair.carry.lasts:
-            self._pair.end_carry(now, Reason(ReasonKind.CARRY_ENDED))
-            return self._targets(now, around)
-        poses = {name: around.expected(name, arm.offset) for name, arm in self._arms.items()}
-        expected = {name: se3_of(pose) for name, pose in poses.items() if pose is not None}
-        carried = self._pair.carry.targets(now, expected, expected if around.in_step else {})
-        (slip, slip_angle), targets = self._pair.carry.slip, {}
-        for name, arm in self._arms.items():
-            pose = carried.get(name)
-            if pose is not None:
-                self._commanded[name] = pose
-            hand = arm.motion.filtered if arm.state is ArmState.ENGAGED else None
+            slip, slip_angle = (arm if carry is None else carry.leader).motion.slip
             targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.offset, hand)
         return targets
 
     def home(self, now: float) -> None:
-        """Both arms shall go home, because a program says so. What is in the way is told as an event."""
+        """Both arms shall go home, because a program says so. An obstacle is told as an event."""
         self._pair.home(now, None)
 
     def end_homing(self, now: float, outcome: Reason, arrived: bool = True) -> None:
@@ -194,11 +174,9 @@ class Teleop:
 
     def connection_lost(self, now: float) -> None:
         """The input is lost: every arm that a hand drives stops, and everything received is forgotten."""
-        self._clock(now)
+        now, _ = self._clock(now)
         if not self.homing or self._pair.asks_home is not None:
-            self._pair.change(
-                Cause.FAULT, self._now if self._now is not None else 0.0, Reason(ReasonKind.CONNECTION_LOST)
-            )
+            self._pair.change(Cause.FAULT, now, Reason(ReasonKind.CONNECTION_LOST))
         for arm in self._arms.values():
             arm.forget()
 
@@ -207,42 +185,38 @@ class Teleop:
 
         With ``arm`` the reason is of that arm: others that follow their hands hold too where they are linked.
         """
-        self._clock(now)
-        now = self._now if self._now is not None else 0.0
+        now, _ = self._clock(now)
         if arm is None or self.homing:
             self._pair.change(Cause.FAULT, now, reason)
         elif self._arms[arm].state not in HOLDING:
             self._stop({arm: reason}, now)
 
-    def _clock(self, now: float) -> Reason | None:
-        """Advance the time; returns the fault of a clock that cannot be followed, or None."""
+    def _clock(self, now: float) -> tuple[float, Reason | None]:
+        """The time from now on, which does not go back a little, and the fault of a clock that cannot be followed."""
         last = self._now
         if not math.isfinite(now):
-            return Reason(ReasonKind.CLOCK_NOT_FINITE)
+            return last or 0.0, Reason(ReasonKind.CLOCK_NOT_FINITE)
         if last is not None and last - self._stall <= now <= last:
-            return None
+            return last, None
         self._now = now
         if last is None or 0.0 < now - last <= self._stall:
-            return None
+            return now, None
         if now > last:
-            return Reason.of(ReasonKind.LOOP_STALLED, duration=now - last)
+            return now, Reason.of(ReasonKind.LOOP_STALLED, duration=now - last)
         for arm in self._arms.values():
             arm.forget()
-        return Reason.of(ReasonKind.CLOCK_WENT_BACK, duration=last - now)
+        return now, Reason.of(ReasonKind.CLOCK_WENT_BACK, duration=last - now)
 
     def _disengage(self, faults: Mapping[str, Reason], now: float) -> None:
         """Stop the arms whose hand has a fault; that of a hand whose arm holds anyway has no effect."""
         if self.homing:
-            fault = faults.get(self._pair.asks_home) if self._pair.asks_home is not None else None
-            if fault:
+            if (fault := faults.get(self._pair.asks_home or "")) is not None:
                 self._pair.change(Cause.FAULT, now, Reason(ReasonKind.HOMING_FAULT, cause=fault))
             return
-        active = {name: fault for name, fault in faults.items() if self._arms[name].state in _LED}
-        if active:
+        if active := {name: fault for name, fault in faults.items() if self._arms[name].state in _LED}:
             self._stop(active, now)
 
     def _stop(self, faults: Mapping[str, Reason], now: float) -> None:
-        """Stop arms for a fault of each, and those that are linked to them."""
         for name, fault in faults.items():
             self._arms[name].change(Cause.FAULT, now, fault)
         first, fault = next(iter(faults.items()))

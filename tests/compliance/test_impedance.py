@@ -11,11 +11,11 @@ from pydantic import ValidationError
 
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.config.cell import load_config
-from q2r2_control.config.control import ImpedanceSettings
+from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState
-from tests.support.torque_loop import left_arm, pose_error, reference
+from tests.support.torque_loop import reference
 
 DT = 0.001
 SETTINGS = ImpedanceSettings(torque_rate_limit=1000.0)  # 1 Nm a tick
@@ -35,26 +35,21 @@ def gravity(robot: Robot, q: Array) -> Array:
     return np.array(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))
 
 
-class TestSettings:
-    @pytest.mark.parametrize(
-        "key",
-        [
-            "translational_stiffness",
-            "rotational_stiffness",
-            "damping_ratio",
-            "nullspace_stiffness",
-            "nullspace_damping_ratio",
-            "limit_stiffness",
-            "limit_damping",
-            "torque_scale",
-            "torque_rate_limit",
-            "ramp_time",
-        ],
-    )
-    @pytest.mark.parametrize("value", [0.0, np.nan])
-    def test_what_would_not_hold_the_arm_is_refused(self, key: str, value: float) -> None:
-        with pytest.raises(ValidationError, match=key):
-            ImpedanceSettings.model_validate({key: value})
+def started(robot: Robot, settings: ImpedanceSettings = SETTINGS) -> ImpedanceController:
+    """A controller that was reset at home."""
+    controller = ImpedanceController(robot, settings)
+    controller.reset(at(robot.home))
+    return controller
+
+
+KEYS = (*LIVE_IMPEDANCE, "limit_stiffness", "limit_damping", "torque_scale", "torque_rate_limit", "ramp_time")
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_settings_that_would_not_hold_the_arm_are_refused(key: str, value: float) -> None:
+    with pytest.raises(ValidationError, match=key):
+        ImpedanceSettings.model_validate({key: value})
 
 
 class TestController:
@@ -69,51 +64,23 @@ class TestController:
         assert not command.report.held
         assert command.report.clipped == ()
 
-    def test_it_pulls_the_tool_towards_the_reference_with_the_stiffness_asked_for(self, robot: Robot) -> None:
-        settings = ImpedanceSettings(torque_rate_limit=1e5)
-        controller = ImpedanceController(robot, settings)
-        controller.reset(at(robot.home))
-        q = robot.home.copy()
-        q[:7] += 0.01
-        tau = controller.step(reference(robot.home), at(q), DT).tau - gravity(robot, q)
-        J, M = left_arm(robot, q)
-        force = np.linalg.solve(J @ np.linalg.solve(M, J.T), J @ np.linalg.solve(M, tau[:7]))
-        error = pose_error(robot.tool_pose(robot.home, "left"), robot.tool_pose(q, "left"))
-        np.testing.assert_allclose(force, np.repeat([2000.0, 200.0], 3) * error, rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(tau[7:], 0, atol=1e-9)
-
-    def test_a_reference_that_accelerates_gets_the_torque_that_takes(self, robot: Robot) -> None:
-        controller = ImpedanceController(robot, ImpedanceSettings(torque_rate_limit=1e5))
-        a = np.linspace(-2, 2, 14)
-        controller.reset(at(robot.home))
-        tau = controller.step(reference(robot.home, a=a), at(robot.home), DT).tau
-        data = robot.model.createData()
-        np.testing.assert_allclose(tau, pin.rnea(robot.model, data, robot.home, np.zeros(14), a), atol=1e-9)
-
     def test_extra_torque_is_added_and_bounded_with_the_rest(self, robot: Robot) -> None:
-        controller = ImpedanceController(robot, SETTINGS)
-        controller.reset(at(robot.home))
+        controller = started(robot)
         extra = np.zeros(14)
         extra[0], extra[5] = 0.5, 1e6
         command = controller.step(reference(robot.home), at(robot.home), DT, extra)
         added = command.tau - gravity(robot, robot.home)
         np.testing.assert_allclose(added[[0, 5]], [0.5, 1.0], atol=1e-9)
         assert command.report.saturated == command.report.rate_limited == ("left_A6",)
+        assert controller.step(reference(robot.home), at(robot.home), DT, np.full(14, np.nan)).report.held
 
-    def test_a_far_reference_pulls_no_more_than_the_clip_lets_it(self, robot: Robot) -> None:
-        controller = ImpedanceController(robot, SETTINGS)
-        controller.reset(at(robot.home))
-        q = robot.home.copy()
+    def test_the_report_names_arms_beyond_the_clip_and_joints_at_their_limits(self, robot: Robot) -> None:
+        controller, q = started(robot), robot.home.copy()
         q[:7] += 0.6
-        command = controller.step(reference(robot.home), at(q), DT)
-        assert command.report.clipped == ("left",)
-        assert np.linalg.norm(command.report.errors["left"][:3]) == pytest.approx(0.1)
-        assert np.linalg.norm(command.report.errors["left"][3:]) <= 0.5 + 1e-12
-        assert np.linalg.norm(command.report.errors["right"]) == pytest.approx(0.0, abs=1e-12)
-
-    def test_a_joint_pushed_to_its_limit_is_named(self, robot: Robot) -> None:
-        controller = ImpedanceController(robot, SETTINGS)
-        controller.reset(at(robot.home))
+        report = controller.step(reference(robot.home), at(q), DT).report
+        assert report.clipped == ("left",)
+        assert np.linalg.norm(report.errors["left"][:3]) == pytest.approx(0.1)
+        assert np.linalg.norm(report.errors["right"]) == pytest.approx(0.0, abs=1e-12)
         q = robot.home.copy()
         q[9] = robot.position_upper[9] - 0.02
         assert controller.step(reference(robot.home), at(q), DT).report.repelled == ("right_A3",)
@@ -123,10 +90,7 @@ class TestController:
     def test_a_state_that_is_no_state_holds_the_last_gravity_torque_and_says_so(
         self, robot: Robot, field: str, value: float
     ) -> None:
-        controller = ImpedanceController(robot, SETTINGS)
-        good = at(robot.home)
-        controller.reset(good)
-        q = robot.home + 0.05
+        controller, good, q = started(robot), at(robot.home), robot.home + 0.05
         for _ in range(200):
             last = controller.step(reference(robot.home), at(q), DT).tau
         broken = getattr(good, field).copy()
@@ -151,8 +115,7 @@ class TestController:
 
     @pytest.mark.parametrize("magnitude", [1e10, 1e160, 1e300])
     def test_absurd_numbers_lead_to_bounded_torque(self, robot: Robot, magnitude: float) -> None:
-        controller = ImpedanceController(robot, SETTINGS)
-        controller.reset(at(robot.home))
+        controller = started(robot)
         last = gravity(robot, robot.home)
         for sign in (1.0, -1.0):
             for absurd in (at(robot.home, sign * magnitude + STRETCHED), at(sign * magnitude + STRETCHED)):
@@ -164,31 +127,19 @@ class TestController:
 
     @pytest.mark.parametrize("value", [np.nan, np.inf])
     def test_a_reference_that_is_no_reference_is_held(self, robot: Robot, value: float) -> None:
-        controller = ImpedanceController(robot, SETTINGS)
-        controller.reset(at(robot.home))
+        controller = started(robot)
         moved = at(robot.home + 0.01)
         for _ in range(50):
             expected = controller.step(reference(robot.home), moved, DT).tau
-        for broken in (
-            reference(robot.home + value),
-            reference(robot.home, v=STRETCHED + value),
-            reference(robot.home, a=STRETCHED + value),
-        ):
+        bad = STRETCHED + value
+        for broken in (reference(bad), reference(robot.home, v=bad), reference(robot.home, a=bad)):
             command = controller.step(broken, moved, DT)
             np.testing.assert_allclose(command.tau, expected, atol=1e-9)
             assert not command.report.held
 
-    def test_extra_torque_that_is_no_number_holds_gravity(self, robot: Robot) -> None:
-        controller = ImpedanceController(robot, SETTINGS)
-        controller.reset(at(robot.home))
-        command = controller.step(reference(robot.home), at(robot.home), DT, np.full(14, np.nan))
-        assert command.report.held
-        np.testing.assert_allclose(command.tau, gravity(robot, robot.home), atol=1e-9)
-
     @pytest.mark.parametrize(("dt", "change"), [(0.0, 0.0), (-1.0, 0.0), (np.nan, 0.0), (0.01, 10.0), (50.0, 100.0)])
     def test_the_torque_changes_with_the_time_that_passed(self, robot: Robot, dt: float, change: float) -> None:
-        controller = ImpedanceController(robot, SETTINGS)
-        controller.reset(at(robot.home))
+        controller = started(robot)
         tau = controller.step(reference(robot.home), at(robot.home), dt, np.full(14, 1e4)).tau
         expected = np.minimum(gravity(robot, robot.home) + change, robot.torque_limit)
         np.testing.assert_allclose(tau, expected, atol=1e-9)
@@ -201,8 +152,7 @@ class TestController:
 
 class TestAnImpedanceThatChanges:
     def test_it_changes_on_a_straight_line_over_the_ramp_time(self, robot: Robot) -> None:
-        controller = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
-        controller.reset(at(robot.home))
+        controller = started(robot, ImpedanceSettings(ramp_time=0.1))
         before = controller.in_force("right")
         asked = {
             **{"translational_stiffness": 500.0, "rotational_stiffness": 150.0, "damping_ratio": 0.5},
@@ -218,32 +168,24 @@ class TestAnImpedanceThatChanges:
         assert controller.in_force("left") == asked
 
     def test_another_change_begins_where_the_last_one_is_and_what_it_does_not_name_goes_on(self, robot: Robot) -> None:
-        controller = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
-        controller.reset(at(robot.home))
-
-        def tick(count: int) -> None:
-            for _ in range(count):
-                controller.step(reference(robot.home), at(robot.home), DT)
-
+        controller = started(robot, ImpedanceSettings(ramp_time=0.1))
         controller.change({"damping_ratio": 0.5, "nullspace_stiffness": 10.0})
-        tick(50)
-        controller.change({"damping_ratio": 1.75}, arm="left")
-        tick(50)
-        # What was not changed again was on its way for the ramp's time.
-        posture = [controller.in_force(arm)["nullspace_stiffness"] for arm in ("left", "right")]
-        assert posture == pytest.approx([10.0, 10.0])
-        assert [controller.in_force(arm)["damping_ratio"] for arm in ("left", "right")] == pytest.approx([1.25, 0.5])
-        tick(50)
-        assert [controller.in_force(arm)["damping_ratio"] for arm in ("left", "right")] == [1.75, 0.5]
+        for ticks, damping in ((50, None), (50, [1.25, 0.5]), (50, [1.75, 0.5])):
+            for _ in range(ticks):
+                controller.step(reference(robot.home), at(robot.home), DT)
+            if damping is None:
+                controller.change({"damping_ratio": 1.75}, arm="left")
+                continue
+            in_force = [controller.in_force(arm) for arm in ("left", "right")]
+            assert [values["damping_ratio"] for values in in_force] == pytest.approx(damping)
+            assert [values["nullspace_stiffness"] for values in in_force] == pytest.approx([10.0, 10.0])
 
     def test_what_is_in_force_afterwards_is_as_if_the_controller_had_been_made_with_it(self, robot: Robot) -> None:
         soft = {"translational_stiffness": 300.0, "damping_ratio": 0.4, "nullspace_stiffness": 20.0}
-        made = ImpedanceController(robot, ImpedanceSettings(**soft))
-        changed = ImpedanceController(robot)
+        made, changed = started(robot, ImpedanceSettings(**soft)), ImpedanceController(robot)
         changed.change(soft)
+        changed.reset(at(robot.home))
         random = np.random.default_rng(2)
-        for controller in (made, changed):
-            controller.reset(at(robot.home))
         for _ in range(50):
             q, v = robot.home + random.normal(0.0, 0.02, 14), random.normal(0.0, 0.1, 14)
             expected, found = (one.step(reference(robot.home), at(q, v), DT).tau for one in (made, changed))
@@ -272,13 +214,11 @@ class TestAnImpedanceThatChanges:
         assert controller.in_force("left") == before
 
 
-@pytest.mark.parametrize(("model", "joints"), [("panda", 7), ("ur5", 6)])
-def test_robots_whose_rotors_are_unknown_have_usual_ones(model: str, joints: int) -> None:
+@pytest.mark.parametrize(("model", "tool", "joints"), [("panda", "panda_hand", 7), ("ur5", "tool0", 6)])
+def test_robots_whose_rotors_are_unknown_have_usual_ones(model: str, tool: str, joints: int) -> None:
     import example_robot_data
 
-    loaded = example_robot_data.load(model)
-    tool = {"panda": "panda_hand", "ur5": "tool0"}[model]
-    robot = Robot.from_urdf(loaded.urdf, {"left": tool})
+    robot = Robot.from_urdf(example_robot_data.load(model).urdf, {"left": tool})
     np.testing.assert_array_equal(robot.model.armature, np.full(joints, 0.1))
     controller = ImpedanceController(robot)
     q = robot.home + 0.2

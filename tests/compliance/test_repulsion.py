@@ -1,7 +1,8 @@
+"""The wall between measured links: its energy, its stability, and arms that are pushed at it in MuJoCo."""
+
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -192,33 +193,29 @@ def test_settings_that_would_not_push_apart_or_would_add_energy_are_refused(key:
         WallSettings(**{key: 0.0})
 
 
-WEIGHTLESS = """<robot name="rod"><link name="base"/><link name="rod"/><joint name="hinge" type="revolute">
+ROD = """<robot name="rod"><link name="base"/><link name="rod"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge" type="revolute">
 <parent link="base"/><child link="rod"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
 
 
 def test_a_robot_without_pairs_meets_no_wall() -> None:
-    weight = '<link name="rod"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-    robot = Robot.from_urdf(WEIGHTLESS.replace('<link name="rod"/>', weight + "</inertial></link>"), {"left": "rod"})
+    robot = Robot.from_urdf(ROD, {"left": "rod"})
     report = MeasuredSeparation(robot, ControllerSettings()).update(np.zeros(1), np.ones(1))
     assert not report.tau.any()
     assert report.closest_distance == np.inf
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """One tick of a simulated push."""
-
-    report: WallReport
-    energy: float  # kinetic, of the wall and of what holds the right arm [J]
-    work: float  # done so far by the push [J]
-    distance: float  # of the closest pair by Coal [m]
-
-
 HOLD, HOLD_DAMPING = 2000.0, 60.0  # of the right arm's joints [Nm/rad, Nm s/rad]
 
 
-def _pushed(force: float, friction: float, dt: float, separation: MeasuredSeparation) -> Iterator[_Seen]:
-    """The left hand, 60 mm from the right one, is pushed at it for 1.5 s and released for 1.5 s."""
+def _pushed(
+    force: float, friction: float, dt: float, separation: MeasuredSeparation
+) -> Iterator[tuple[WallReport, float, float, float]]:
+    """The left hand, 60 mm from the right one, is pushed at it for 1.5 s and released for 1.5 s.
+
+    Yields the report, the energy of motion, of the wall and of what holds the right arm, the push's work [J], and the
+    distance of the closest pair by Coal [m].
+    """
     q = ROBOT.home.copy()
     while min(pair.distance for pair in ROBOT.distances(q) if _of_two_arms((pair.name_a, pair.name_b))) > 0.06:
         q += 0.005 * np.array([-1, *[0] * 6, 1, *[0] * 6])
@@ -237,7 +234,7 @@ def _pushed(force: float, friction: float, dt: float, separation: MeasuredSepara
         kinetic = 0.5 * float(state.v @ _mass_matrix(state.q) @ state.v)
         spring = 0.5 * HOLD * float(((held - state.q[7:]) ** 2).sum())
         coal = min(pair.distance for pair in ROBOT.distances(state.q)) if tick % 5 == 0 else report.closest_distance
-        yield _Seen(report, kinetic + spring + report.energy, work, coal)
+        yield report, kinetic + spring + report.energy, work, coal
         plant.apply(Command(CommandMode.TORQUE, state.q, state.v, tau, {}))
         plant.advance(dt)
 
@@ -253,36 +250,17 @@ def test_an_arm_pushed_at_the_other_with_40_newtons_never_touches_it_and_gets_no
     friction: float, dt: float, stiffness: float, least: float
 ) -> None:
     pressed, released = 0, []
-    for tick, seen in enumerate(_pushed(40.0, friction, dt, wall(stiffness=stiffness))):
-        assert seen.distance > least
-        assert seen.energy <= seen.work + 0.01, "the push's work is all there is"
-        pressed += bool(seen.report.pressing)
+    pushed = _pushed(40.0, friction, dt, wall(stiffness=stiffness))
+    for tick, (report, energy, work, distance) in enumerate(pushed):
+        assert distance > least
+        assert energy <= work + 0.01, "the push's work is all there is"
+        pressed += bool(report.pressing)
         if tick * dt > 1.5:
-            released.append(seen.energy)
+            released.append(energy)
             assert released[-1] <= released[0] + 1e-3
             assert len(released) < 2 or released[-1] <= released[-2] + 2e-4
     assert pressed * dt > 0.1
     assert released[-1] < 0.7 * released[0]
-
-
-def test_pressed_towards_the_table_the_arm_rests_where_the_spring_bears_the_force_and_the_torque_is_quiet() -> None:
-    plant, data = MujocoPlant(ROBOT, load_config("config/dual_iiwa7.yaml")), ROBOT.model.createData()
-    plant.push("left", np.array([0.0, 0.0, -40.0, 0.0, 0.0, 0.0]), 10.0)
-    depths, torques = [], []
-    for _ in range(2000):
-        state = plant.state()
-        report = wall().update(state.q, state.v)
-        assert report.closest_distance > 0.005
-        depths.append(SHELL - report.closest_distance)
-        torques.append(report.tau)
-        tau = pin.computeGeneralizedGravity(ROBOT.model, data, state.q) + report.tau - 10.0 * state.v
-        plant.apply(Command(CommandMode.TORQUE, state.q, state.v, tau, {}))
-        plant.advance(0.002)
-    assert report.pressing
-    assert all(map(_with_the_table, report.pressing))
-    deepest, alone = sum(depths[-100:]) / 100, 40.0 / WallSettings().stiffness
-    assert alone / 4 < deepest < alone, "the four capsules of the finger tips share the force"
-    assert np.abs(np.diff(torques[-500:], axis=0)).max() < 0.02
 
 
 def test_a_wall_begins_where_pairs_are_told_to_stay_later_as_if_it_had_been_made_so() -> None:

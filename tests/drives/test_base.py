@@ -8,18 +8,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control import CartesianController, Pipeline, Robot, load_config
+from q2r2_control import CartesianController, Robot
 from q2r2_control.drives.base import FEEDBACK_GAIN, TorqueDrive, VelocityDrive
-from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.types import CommandMode, Reference, RobotState, StepReport, StepStatus
+from tests.pipeline.loops import pipeline
 from tests.support.processes import Watch, cell
 
 
 @pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
 def test_in_velocity_mode_both_arms_follow_their_reference_within_every_limit(plant: str) -> None:
-    config = cell().model_copy(update={"loop_rate_hz": 500.0})
-    loop = Pipeline.from_config(config, input=ScriptedInput("circle", frequency_hz=0.5), plant=plant, mode="velocity")
+    loop = pipeline(plant=plant, mode="velocity")
     watch = Watch(loop)
     summary = loop.run(2.5, realtime=False)
     assert summary.at_rest
@@ -39,7 +38,7 @@ def at(q: np.ndarray, v: np.ndarray) -> Reference:
 
 
 def test_the_feedback_is_bounded_and_left_out_where_the_state_is_not_trusted() -> None:
-    loop = Pipeline.from_config(cell(), plant="kinematic", mode="velocity")
+    loop = pipeline(mode="velocity")
     drive, robot = loop.drive, loop.robot
     assert isinstance(drive, VelocityDrive)
     zero = np.zeros_like(robot.home)
@@ -56,23 +55,19 @@ def test_the_feedback_is_bounded_and_left_out_where_the_state_is_not_trusted() -
     assert not last.v.any()
 
 
-NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
-
 DT = 0.004
 
 
 @pytest.fixture(scope="module")
 def robot() -> Robot:
-    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+    return Robot.from_config(cell())
 
 
 def pulled(robot: Robot, has_servos: bool) -> tuple[TorqueDrive, Reference, RobotState]:
     """A drive whose reference has left the arms, which stand still, so that the spring pulls."""
-    config = load_config("config/dual_iiwa7.yaml")
-    controller, drive = (
-        CartesianController(robot, config.control.model_copy(update=NO_CLOCK)),
-        TorqueDrive(robot, config, has_servos),
-    )
+    # Whether a solution is late depends on the machine.
+    controller = CartesianController(robot, cell().control.model_copy(update={"solve_time_limit": None}))
+    drive = TorqueDrive(robot, cell(), has_servos)
     zero = np.zeros_like(robot.home)
     state = RobotState(robot.home, zero, zero, None, 0.0)
     drive.reset(state)
@@ -81,7 +76,7 @@ def pulled(robot: Robot, has_servos: bool) -> tuple[TorqueDrive, Reference, Robo
     for _ in range(100):
         reference = controller.step({"left": goal}, DT)
         command = drive.command(reference, state, {}, DT)
-    assert np.abs(command.tau - drive.gravity(robot.home)).max() > 10.0
+    assert np.abs(command.tau - drive.impedance.gravity(robot.home)).max() > 10.0
     return drive, reference, state
 
 
@@ -110,7 +105,7 @@ def test_the_wall_between_measured_links_is_part_of_the_command(robot: Robot) ->
     # Fold the left arm inwards until a measured pair is closer than allowed.
     q = state.q.copy()
     rng = np.random.default_rng(3)
-    kept = kept_distances(robot, load_config("config/dual_iiwa7.yaml").control).values
+    kept = kept_distances(robot, cell().control).values
     while not (robot.distance_values(q).min() > 0.0 and (robot.distance_values(q) - kept).min() < -0.01):
         q = rng.uniform(robot.position_lower, robot.position_upper)
     near = replace(state, q=q)

@@ -25,11 +25,9 @@ class Arms:
 
     def __init__(self, owns_plant: bool) -> None:
         config, robot = cell(), Robot.from_config(cell())
-        drive = make_drive(CommandMode.POSITION, robot, config)
+        drive, watch = make_drive(CommandMode.POSITION, robot, config), watch_settings(config.supervision, False)
         controller = CartesianController(robot, config.control)
-        self.loop = ControlLoop(
-            controller, drive, DT, StreamSettings(), watch_settings(config.supervision, False), owns_plant=owns_plant
-        )
+        self.loop = ControlLoop(controller, drive, DT, StreamSettings(), watch, owns_plant=owns_plant)
         self.home, self.now = robot.home, 0.0
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.tick import Tick
@@ -11,11 +12,12 @@ from tests.support.processes import cell, speed
 
 
 def pipeline(
-    trajectory: str = "circle", plant: str = "kinematic", mode: str = "position", **changes: object
+    source: Input | None = None, plant: str = "kinematic", mode: str = "position", **changes: object
 ) -> Pipeline:
     """At 500 Hz, the lowest rate with one substep a tick, since most of a test's time goes by ticks."""
     config = cell().model_copy(update={"loop_rate_hz": 500.0, **changes})
-    return Pipeline.from_config(config, input=ScriptedInput(trajectory, frequency_hz=0.5), plant=plant, mode=mode)
+    source = source or ScriptedInput("circle", frequency_hz=0.5)
+    return Pipeline.from_config(config, input=source, plant=plant, mode=mode)
 
 
 def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:

@@ -91,15 +91,3 @@ def test_a_gripper_that_something_keeps_from_closing_holds_nothing(monkeypatch: 
     assert watch.ticks[-1].targets["left"].gripper == 0.0
     assert loop.plant.gripper_openings()["left"] == pytest.approx(0.5, abs=0.05)
     assert not any(tick.holding["left"] for tick in watch.ticks)
-
-
-def test_a_gripper_closes_and_opens_with_the_upper_button_of_its_hand() -> None:
-    loop = Pipeline.from_config(cell(), input=LeftUpperPresses("line"), plant="mujoco")
-    watch = Watch(loop)
-    summary = loop.run(2.2, realtime=False)
-    assert {arm: figures.gripper_changes for arm, figures in summary.arms.items()} == {"left": 2, "right": 0}
-    openings = {t: watch.ticks[round(t * 1000)].grippers for t in (0.95, 1.55, 2.15)}
-    assert openings[0.95]["left"] > 0.95
-    assert openings[1.55]["left"] < 0.05
-    assert openings[2.15]["left"] > 0.95
-    assert all(opening["right"] > 0.95 for opening in openings.values())

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
 
-from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.summary.tick import Tick
-from q2r2_control.teleop.haptics import CONTACT, ENGAGED, FAULT, GRASP, LIMIT, NEAR, SLIP, Pulse
+from q2r2_control.teleop.haptics import CONTACT, ENGAGED, GRASP, LIMIT, NEAR, SLIP, Pulse
 from q2r2_control.types import Array, HapticFeedback
+from tests.pipeline.loops import pipeline
 from tests.support.hands_input import ENGAGED as BEGIN
 from tests.support.hands_input import HandsInput, Path
 from tests.support.operator_script import HANDS
-from tests.support.processes import cell
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -54,16 +50,9 @@ def straight(way: Array, duration: float = 1.5) -> Path:
     return path
 
 
-def run(hands: FeltHands, duration: float, plant: str = "kinematic", listener: Callable | None = None) -> None:
-    loop = Pipeline.from_config(cell().model_copy(update={"loop_rate_hz": 500.0}), input=hands, plant=plant)
-    if listener is not None:
-        loop.listeners.append(lambda tick: listener(loop, tick))
-    loop.run(duration, realtime=False)
-
-
 def test_engaging_is_felt_by_both_hands_and_every_vibration_ends_before_the_next_one_begins() -> None:
     hands = FeltHands(left=straight(0.25 * -np.eye(3)[1]))
-    run(hands, 2.5)
+    pipeline(hands).run(2.5, realtime=False)
     for hand in HANDS:
         assert hands.by(hand, ENGAGED) == [ENGAGED.amplitude]
         sent = [(t, one.amplitude > 0.0) for t, one in hands.felt if one.hand == hand]
@@ -74,7 +63,7 @@ def test_engaging_is_felt_by_both_hands_and_every_vibration_ends_before_the_next
 
 def test_an_arm_that_is_driven_at_the_other_is_felt_by_both_hands_stronger_and_stronger_and_then_no_more() -> None:
     hands = FeltHands(left=straight(0.5 * -np.eye(3)[1]))
-    run(hands, 5.0)
+    pipeline(hands).run(5.0, realtime=False)
     for hand in HANDS:
         amplitudes = hands.by(hand, NEAR)
         assert len(amplitudes) >= 4
@@ -87,23 +76,20 @@ def test_a_hand_that_goes_out_of_reach_feels_its_target_slip_and_one_that_turns_
         return np.append(np.zeros(3), 40.0 * straight(0.1 * UP, 4.0)(t)[:3])
 
     hands = FeltHands(left=straight(1.2 * UP, 3.0), right=turn)
-    run(hands, 6.0)
+    pipeline(hands).run(6.0, realtime=False)
     assert len(hands.by("left", SLIP)) >= 5
     assert 1 <= len(hands.by("right", LIMIT)) <= 3
     assert not hands.by("left", LIMIT)
 
 
 def test_a_push_at_the_tool_is_felt_by_its_hand_only() -> None:
-    hands, pushed = FeltHands(), False
-
-    def push(loop: Pipeline, tick: Tick) -> None:
-        nonlocal pushed
-        if tick.t > 1.0 and not pushed:
-            pushed = True
-            assert isinstance(loop.plant, MujocoPlant)
-            loop.plant.push("right", np.array([0.0, 0.0, 22.0, 0.0, 0.0, 0.0]), 0.5)
-
-    run(hands, 2.0, "mujoco", push)
+    hands = FeltHands()
+    loop = pipeline(hands, "mujoco")
+    plant = loop.plant
+    assert isinstance(plant, MujocoPlant)
+    force = np.array([0.0, 0.0, 22.0, 0.0, 0.0, 0.0])
+    loop.listeners.append(lambda tick: plant.push("right", force, 0.5) if 1.0 <= tick.t < 1.002 else None)
+    loop.run(2.0, realtime=False)
     assert len(hands.by("right", CONTACT)) >= 1
     assert CONTACT.amplitude < max(hands.by("right", CONTACT)) < 0.6
     assert not hands.by("left", CONTACT)
@@ -118,16 +104,5 @@ def test_a_gripper_that_closes_on_a_block_is_felt_once_and_an_empty_one_is_not()
                 self.grasps[feedback.hand] = self.grasps.get(feedback.hand, 0) + 1
 
     script = FeltScript("grasp")
-    config = cell().model_copy(update={"loop_rate_hz": 500.0})
-    Pipeline.from_config(config, input=script, plant="mujoco").run(14.0, realtime=False)
+    pipeline(script, "mujoco").run(14.0, realtime=False)
     assert script.grasps == {"right": 1}
-
-
-def test_a_refused_press_is_felt_as_a_fault_is() -> None:
-    hands = FeltHands()
-    loop = Pipeline.from_config(cell(), input=hands, plant="kinematic")
-    loop.listeners.append(
-        lambda tick: loop.teleop.pause(tick.now, Reason(ReasonKind.CONNECTION_LOST)) if tick.t > 0.5 else None
-    )
-    loop.run(0.6, realtime=False)
-    assert hands.by("left", FAULT) == [1.0]

@@ -15,31 +15,15 @@ from tests.support.processes import cell
 PACKAGE = """
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.plants.kinematic import KinematicPlant
-from q2r2_control.types import DeviceControls, HandInputs, HandSample
+from q2r2_control.types import DeviceControls
 
 
-class Pedal:
+class Pedal(ScriptedInput):
     controls = DeviceControls(buttons=("button_lower",), axes=())
-    connected = True
 
     @classmethod
     def from_config(cls, config):
-        return cls()
-
-    def start(self):
-        self._hands = ScriptedInput("circle")
-        self._hands.start()
-
-    def poll(self, now):
-        samples = self._hands.poll(now)
-        return [HandSample(s.hand, s.position, s.quaternion, s.pose_stamp,
-                           HandInputs(button_lower=s.inputs.button_lower), s.inputs_stamp) for s in samples]
-
-    def send_haptic(self, feedback):
-        pass
-
-    def close(self):
-        pass
+        return cls("circle")
 
 
 class Sluggish(KinematicPlant):

@@ -16,7 +16,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.loop.arm_conditions import ArmConditions
+from q2r2_control.loop.control_loop import ArmConditions
 from q2r2_control.types import SIDES, ActiveLimit, LimitKind, RobotState
 from tests.ros.conftest import need_ros
 from tests.ros.processes import CONFIG, Processes, RosProcess, as_arguments, subscribed, wait_until

@@ -12,8 +12,10 @@ import pinocchio as pin
 
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Event, Reason
+from q2r2_control.teleop.arm_states import is_refusal
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, ArmTarget, Array, HandInputs, HandSample
+from tests.support.reasons import kinds
 
 TICK = 0.001
 PERIOD = 0.013  # of the hands' samples [s]
@@ -33,7 +35,7 @@ def sample(
 
 @dataclass
 class Operator:
-    """Feeds a :class:`Teleop` at 1 kHz with both hands' samples at about 77 Hz; records every target."""
+    """Feeds a :class:`Teleop` at 1 kHz with both hands' samples at about 77 Hz; keeps events and the last targets."""
 
     settings: TeleopSettings = field(default_factory=TeleopSettings)
     arms: tuple[str, ...] = SIDES
@@ -52,6 +54,8 @@ class Operator:
     obstacles: dict[str, Reason] = field(default_factory=dict)
     lower: set[str] = field(default_factory=set)  # hands that hold the button
     upper: set[str] = field(default_factory=set)
+    held: dict[str, float] = field(default_factory=dict)  # how far other controls are pushed, by their bindings' names
+    only: str | None = None  # the hand that pushes them; None: both
     silent: set[str] = field(default_factory=set)  # hands that send nothing
     alter: Callable[[HandSample], HandSample] = lambda received: received
     events: list[Event] = field(default_factory=list)
@@ -63,11 +67,18 @@ class Operator:
 
     def samples(self) -> list[HandSample]:
         """What both hands send now."""
-        return [
-            self.alter(sample(hand, self.hands[hand], self.now, lower=hand in self.lower, upper=hand in self.upper))
+        found = [
+            sample(hand, self.hands[hand], self.now, lower=hand in self.lower, upper=hand in self.upper)
             for hand in SIDES
             if hand not in self.silent
         ]
+        pushed: dict[str, Any] = {
+            name: value * share for control, share in self.held.items() for name, value in PUSHED[control].items()
+        }
+        for index, one in enumerate(found):
+            if one.hand == (self.only or one.hand):
+                found[index] = replace(one, inputs=replace(one.inputs, **pushed))
+        return [self.alter(one) for one in found]
 
     def tick(self, samples: list[HandSample] | None = None, dt: float = TICK) -> dict[str, ArmTarget]:
         self.now += dt
@@ -99,6 +110,27 @@ class Operator:
         held.difference_update(hands)
         self.run(0.1)
 
+    def push(self, control: str, hand: str = "left") -> None:
+        """Push a control for 0.1 s, after which it rests for as long."""
+        self.only, self.held = hand, {control: 1.0}
+        self.run(0.1)
+        self.held = {}
+        self.run(0.1)
+
+    def place(self, arm: str = "left") -> pin.SE3:
+        """The target of an arm that has one."""
+        target = self.targets[arm].pose
+        assert target is not None
+        return target
+
+    def assert_holds(self, duration: float = 0.4) -> None:
+        """Both arms hold at every tick, although the hands go on waving."""
+        for targets in self.run(duration, waving(self)):
+            assert all(target.pose is None for target in targets.values())
+
+    def refusals(self) -> set[str]:
+        return {kinds(event.reason) for event in self.events if is_refusal(event)}
+
     def engage(self, *hands: str) -> None:
         self.run(0.05)
         self.press(*(hands or SIDES))
@@ -114,10 +146,9 @@ def spoilt(received: HandSample, **changes: object) -> HandSample:
 
 
 History = list[dict[str, ArmTarget]]
-IDLE, LOST, PAUSED, HOMING, STOPPED = (
-    dict.fromkeys(SIDES, state) for state in ("idle", "lost", "paused", "homing", "stopped")
+IDLE, ENGAGED, LOST, PAUSED, HOMING, STOPPED = (
+    dict.fromkeys(SIDES, state) for state in ("idle", "engaged", "lost", "paused", "homing", "stopped")
 )
-ENGAGED = {"left": "engaged", "right": "engaged"}
 
 
 def operator(**changes: object) -> Operator:
@@ -144,8 +175,8 @@ def sidewards(way: float) -> Array:
     return np.array([0.0, way, 0.0])
 
 
-def first_targets(history: History, arm: str) -> pin.SE3:
-    return next(targets[arm].pose for targets in history if targets[arm].pose is not None)
+def first_target(history: History, arm: str) -> pin.SE3:
+    return next(pose for targets in history if (pose := targets[arm].pose) is not None)
 
 
 def assert_smooth(history: History, largest: float = 0.002) -> None:
@@ -158,13 +189,6 @@ def assert_smooth(history: History, largest: float = 0.002) -> None:
                 assert np.linalg.norm(pin.log3(a.rotation.T @ b.rotation)) < 3 * largest
 
 
-def assert_holds(driver: Operator, duration: float = 0.4) -> None:
-    """Both arms hold at every tick, although the hands go on waving."""
-    for targets in driver.run(duration, waving(driver)):
-        assert targets["left"].pose is None
-        assert targets["right"].pose is None
-
-
 PUSHED: dict[str, dict[str, Any]] = {
     "trigger": {"press_index": 1.0},
     "grip": {"press_middle": 1.0},
@@ -173,25 +197,3 @@ PUSHED: dict[str, dict[str, Any]] = {
     "stick_left": {"thumb_stick_horizontal": -1.0},
     "stick_right": {"thumb_stick_horizontal": 1.0},
 }
-
-
-class Squeezing(Operator):
-    """Holds controls of both hands, by the names of the bindings."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.held: dict[str, float] = {}
-        self.only: str | None = None  # the hand that holds them; None: both
-        self.alter = self._squeeze
-
-    def _squeeze(self, received: HandSample) -> HandSample:
-        if received.hand != (self.only or received.hand):
-            return received
-        values: dict[str, Any] = {
-            field: value * share for control, share in self.held.items() for field, value in PUSHED[control].items()
-        }
-        return replace(received, inputs=replace(received.inputs, **values))
-
-
-def squeezing(**changes: object) -> Squeezing:
-    return Squeezing(operator(**changes).settings)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -14,32 +13,12 @@ from q2r2_control.config.bindings import HELD, Action, BindingSettings
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.gestures import HeldControls, travel
 from q2r2_control.types import SIDES, HandInputs
-from tests.teleop.hands import (
-    ENGAGED,
-    IDLE,
-    LOST,
-    PAUSED,
-    PUSHED,
-    Operator,
-    Squeezing,
-    assert_smooth,
-    spoilt,
-    squeezing,
-    waving,
-)
+from tests.teleop import hands
+from tests.teleop.hands import ENGAGED, IDLE, LOST, PAUSED, PUSHED, Operator, assert_smooth, spoilt, waving
 
 
-def engaged(**bindings: str) -> Squeezing:
-    driver = squeezing(bindings=bindings)
-    driver.engage()
-    assert driver.states == ENGAGED
-    return driver
-
-
-def place(driver: Operator, arm: str = "left") -> pin.SE3:
-    target = driver.targets[arm].pose
-    assert target is not None
-    return target
+def engaged(**bindings: str) -> Operator:
+    return hands.engaged(bindings=bindings)
 
 
 def shift(driver: Operator, way: np.ndarray, turn: np.ndarray, duration: float = 1.0) -> list:
@@ -54,12 +33,6 @@ def shift(driver: Operator, way: np.ndarray, turn: np.ndarray, duration: float =
         }
 
     return driver.run(duration + 0.8, move)
-
-
-def later(wave: Any, by: float, t: float) -> dict[str, pin.SE3]:
-    """A motion of the hands that has gone on for so long [s]."""
-    hands: dict[str, pin.SE3] = wave(t + by)
-    return hands
 
 
 WAY, TURN = np.array([0.1, -0.05, 0.08]), np.array([0.1, 0.3, -0.2])
@@ -78,9 +51,9 @@ def test_what_is_held_scales_the_motion_for_as_long_as_it_is_held_and_nothing_ju
     for held, shares in ((1.0, (position, rotation)), (0.0, (1.0, 1.0))):
         driver.held = {control: held}
         history += driver.run(0.1)
-        before = place(driver)
+        before = driver.place()
         history += shift(driver, WAY, TURN)
-        after = place(driver)
+        after = driver.place()
         np.testing.assert_allclose(after.translation - before.translation, shares[0] * WAY, atol=2e-4)
         np.testing.assert_allclose(pin.log3(after.rotation @ before.rotation.T), shares[1] * TURN, atol=1e-3)
     assert_smooth(history)
@@ -89,29 +62,29 @@ def test_what_is_held_scales_the_motion_for_as_long_as_it_is_held_and_nothing_ju
 def test_pressing_and_letting_go_in_mid_motion_does_not_jump_either() -> None:
     driver = engaged(grip="precision", trigger="rotation_lock", stick_up="translation_lock")
     wave = waving(driver, 0.2)
-    history, began, random = [], driver.now, np.random.default_rng(2)
-    for _ in range(40):
+    history, random = [], np.random.default_rng(2)
+    for turn in range(40):
         driver.held = {control: float(random.random() < 0.5) for control in ("grip", "trigger", "stick_up")}
-        history += driver.run(0.05, partial(later, wave, driver.now - began))
+        history += driver.run(0.05, lambda t, turn=turn: wave(t + 0.05 * turn))  # type: ignore[misc]
     assert_smooth(history)
     assert driver.states == ENGAGED
 
 
 def test_an_arm_that_is_engaged_while_precision_is_held_begins_with_it() -> None:
-    driver = squeezing(bindings={"grip": "precision"})
+    driver = hands.operator(bindings={"grip": "precision"})
     driver.run(0.1)
     driver.held = {"grip": 1.0}
     driver.engage()
-    before = place(driver)
+    before = driver.place()
     shift(driver, WAY, np.zeros(3))
-    np.testing.assert_allclose(place(driver).translation - before.translation, 0.25 * WAY, atol=2e-4)
+    np.testing.assert_allclose(driver.place().translation - before.translation, 0.25 * WAY, atol=2e-4)
 
 
 class TestADeadMan:
     BINDINGS: ClassVar[dict[str, str]] = {"lower": "none", "grip": "dead_man"}
 
-    def driver(self) -> Squeezing:
-        driver = squeezing(bindings=self.BINDINGS)
+    def driver(self) -> Operator:
+        driver = hands.operator(bindings=self.BINDINGS)
         driver.run(0.1)
         assert driver.states == IDLE
         return driver
@@ -147,7 +120,7 @@ class TestADeadMan:
 
     @pytest.mark.parametrize("lost", [False, True])
     def test_that_is_held_while_the_connection_comes_up_does_nothing(self, lost: bool) -> None:
-        driver = squeezing(bindings=self.BINDINGS)
+        driver = hands.operator(bindings=self.BINDINGS)
         driver.held = {"grip": 1.0}
         driver.run(0.2)
         assert driver.states == IDLE

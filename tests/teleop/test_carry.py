@@ -9,27 +9,19 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.teleop.arm_states import is_fault, is_refusal
+from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.types import SIDES, ArmTarget
-from tests.support.reasons import kinds
-from tests.teleop.hands import ENGAGED, PAUSED, Squeezing, assert_holds, assert_smooth, squeezing
+from tests.teleop.hands import ENGAGED, PAUSED, Operator, assert_smooth, engaged, operator
 
 BINDINGS = {"grip": "carry", "stick_down": "home", "stick_left": "stop"}
 CARRYING = {"left": "engaged", "right": "carried"}
 
 
-def push(driver: Squeezing, control: str, hand: str = "left") -> None:
-    driver.only, driver.held = hand, {control: 1.0}
-    driver.run(0.1)
-    driver.held = {}
-    driver.run(0.1)
-
-
-def carrying(*hands: str, **changes: object) -> Squeezing:
+def carrying(*hands: str, **changes: object) -> Operator:
     """The left hand carries, after ``hands`` were engaged."""
-    driver = squeezing(bindings=BINDINGS, **changes)
-    driver.engage(*(hands or SIDES))
-    push(driver, "grip")
+    driver = operator(bindings=BINDINGS, **changes)
+    driver.engage(*hands)
+    driver.push("grip")
     assert driver.states == CARRYING
     return driver
 
@@ -41,7 +33,7 @@ def relation(targets: dict[str, ArmTarget]) -> pin.SE3:
     return left.actInv(right)
 
 
-def turning(driver: Squeezing, way: float = 0.2, angle: float = 0.6) -> Callable[[float], dict[str, pin.SE3]]:
+def turning(driver: Operator, way: float = 0.2, angle: float = 0.6) -> Callable[[float], dict[str, pin.SE3]]:
     """The left hand goes along and turns within a second; the right one wanders about as it likes."""
     left, right = (driver.hands[hand] for hand in SIDES)
 
@@ -60,18 +52,16 @@ def turning(driver: Squeezing, way: float = 0.2, angle: float = 0.6) -> Callable
 class TestBothTools:
     def test_keep_their_relation_at_every_tick_and_turn_about_the_point_between_them(self) -> None:
         driver = carrying()
-        before = {arm: driver.targets[arm].pose for arm in SIDES}
-        history = driver.run(1.5, turning(driver))
-        for targets in history:
-            assert relation(targets).isApprox(relation({arm: ArmTarget(before[arm], 1.0) for arm in SIDES}), 1e-9)
-        middles = [np.mean([t[arm].pose.translation for arm in SIDES], axis=0) for t in history]  # type: ignore[union-attr]
-        np.testing.assert_allclose(middles[-1] - middles[0], (0.2, 0.1, -0.1), atol=1e-3)
-        turned = history[-1]["right"].pose.rotation @ before["right"].rotation.T  # type: ignore[union-attr]
+        before, start = relation(driver.targets), {arm: driver.place(arm) for arm in SIDES}
+        for targets in driver.run(1.5, turning(driver)):
+            assert relation(targets).isApprox(before, 1e-9)
+        ways = [driver.place(arm).translation - start[arm].translation for arm in SIDES]
+        np.testing.assert_allclose(np.mean(ways, axis=0), (0.2, 0.1, -0.1), atol=1e-3)
+        turned = driver.place("right").rotation @ start["right"].rotation.T
         np.testing.assert_allclose(pin.log3(turned), (0.0, 0.18, 0.6), atol=5e-3)
 
     def test_do_not_jump_when_it_begins_in_mid_motion(self) -> None:
-        driver = squeezing(bindings=BINDINGS)
-        driver.engage()
+        driver = engaged(bindings=BINDINGS)
         move = turning(driver)
         history = driver.run(0.4, move)
         driver.only, driver.held = "left", {"grip": 1.0}
@@ -81,30 +71,25 @@ class TestBothTools:
 
     @pytest.mark.parametrize("hand", SIDES)
     def test_are_led_by_the_hand_that_asked(self, hand: str) -> None:
-        driver = squeezing(bindings=BINDINGS)
-        driver.engage()
-        push(driver, "grip", hand)
+        driver = engaged(bindings=BINDINGS)
+        driver.push("grip", hand)
         assert driver.states == {hand: "engaged", ("right" if hand == "left" else "left"): "carried"}
         assert [arm for arm, target in driver.targets.items() if target.hand is not None] == [hand]
 
     def test_need_only_the_arm_of_that_hand_engaged_and_the_other_one_does_not_move_when_it_begins(self) -> None:
         driver = carrying("left")
-        held = driver.targets["right"].pose
-        assert held is not None
-        assert held.isApprox(driver.tools["right"], 1e-6)
+        assert driver.place("right").isApprox(driver.tools["right"], 1e-6)
 
     def test_are_held_back_together_where_one_arm_cannot_follow(self) -> None:
         driver = carrying()
-        poses: dict[str, Any] = {arm: driver.targets[arm].pose for arm in SIDES}
+        poses = {arm: driver.place(arm) for arm in SIDES}
         move = turning(driver, angle=0.0)
         for tick in range(1500):
             driver.hands |= move(0.001 * tick)
-            left = driver.targets["left"].pose
-            assert left is not None
-            driver.commanded = {"left": left, "right": poses["right"]}  # which is stuck
+            driver.commanded = {"left": driver.place(), "right": poses["right"]}  # which is stuck
             driver.tick()
             for arm in SIDES:
-                away = driver.targets[arm].pose.translation - poses[arm].translation  # type: ignore[union-attr]
+                away = driver.place(arm).translation - poses[arm].translation
                 assert np.linalg.norm(away) < 0.03 + (0.01 if arm == "right" else 0.0) + 1e-6
         assert driver.targets["left"].slip > 0.15
 
@@ -116,13 +101,11 @@ class TestBothTools:
     def test_keep_their_relation(self, in_step: bool, top: float, least: float, greatest: float) -> None:
         driver = carrying(workspace={"right": {"x": [0.3, 0.7], "y": [-0.7, 0.7], "z": [0.3, top]}})
         driver.in_step = in_step
-        begin = {arm: driver.targets[arm].pose for arm in SIDES}
-        right = begin["right"]
-        assert right is not None
+        right = driver.place("right")
         late = pin.SE3(right.rotation, right.translation - np.array([0.0, 0.0, 0.004]))
-        driver.commanded = {"left": begin["left"], "right": late}
+        driver.commanded = {"left": driver.place(), "right": late}
         driver.run(0.2)
-        raised = driver.targets["right"].pose.translation[2] - right.translation[2]  # type: ignore[union-attr]
+        raised = driver.place("right").translation[2] - right.translation[2]
         assert least < raised < greatest
 
     def test_both_stay_in_their_boxes(self) -> None:
@@ -142,18 +125,18 @@ class TestItEnds:
     @pytest.mark.parametrize(
         "end",
         [
-            pytest.param(lambda driver: push(driver, "grip"), id="by the same control"),
-            pytest.param(lambda driver: push(driver, "grip", "right"), id="by the same control of the other hand"),
+            pytest.param(lambda driver: driver.push("grip"), id="by the same control"),
+            pytest.param(lambda driver: driver.push("grip", "right"), id="by the same control of the other hand"),
             pytest.param(lambda driver: driver.press("left"), id="by a pause"),
             pytest.param(lambda driver: driver.press("right"), id="by a pause of the other hand"),
         ],
     )
-    def test_for_both_arms_which_hold_until_they_are_engaged_anew(self, end: Callable[[Squeezing], Any]) -> None:
+    def test_for_both_arms_which_hold_until_they_are_engaged_anew(self, end: Callable[[Operator], Any]) -> None:
         driver = carrying()
         end(driver)
         assert driver.states == PAUSED
         assert not any(map(is_fault, driver.events))
-        assert_holds(driver)
+        driver.assert_holds()
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
@@ -163,11 +146,10 @@ class TestItEnds:
         driver.press("left")
         driver.press("left")
         assert driver.states == {"left": "engaged", "right": "paused"}
-        held = driver.targets["left"].pose
-        assert held is not None
+        held = driver.place()
         driver.commanded = {"left": held}  # which is stuck
         driver.run(1.5, turning(driver, angle=0.0))
-        away = driver.targets["left"].pose.translation - held.translation  # type: ignore[union-attr]
+        away = driver.place().translation - held.translation
         assert 0.09 < np.linalg.norm(away) < 0.1 + 1e-6  # of which less where the hand has come back a little
 
     @pytest.mark.parametrize("hand", SIDES)
@@ -178,7 +160,7 @@ class TestItEnds:
         driver.lower, driver.upper = set(), set()
         driver.run(0.3)
         assert driver.states == PAUSED
-        assert_holds(driver)
+        driver.assert_holds()
 
     @pytest.mark.parametrize("linked", [True, False])
     def test_with_a_fault_of_the_hand_that_leads(self, linked: bool) -> None:
@@ -186,7 +168,7 @@ class TestItEnds:
         driver.silent = {"left"}
         driver.run(0.3)
         assert driver.states == {"left": "lost", "right": "lost" if linked else "paused"}
-        assert_holds(driver)
+        driver.assert_holds()
 
     def test_not_with_a_fault_of_the_other_hand_which_may_be_put_down(self) -> None:
         driver = carrying()
@@ -197,7 +179,7 @@ class TestItEnds:
 
     def test_with_a_stop_and_with_a_lost_connection(self) -> None:
         driver = carrying()
-        push(driver, "stick_left", "right")
+        driver.push("stick_left", "right")
         assert driver.states == {"left": "stopped", "right": "stopped"}
         driver = carrying()
         driver.teleop.connection_lost(driver.now)
@@ -206,30 +188,23 @@ class TestItEnds:
 
 
 class TestItDoesNotBegin:
-    @pytest.mark.parametrize(
-        ("engaged", "expected"),
-        [((), "not_carried: engage_first"), (("right",), "not_carried: engage_first")],
-    )
-    def test_for_an_arm_that_is_not_engaged(self, engaged: tuple[str, ...], expected: str) -> None:
-        driver = squeezing(bindings=BINDINGS)
-        driver.run(0.1)
-        if engaged:
-            driver.engage(*engaged)
-        push(driver, "grip")
-        assert "carried" not in driver.states.values()
-        assert [kinds(event.reason) for event in driver.events if is_refusal(event)] == [expected]
+    def test_for_an_arm_that_is_not_engaged(self) -> None:
+        driver = operator(bindings=BINDINGS)
+        driver.engage("right")
+        driver.push("grip")
+        assert driver.states == {"left": "idle", "right": "engaged"}
+        assert driver.refusals() == {"not_carried: engage_first"}
 
     def test_where_a_tool_is_held_up(self) -> None:
-        driver = squeezing(bindings=BINDINGS)
-        driver.engage()
-        driver.commanded = {arm: driver.targets[arm].pose for arm in SIDES}
+        driver = engaged(bindings=BINDINGS)
+        driver.commanded = {arm: driver.place(arm) for arm in SIDES}
         driver.run(1.0, turning(driver))
-        push(driver, "grip")
+        driver.push("grip")
         assert driver.states == ENGAGED
-        assert {kinds(event.reason) for event in driver.events if is_refusal(event)} == {"not_carried: tool_held_up"}
+        assert driver.refusals() == {"not_carried: tool_held_up"}
 
     def test_and_while_it_lasts_the_arms_do_not_go_home(self) -> None:
         driver = carrying()
-        push(driver, "stick_down")
+        driver.push("stick_down")
         assert driver.states == CARRYING
-        assert {kinds(event.reason) for event in driver.events if is_refusal(event)} == {"not_homing: carrying"}
+        assert driver.refusals() == {"not_homing: carrying"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
@@ -39,13 +38,11 @@ def test_an_arm_that_moves_goes_on_without_a_jump(changes: dict[str, object]) ->
 def test_what_was_changed_counts_from_then_on() -> None:
     driver = engaged()
     assert driver.teleop.change(settings(driver, position_scale=0.5), driver.now) is None
-    start = dict(driver.hands)
-    moved = {hand: pin.SE3(at.rotation, at.translation + np.array([0.1, 0.0, 0.0])) for hand, at in start.items()}
-    driver.run(1.0, lambda t: {hand: pin.SE3.Interpolate(start[hand], moved[hand], min(t, 1.0)) for hand in SIDES})
+    driver.run(1.0, waving(driver, 0.1))
     driver.run(0.5)
     for arm in SIDES:
-        way = driver.targets[arm].pose.translation - driver.tools[arm].translation  # type: ignore[union-attr]
-        np.testing.assert_allclose(way, (0.05, 0.0, 0.0), atol=1e-3)
+        way = driver.place(arm).translation - driver.tools[arm].translation
+        np.testing.assert_allclose(way, (0.0, 0.05, 0.0), atol=1e-3)
 
 
 @pytest.mark.parametrize(

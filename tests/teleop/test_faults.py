@@ -19,14 +19,12 @@ from tests.teleop.hands import (
     ENGAGED,
     IDLE,
     LOST,
-    assert_holds,
     assert_smooth,
     engaged,
-    first_targets,
+    first_target,
     operator,
     pose,
     sample,
-    sidewards,
     spoilt,
     waving,
 )
@@ -54,7 +52,7 @@ def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
     assert [event.arm for event in last] == (["left", "right"] if linked else ["left"])
     driver.alter = lambda s: s
     if linked:
-        assert_holds(driver)
+        driver.assert_holds()
     driver.press("left")
     assert driver.states["left"] == "engaged"
 
@@ -62,8 +60,6 @@ def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
 @pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
 def test_what_stops_one_arm_outside_of_this_layer_stops_the_linked_one_once(linked: bool) -> None:
     driver = engaged(linked=linked)
-    driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN), "left")
-    assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
     driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN), "left")
     assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
     driver.run(0.1)
@@ -102,26 +98,10 @@ def test_after_silence_the_hand_may_come_back_anywhere_and_the_arm_stays() -> No
     driver.run(0.3)
     driver.hands["left"] = pose(2.0, 2.0, 2.0, (1.0, 1.0, 1.0))
     driver.silent = set()
-    assert_holds(driver)
+    driver.assert_holds()
     driver.lower = {"left"}
-    first = first_targets(driver.run(0.2), "left")
+    first = first_target(driver.run(0.2), "left")
     np.testing.assert_allclose(first.translation, driver.tools["left"].translation, atol=1e-9)
-
-
-def test_a_button_held_through_a_fault_does_not_engage_again_until_released_and_pressed() -> None:
-    driver = operator()
-    driver.run(0.1)
-    driver.lower = set(SIDES)
-    driver.run(0.3)
-    assert driver.states == ENGAGED
-    driver.silent = set(SIDES)
-    driver.run(0.3)
-    driver.silent = set()
-    assert_holds(driver)
-    driver.lower = set()
-    assert_holds(driver)
-    driver.press(*SIDES)
-    assert driver.states == ENGAGED
 
 
 def test_a_reading_of_the_buttons_that_was_overtaken_presses_nothing() -> None:
@@ -140,7 +120,7 @@ def test_a_lost_connection_pauses_every_arm_and_wants_fresh_poses_and_a_new_pres
     assert driver.states == LOST
     assert {event.kind for event in driver.teleop.take_events()} == {"connection_lost"}
     driver.lower = set(SIDES)
-    assert_holds(driver)
+    driver.assert_holds()
     driver.lower = set()
     driver.run(0.1)
     driver.press(*SIDES)
@@ -171,16 +151,16 @@ def test_engaging_is_refused_when_the_tools_pose_is(tools: dict[str, pin.SE3]) -
     driver.tools = tools
     driver.engage()
     assert driver.states == IDLE
-    assert {kinds(event.reason) for event in driver.events} == {"not_engaged: tool_unknown"}
+    assert driver.refusals() == {"not_engaged: tool_unknown"}
 
 
 def test_a_stalled_loop_disengages_instead_of_catching_up() -> None:
     driver = engaged()
     driver.run(0.1, waving(driver))
-    driver.hands = {hand: pose(*(at.translation + sidewards(0.1))) for hand, at in driver.hands.items()}
+    driver.hands = {hand: pose(1.0) for hand in SIDES}
     driver.now += 1.0
     assert driver.tick(driver.samples())["left"].pose is None
-    assert_holds(driver)
+    driver.assert_holds()
 
 
 @pytest.mark.parametrize("back", [0.001, 0.1], ids=["a millisecond", "a tenth of a second"])
@@ -201,27 +181,9 @@ def test_a_clock_that_cannot_be_followed_disengages_and_a_press_on_the_new_one_e
     assert targets["left"].pose is targets["right"].pose is None
     if math.isfinite(now):
         driver.now = driver._next_sample = now
-    assert_holds(driver)
+    driver.assert_holds()
     driver.press(*SIDES)
     assert driver.states == ENGAGED
-
-
-def test_bursts_doubled_overtaken_and_unknown_samples_make_no_jump() -> None:
-    driver = engaged()
-    history = [driver.targets]
-    hand = driver.hands["left"].translation
-    for burst in range(20):
-        samples = [
-            sample("left", pose(*(hand + sidewards(0.002 * (burst + k / 50)))), driver.now - 0.0002 * (50 - k))
-            for k in range(50)
-        ]
-        samples += [samples[-1], samples[3], samples[-1]]
-        samples += [replace(samples[0], hand=name) for name in ("middle", "")]
-        history.append(driver.tick([*samples, sample("right", driver.hands["right"], driver.now)]))
-        history += driver.run(0.02, lambda t: {}) if burst % 3 == 0 else [driver.tick([]) for _ in range(20)]
-        driver.silent = {"left"}
-    assert driver.states == ENGAGED
-    assert_smooth(history)
 
 
 values = st.one_of(st.floats(allow_nan=True), st.sampled_from([0.0, 1.0, math.nan, math.inf, 1e308]))

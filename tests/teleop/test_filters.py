@@ -32,37 +32,17 @@ def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float =
     return FilterSettings().delay, outputs
 
 
-def errors(path: Path, since: float, dt: float = 0.002, **options: float) -> tuple[float, float]:
-    """RMS distance [m] and angle [rad] from the path shifted by the stated delay, at every tick from ``since`` on."""
-    delay, outputs = follow(path, dt=dt, **options)
-    distances, angles = [], []
-    for tick, output in enumerate(outputs):
-        if tick * dt >= since:
-            ideal = path(tick * dt - delay)
-            distances.append(np.linalg.norm(output.translation - ideal.translation))
-            angles.append(np.linalg.norm(pin.log3(ideal.rotation.T @ output.rotation)))
-    return math.sqrt(np.mean(np.square(distances))), math.sqrt(np.mean(np.square(angles)))
-
-
 @pytest.mark.parametrize("dt", [0.001, 0.02], ids="loop of {} s".format)
 @pytest.mark.parametrize("speed", [0.02, 2.0], ids="{} per second".format)
 def test_a_steady_motion_comes_out_late_by_exactly_the_stated_delay_at_any_speed(speed: float, dt: float) -> None:
     def path(t: float) -> pin.SE3:
         return pose(speed * t, 0.0, 0.0, (0.0, 0.0, speed * t))
 
-    distance, angle = errors(path, since=2.0, dt=dt)
-    tolerance = 1e-3  # [s]
-    assert distance < speed * tolerance
-    assert angle < speed * tolerance
-
-
-@pytest.mark.parametrize("frequency", [0.5], ids="{} Hz".format)
-def test_a_circle_keeps_its_shape_to_a_millimetre(frequency: float) -> None:
-    def path(t: float) -> pin.SE3:
-        phase = 2 * math.pi * frequency * t
-        return pose(0.0, 0.1 * math.sin(phase), 0.1 * (1 - math.cos(phase)))
-
-    assert errors(path, since=0.7)[0] < 1e-3
+    delay, outputs = follow(path, dt=dt)
+    for tick in range(round(2.0 / dt), len(outputs)):
+        missing = path(tick * dt - delay).actInv(outputs[tick])
+        assert np.linalg.norm(missing.translation) < speed * 1e-3
+        assert np.linalg.norm(pin.log3(missing.rotation)) < speed * 1e-3
 
 
 @pytest.mark.parametrize("frequency", [8.0, 12.0], ids="{} Hz".format)
@@ -97,18 +77,6 @@ def test_the_output_moves_in_every_tick_although_samples_come_every_thirteenth()
     np.testing.assert_allclose(speeds, 0.2, rtol=0.02)
 
 
-def test_a_reset_filter_rests_at_its_pose_whatever_went_before() -> None:
-    pose_filter = PoseFilter(FilterSettings())
-    pose_filter.reset(floats_of(pose()), 0.0)
-    for tick in range(100):
-        pose_filter.add(floats_of(pose(0.01 * tick, turn=(0.02 * tick, 0, 0))), tick * 0.013, tick * 0.013)
-        pose_filter.at(tick * 0.013)
-    pose_filter.reset(floats_of(STILL), 1.3)
-    for tick in range(200):
-        output = se3_of(pose_filter.at(1.3 + 0.001 * tick))
-        np.testing.assert_allclose(output.homogeneous, STILL.homogeneous, atol=1e-12)
-
-
 def largest_step(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> float:
     """Largest step of the output in 1 ms, for samples (stamp, x) that arrive at given times."""
     pose_filter = PoseFilter(FilterSettings())
@@ -138,15 +106,6 @@ def largest_step(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> flo
 )
 def test_the_output_is_continuous_when_the_stream_has(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> None:
     assert largest_step(arrivals) < 0.006
-
-
-def test_a_clock_that_stands_still_or_goes_back_returns_the_same_pose() -> None:
-    pose_filter = PoseFilter(FilterSettings())
-    pose_filter.reset(floats_of(pose()), 1.0)
-    pose_filter.add(floats_of(pose(0.1)), 1.01, 1.01)
-    here = pose_filter.at(1.02)
-    for now in (1.02, 1.0, -5.0):
-        assert pose_filter.at(now) == here
 
 
 def test_a_rotation_that_is_filtered_for_long_stays_one() -> None:

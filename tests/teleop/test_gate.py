@@ -42,12 +42,9 @@ def gate() -> PoseGate:
     ids=str,
 )
 def test_a_pose_that_is_not_finite_or_not_a_rotation_is_refused_and_leaves_no_pose(changes: dict[str, object]) -> None:
-    spoilt = replace(GOOD, pose_stamp=1.01, **changes)  # type: ignore[arg-type]
     passed = gate()
-    usable, fault = passed.receive(spoilt, 1.01)
-    assert not usable
-    assert fault is not None
-    assert passed.pose is None
+    usable, fault = passed.receive(replace(GOOD, pose_stamp=1.01, **changes), 1.01)  # type: ignore[arg-type]
+    assert (usable, kinds(fault), passed.pose) == (False, "pose_unusable", None)
 
 
 @pytest.mark.parametrize("factor", [-1.0, -1e-3])
@@ -108,9 +105,6 @@ def test_before_any_pose_inputs_alone_are_no_fault_and_a_stamp_that_is_no_number
     assert fresh.stale(1.0)
 
 
-# Speed ---------------------------------------------------------------------------------------------------------------
-
-
 def faults_of_a_motion(speed: float, receipts: list[float], turning: bool = False) -> list[str]:
     """Faults of a hand at a constant speed [m/s or rad/s], sampled at 75 Hz and received at these times [s]."""
     passed = PoseGate(GateSettings())
@@ -144,16 +138,11 @@ def test_samples_that_a_network_held_up_and_delivers_at_once_are_no_speed(stall:
 
 def test_no_speed_is_taken_across_a_jump_which_is_a_fault_of_its_own() -> None:
     passed = PoseGate(GateSettings(max_speed=1.0))
-    for index in range(10):
-        passed.receive(sample("left", pose(), EVEN[index]), EVEN[index])
-    found = []
-    for index in range(10, 20):
-        found.append(passed.receive(sample("left", pose(0.5), EVEN[index]), EVEN[index])[1])
+    for stamp in EVEN[:10]:
+        passed.receive(sample("left", pose(), stamp), stamp)
+    found = [passed.receive(sample("left", pose(0.5), stamp), stamp)[1] for stamp in EVEN[10:20]]
     assert kinds(found[0]) == "hand_jumped"
     assert found[1:] == [None] * 9
-
-
-# A fault that the input found ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fault", sorted(HandFault))

@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from q2r2_control.teleop.hand_motion import MAX_OFFSET
 from q2r2_control.types import SIDES, Array
-from tests.teleop.hands import Operator, engaged, operator, squeezing, waving
+from tests.teleop.hands import Operator, engaged, operator, waving
 
 SAG = np.array([0.005, 0.0, -0.02])
 
@@ -25,10 +25,8 @@ def command(driver: Operator, arm: str = "left") -> Array:
     return asked.translation
 
 
-def target(driver: Operator, arm: str = "left") -> Array:
-    asked = driver.targets[arm].pose
-    assert asked is not None
-    return asked.translation
+def target(driver: Operator) -> Array:
+    return driver.place().translation
 
 
 def test_the_target_begins_at_the_tool_and_the_command_where_it_was() -> None:
@@ -63,25 +61,16 @@ def test_the_leash_is_measured_from_where_the_tool_hangs() -> None:
     for way in (0.2, -0.2):
         driver = hanging(operator(leash={"distance": 0.03}))
         driver.engage()
-        start = dict(driver.hands)
-
-        def up(t: float, way: float = way, start: dict[str, pin.SE3] = start) -> dict[str, pin.SE3]:
-            return {
-                hand: pin.SE3(at.rotation, at.translation + np.array([0.0, 0.0, way * t])) for hand, at in start.items()
-            }
-
-        driver.run(1.0, up)
+        driver.run(1.0, waving(driver, way))
         off = target(driver) - driver.tools["left"].translation
-        np.testing.assert_allclose(off, (0.0, 0.0, np.sign(way) * 0.03), atol=1e-6)
+        np.testing.assert_allclose(off, (0.0, np.sign(way) * 0.03, 0.0), atol=1e-6)
 
 
 def test_an_arm_that_was_never_engaged_is_carried_without_a_jump_of_either_command() -> None:
-    driver = squeezing(bindings={"grip": "carry"})
-    hanging(driver)
+    driver = hanging(operator(bindings={"grip": "carry"}))
     assert driver.commanded is not None
     driver.engage("left")
-    driver.only, driver.held = "left", {"grip": 1.0}
-    driver.run(0.1)
+    driver.push("grip")
     assert driver.states == {"left": "engaged", "right": "carried"}
     for arm in SIDES:
         np.testing.assert_allclose(command(driver, arm), driver.commanded[arm].translation, atol=1e-9)

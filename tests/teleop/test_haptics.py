@@ -10,32 +10,9 @@ import pytest
 from q2r2_control.config.teleop import HapticSettings
 from q2r2_control.events import Event, Reason
 from q2r2_control.events import ReasonKind as K
-from q2r2_control.teleop.haptics import (
-    CONTACT,
-    ENGAGED,
-    EPISODE_BEGINS,
-    EPISODE_DISCARDED,
-    EPISODE_ENDS,
-    EPISODE_KEPT,
-    EPISODE_REJECTED,
-    FAULT,
-    GRASP,
-    HOMING,
-    LIMIT,
-    NEAR,
-    PAUSED,
-    SLIP,
-    STOPPED,
-    VOCABULARY,
-    ArmCondition,
-    HapticPulses,
-    Pulse,
-)
+from q2r2_control.teleop import haptics as pulses
+from q2r2_control.teleop.haptics import VOCABULARY, ArmCondition, HapticPulses, Pulse
 from q2r2_control.types import HapticFeedback
-
-
-def press(source: str, destination: str) -> Event:
-    return event(source, destination, Reason.of(K.PRESSED, control="lower button"))
 
 
 def event(source: str, destination: str, reason: Reason | K) -> Event:
@@ -48,25 +25,22 @@ def verdict(keep: bool) -> Reason:
 
 JUMPED = event("engaged", "lost", K.HAND_JUMPED)
 EVENTS = {
-    "engaging": (press("paused", "engaged"), ENGAGED),
-    "pausing": (press("engaged", "pausing"), PAUSED),
-    "the alignment chord": (event("engaged", "aligning", K.ALIGNMENT_CHORD), PAUSED),
-    "a fault": (event("engaged", "lost", K.POSE_SILENT), FAULT),
-    "a refused press": (event("paused", "paused", K.NOT_ENGAGED), FAULT),
-    "an alignment that ends unengaged": (event("aligning", "lost", K.NOT_ENGAGED), FAULT),
-    "the way home": (event("paused", "homing", K.COMMANDED), HOMING),
-    "the end of the way home": (event("homing", "paused", K.HOMING_ARRIVED), PAUSED),
-    "both arms carry, for the one that leads": (event("engaged", "engaged", K.CARRY_BEGAN), ENGAGED),
-    "both arms carry, for the other one": (event("paused", "carried", K.CARRIED_BY), ENGAGED),
-    "the end of carrying": (event("carried", "paused", K.PRESSED), PAUSED),
-    "an episode that begins": (event("engaged", "engaged", K.EPISODE_BEGINS), EPISODE_BEGINS),
-    "an episode that begins while the arm is lost": (event("lost", "lost", K.EPISODE_BEGINS), EPISODE_BEGINS),
-    "an episode that is kept": (event("paused", "paused", verdict(True)), EPISODE_KEPT),
-    "one that is not": (event("lost", "lost", verdict(False)), EPISODE_REJECTED),
-    "an episode that ends": (event("engaged", "engaged", K.EPISODE_ENDS), EPISODE_ENDS),
-    "an episode that is discarded": (event("paused", "paused", K.EPISODE_DISCARDED), EPISODE_DISCARDED),
-    "what an engaged arm refuses": (event("engaged", "engaged", K.NOT_CARRIED), FAULT),
-    "a stop": (event("engaged", "stopped", K.COMMANDED), STOPPED),
+    "engaging": (event("paused", "engaged", K.PRESSED), pulses.ENGAGED),
+    "pausing": (event("engaged", "pausing", K.PRESSED), pulses.PAUSED),
+    "a fault": (event("engaged", "lost", K.POSE_SILENT), pulses.FAULT),
+    "a refused press": (event("paused", "paused", K.NOT_ENGAGED), pulses.FAULT),
+    "an alignment that ends unengaged": (event("aligning", "lost", K.NOT_ENGAGED), pulses.FAULT),
+    "the way home": (event("paused", "homing", K.COMMANDED), pulses.HOMING),
+    "the end of the way home": (event("homing", "paused", K.HOMING_ARRIVED), pulses.PAUSED),
+    "both arms carry, for the one that leads": (event("engaged", "engaged", K.CARRY_BEGAN), pulses.ENGAGED),
+    "both arms carry, for the other one": (event("paused", "carried", K.CARRIED_BY), pulses.ENGAGED),
+    "the end of carrying": (event("carried", "paused", K.PRESSED), pulses.PAUSED),
+    "an episode that begins": (event("lost", "lost", K.EPISODE_BEGINS), pulses.EPISODE_BEGINS),
+    "an episode that is kept": (event("paused", "paused", verdict(True)), pulses.EPISODE_KEPT),
+    "one that is not": (event("lost", "lost", verdict(False)), pulses.EPISODE_REJECTED),
+    "an episode that ends": (event("engaged", "engaged", K.EPISODE_ENDS), pulses.EPISODE_ENDS),
+    "an episode that is discarded": (event("paused", "paused", K.EPISODE_DISCARDED), pulses.EPISODE_DISCARDED),
+    "a stop": (event("engaged", "stopped", K.COMMANDED), pulses.STOPPED),
 }
 
 
@@ -86,7 +60,7 @@ def test_an_event_is_felt_once_and_ends(happens: Event, pulse: Pulse) -> None:
 
 def test_a_pause_that_is_complete_is_not_felt_again() -> None:
     haptics = HapticPulses()
-    haptics.tell(press("pausing", "paused"))
+    haptics.tell(event("pausing", "paused", K.PRESSED))
     assert haptics.at(1.0, "left") is None
 
 
@@ -96,19 +70,19 @@ def test_slipping_is_felt_at_every_stretch_of_it_and_anew_after_engaging() -> No
     for tick in range(100):
         haptics.slip(0.001 * tick, 0.0)
         felt.append(haptics.at(tick * 0.1, "left"))
-    assert felt.count(feedback(SLIP)) == 4
+    assert felt.count(feedback(pulses.SLIP)) == 4
     haptics.slip(0.0, 0.0)
     haptics.slip(0.0, 0.11)
-    assert haptics.at(20.0, "left") == feedback(SLIP)
+    assert haptics.at(20.0, "left") == feedback(pulses.SLIP)
 
 
 def test_a_weaker_vibration_does_not_cut_a_stronger_one_short() -> None:
     haptics = HapticPulses()
     haptics.tell(JUMPED)
-    assert haptics.at(1.0, "left") == feedback(FAULT)
+    assert haptics.at(1.0, "left") == feedback(pulses.FAULT)
     haptics.slip(1.0, 0.0)
     assert haptics.at(1.1, "left") is None
-    assert haptics.at(1.0 + FAULT.duration, "left") == HapticFeedback("left", 0.0, 0.0)
+    assert haptics.at(1.0 + pulses.FAULT.duration, "left") == HapticFeedback("left", 0.0, 0.0)
 
 
 def felt(haptics: HapticPulses, since: float, until: float) -> list[HapticFeedback]:
@@ -123,25 +97,25 @@ def condition(spare: float = 1.0, limits: tuple[str, ...] = (), force: float | N
 
 def test_coming_near_is_felt_at_every_5_mm_and_stronger_the_nearer_and_leaving_is_not() -> None:
     haptics = HapticPulses()
-    pulses: list[float] = []
+    felt_at: list[float] = []
     for tick in range(200):  # from 60 mm to spare to 0, where the distance trembles, and back
         haptics.notice(condition(abs(0.06 - 0.0006 * tick) + (0.004 * (tick % 2) if tick < 100 else 0.0)))
-        pulses += [sent.amplitude for sent in felt(haptics, tick, tick + 1.0) if sent.amplitude > 0.0]
+        felt_at += [sent.amplitude for sent in felt(haptics, tick, tick + 1.0) if sent.amplitude > 0.0]
         if tick == 100:
-            approaching = len(pulses)
-    assert approaching == len(pulses) == 10
-    assert pulses == sorted(pulses)
-    assert NEAR.amplitude < pulses[0] < pulses[-1] == pytest.approx(0.6)
+            approaching = len(felt_at)
+    assert approaching == len(felt_at) == 10
+    assert felt_at == sorted(felt_at)
+    assert pulses.NEAR.amplitude < felt_at[0] < felt_at[-1] == pytest.approx(0.6)
 
 
 def test_a_contact_is_felt_at_every_5_newtons_and_stronger_the_harder() -> None:
     haptics = HapticPulses()
-    pulses = []
+    felt_at = []
     for tick in range(80):
         haptics.notice(condition(force=float(tick)))
-        pulses += [sent.amplitude for sent in felt(haptics, tick, tick + 1.0) if sent.amplitude > 0.0]
-    assert len(pulses) == 15
-    assert CONTACT.amplitude < pulses[0] < pulses[5] < pulses[-1] == pytest.approx(0.8)
+        felt_at += [sent.amplitude for sent in felt(haptics, tick, tick + 1.0) if sent.amplitude > 0.0]
+    assert len(felt_at) == 15
+    assert pulses.CONTACT.amplitude < felt_at[0] < felt_at[5] < felt_at[-1] == pytest.approx(0.8)
 
 
 def test_a_joint_at_its_limit_and_a_grasp_are_each_felt_once_for_as_long_as_they_last() -> None:
@@ -150,26 +124,26 @@ def test_a_joint_at_its_limit_and_a_grasp_are_each_felt_once_for_as_long_as_they
     for tick in range(10):
         haptics.notice(condition(limits=("left_A2", "left_A4") if tick > 4 else ("left_A4",)))
         sent += felt(haptics, tick, tick + 1.0)
-    assert [one for one in sent if one.amplitude] == [feedback(LIMIT)] * 2
+    assert [one for one in sent if one.amplitude] == [feedback(pulses.LIMIT)] * 2
     for tick in range(10, 20):
         haptics.grasps(tick != 15)
         sent += felt(haptics, tick, tick + 1.0)
-    assert [one for one in sent if one.amplitude][2:] == [feedback(GRASP)] * 2
+    assert [one for one in sent if one.amplitude][2:] == [feedback(pulses.GRASP)] * 2
 
 
 def test_two_vibrations_are_felt_as_two_and_a_fault_waits_for_none() -> None:
     haptics = HapticPulses()
-    haptics.tell(press("paused", "engaged"))
-    first = felt(haptics, 1.0, 1.0 + ENGAGED.duration + 0.002)
-    assert [one.amplitude for one in first] == [ENGAGED.amplitude, 0.0]
+    haptics.tell(event("paused", "engaged", K.PRESSED))
+    first = felt(haptics, 1.0, 1.0 + pulses.ENGAGED.duration + 0.002)
+    assert [one.amplitude for one in first] == [pulses.ENGAGED.amplitude, 0.0]
     haptics.notice(condition(limits=("left_A4",)))
     assert felt(haptics, 1.09, 1.12) == []
-    assert felt(haptics, 1.12, 1.2)[0] == feedback(LIMIT)
+    assert felt(haptics, 1.12, 1.2)[0] == feedback(pulses.LIMIT)
     haptics.tell(JUMPED)
-    assert haptics.at(1.21, "left") == feedback(FAULT)
+    assert haptics.at(1.21, "left") == feedback(pulses.FAULT)
 
 
-@pytest.mark.parametrize(("strength", "expected"), [(0.5, [0.5 * FAULT.amplitude, 0.0]), (0.0, [])])
+@pytest.mark.parametrize(("strength", "expected"), [(0.5, [0.5 * pulses.FAULT.amplitude, 0.0]), (0.0, [])])
 def test_the_strength_of_all_is_a_setting_and_0_sends_nothing(strength: float, expected: list[float]) -> None:
     haptics = HapticPulses(HapticSettings(strength=strength))
     haptics.tell(JUMPED)
@@ -182,7 +156,7 @@ def test_of_two_at_once_the_one_that_stands_later_in_the_vocabulary_is_felt() ->
     haptics = HapticPulses()
     haptics.grasps(True)
     haptics.notice(condition(limits=("left_A4",)))
-    assert haptics.at(0.0, "left") == feedback(GRASP)
+    assert haptics.at(0.0, "left") == feedback(pulses.GRASP)
 
 
 def test_the_table_in_the_docs_is_the_vocabulary() -> None:

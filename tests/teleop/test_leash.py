@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.cell import load_config
 from q2r2_control.config.teleop import LeashSettings
-from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.quaternions import floats_of, se3_of
-from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array
+from tests.pipeline.loops import pipeline
 from tests.support.hands_input import HandsInput
-from tests.teleop.hands import History, Operator, assert_smooth, engaged, pose
+from tests.teleop.hands import assert_smooth, engaged, pose
 
 DT = 0.001
 TOOL = pose(0.5, 0.2, 0.4, (3.0, 0.2, -0.1))
@@ -74,14 +71,11 @@ def along(*values: float) -> Array:
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 def test_a_target_within_the_leash_is_the_relative_motion_bit_for_bit(motion: RelativeMotion) -> None:
     random = np.random.default_rng(51)
-    tied, untied = Tied(motion, distance=0.1, angle=0.5), []
-    targets = []
-    for _ in range(200):
-        hand = moved(HAND, np.append(random.uniform(-0.02, 0.02, 3), random.uniform(-0.1, 0.1, 3)))
-        targets.append(tied.tick(hand).homogeneous)
-        untied.append(hand)
+    tied, bounds = Tied(motion, distance=0.1, angle=0.5), [*[0.02] * 3, *[0.1] * 3]
+    hands = [moved(HAND, random.uniform(-1.0, 1.0, 6) * bounds) for _ in range(200)]
+    targets = [tied.tick(hand).homogeneous for hand in hands]
     motion.anchor(HAND, TOOL)
-    np.testing.assert_array_equal(targets, [motion.target(hand).homogeneous for hand in [HAND, *untied]][1:])
+    np.testing.assert_array_equal(targets, [motion.target(hand).homogeneous for hand in [HAND, *hands]][1:])
     assert tied.leash.position.slip == tied.leash.rotation.slip == 0.0
 
 
@@ -198,7 +192,8 @@ def test_a_new_engagement_starts_slack_at_the_tool() -> None:
     assert all(target.slip == pytest.approx(0.2, abs=0.03) for target in driver.targets.values())
     driver.press("left", "right")
     assert all(target.pose is None for target in driver.targets.values())
-    history = driver.run(0.05) + _pressed(driver)
+    driver.lower = {"left", "right"}
+    history = driver.run(0.2)
     for arm, tool in driver.tools.items():
         first = next(targets[arm] for targets in history if targets[arm].pose is not None)
         assert first.pose is not None
@@ -206,83 +201,43 @@ def test_a_new_engagement_starts_slack_at_the_tool() -> None:
         assert first.slip == first.slip_angle == 0.0
 
 
-def _pressed(driver: Operator) -> History:
-    driver.lower = {"left", "right"}
-    return driver.run(0.2)
-
-
-class Out(NamedTuple):
-    """A hand's way out, held, and back by ``back`` [m] after ``HELD``; directions in the world."""
-
-    direction: tuple[float, float, float]
-    way: float  # [m]; the arm can follow a part of it
-
-
+# Directions of a hand's way out, in the world, of which the arm can follow a part [m].
 OUT = {
-    "stretched out forwards": Out((1.0, 0.0, 0.0), 1.0),
-    "blocked by the table": Out((0.0, 0.0, -1.0), 0.65),
-    "blocked by the other arm": Out((0.0, -1.0, 0.0), 1.2),
+    "stretched out forwards": np.array([1.0, 0.0, 0.0]),
+    "blocked by the table": np.array([0.0, 0.0, -0.65]),
+    "blocked by the other arm": np.array([0.0, -1.2, 0.0]),
 }
-HELD, BACK = 6.0, 0.002  # [s, m]
+HELD, BACK = 6.0, 0.002  # the hand goes back after so long, by so much [s, m]
 RATE = 500.0
 
 
-class Run(NamedTuple):
-    t: Array  # (n,) [s]
-    way: Array  # (n,) of the tool, along the hand's direction [m]
-    speed: Array  # (n,) of the tool [m/s]
-    acceleration: Array  # (n,) norm over the joints [rad/s^2]
-    summary: RunSummary
-
-    def moved(self, start: float, end: float) -> float:
-        """How far the tool went along the hand's direction from one time to another [m]."""
-        first, last = np.searchsorted(self.t, [start - 1e-9, end - 1e-9])
-        return float(self.way[last] - self.way[first])
-
-
-def loop(name: str, tremor: float = 0.0) -> Run:
-    """The left hand goes out smoothly within 2.5 s, rests, comes back at ``HELD``, and trembles all the time [m]."""
-    config = load_config("config/dual_iiwa7.yaml").model_copy(update={"loop_rate_hz": RATE})
-    direction = np.array(OUT[name].direction) / np.linalg.norm(OUT[name].direction)
+@pytest.mark.parametrize("out", OUT.values(), ids=OUT)
+def test_an_arm_held_up_rests_and_follows_the_first_millimetres_back_at_once_and_without_a_lurch(out: Array) -> None:
+    """The left hand goes out smoothly within 2.5 s, trembles there, and comes back at ``HELD``."""
+    farthest = float(np.linalg.norm(out))
 
     def hand(t: float) -> Array:
         share = 0.5 - 0.5 * math.cos(math.pi * min(max((t - 0.4) / 2.5, 0.0), 1.0))
         back = min(max((t - HELD) / 0.05, 0.0), 1.0)
-        way = OUT[name].way * share - BACK * back + tremor * math.sin(2.0 * math.pi * 9.0 * t)
-        return np.append(way * direction, np.zeros(3))
+        way = farthest * share - BACK * back + 0.2e-3 * math.sin(2.0 * math.pi * 9.0 * t) * (2.9 < t < HELD)
+        return np.append(way * out / farthest, np.zeros(3))
 
-    pipeline = Pipeline.from_config(config, input=HandsInput(left=hand), plant="kinematic")
     ticks: list[Tick] = []
-    pipeline.listeners.append(ticks.append)
-    summary = pipeline.run(HELD + 0.5, realtime=False)
-    places = np.array([tick.tools["left"].translation for tick in ticks])
+    loop = pipeline(HandsInput(left=hand))
+    loop.listeners.append(ticks.append)
+    summary = loop.run(HELD + 0.5, realtime=False)
+    places, t = np.array([tick.tools["left"].translation for tick in ticks]), np.array([tick.t for tick in ticks])
+    way = places @ out / farthest
     speed = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1) * RATE
-    return Run(
-        t=np.array([tick.t for tick in ticks]),
-        way=places @ direction,
-        speed=speed,
-        acceleration=np.array([np.linalg.norm(tick.reference.a) for tick in ticks]),
-        summary=summary,
-    )
-
-
-@pytest.mark.parametrize("name", OUT)
-def test_an_arm_held_up_follows_the_first_millimetres_back_at_once_and_without_a_lurch(name: str) -> None:
-    run = loop(name)
-    assert run.moved(0.4, HELD) < OUT[name].way - 0.45  # the arm was held up for half a metre
+    start, held, soon, later = np.searchsorted(t, np.array([0.4, HELD, HELD + 0.25, HELD + 0.45]) - 1e-9)
+    assert way[held] - way[start] < farthest - 0.45  # the arm was held up for half a metre
+    resting = (t > HELD - 0.5) & (t < HELD)
+    acceleration = np.array([np.linalg.norm(tick.reference.a) for tick in ticks])[resting]
+    assert np.sqrt(np.mean(acceleration**2)) < 0.2  # an arm that is free has 0.39
+    assert speed[resting].max() < 0.01
     # Almost straight, an arm takes a while for the second one; and an arm that was pushed aside comes back as well.
-    assert -2.0 * BACK < run.moved(HELD, HELD + 0.25) < -0.5 * BACK
-    assert run.moved(HELD, HELD + 0.45) > -2.0 * BACK
-    assert run.speed[run.t >= HELD].max() < 0.05  # the hand comes back at 0.04 m/s
-    assert run.summary.arms["left"].slip_mm_max > 350.0
-    assert run.summary.fallback_ticks == run.summary.uncertified_ticks == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", OUT)
-def test_tremor_does_not_make_an_arm_held_up_chatter(name: str) -> None:
-    run = loop(name, tremor=0.2e-3)
-    resting = (run.t > HELD - 0.5) & (run.t < HELD)
-    # An arm that is free has 0.39.
-    assert np.sqrt(np.mean(run.acceleration[resting] ** 2)) < 0.2
-    assert run.speed[resting].max() < 0.01
+    assert -2.0 * BACK < way[soon] - way[held] < -0.5 * BACK
+    assert way[later] - way[held] > -2.0 * BACK
+    assert speed[t >= HELD].max() < 0.05  # the hand comes back at 0.04 m/s
+    assert summary.arms["left"].slip_mm_max > 350.0
+    assert summary.fallback_ticks == summary.uncertified_ticks == 0

@@ -9,63 +9,71 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.quaternions import floats_of, rotation_vector, se3_of
-from q2r2_control.teleop.filters import PoseFilter
-from q2r2_control.teleop.rest import RestingPose
-from q2r2_control.types import SIDES, Array, HandSample, Pose
+from q2r2_control.quaternions import floats_of, se3_of
+from q2r2_control.teleop.filters import PoseFilter, RestingPose
+from q2r2_control.types import SIDES, HandSample, Pose
 from tests.teleop.hands import PAUSED, Operator, pose
 
 pytestmark = pytest.mark.slow
 
 TICK, PERIOD = 0.004, 1.0 / 75.0  # of the loop and of the samples [s]
 NOISE, TURN_NOISE = 2e-4, 5e-4  # of a headset, standard deviation of each axis [m], [rad]
+AXIS = np.array([0.6, 0.0, 0.8])  # that the hand turns about
 
 
 class Filtered:
-    """A filter with and without the mean at rest, fed with a hand along x."""
+    """A filter with and without the mean at rest, fed with a hand that goes along x and turns."""
 
-    def __init__(self, noise: float = 0.0) -> None:
-        self._random, self._noise = np.random.default_rng(4), noise
+    def __init__(self, noise: float = NOISE) -> None:
+        self._random, self._noise = np.random.default_rng(4), noise / NOISE
         self._filter, self._rest = PoseFilter(FilterSettings()), RestingPose()
-        start = self._sample(0.0)
+        self.t = self._due = self.x = self.angle = 0.0
+        start = self._sample()
         self._filter.reset(start, 0.0)
         self._rest.begin(start, 0.0)
-        self.t = self._due = 0.0
-        self.plain: list[Array] = []
-        self.drawn: list[Array] = []
-        self.turned: list[Array] = []
+        self.plain: list[Pose] = []
+        self.drawn: list[Pose] = []
 
-    def _sample(self, x: float) -> Pose:
-        noise = self._random.normal(0.0, 1.0, 6) * self._noise
-        return floats_of(pose(x + noise[0], noise[1], noise[2], tuple(noise[3:] * TURN_NOISE / NOISE)))
+    @property
+    def hand(self) -> pin.SE3:
+        return pose(self.x, turn=tuple(self.angle * AXIS))
 
-    def run(self, seconds: float, speed: float = 0.0, x: float = 0.0) -> float:
-        """Returns where the hand is at the end [m]."""
+    def _sample(self) -> Pose:
+        noise = self._random.normal(0.0, self._noise, 6) * [*[NOISE] * 3, *[TURN_NOISE] * 3]
+        return floats_of(self.hand * pin.SE3(pin.exp3(noise[3:]), noise[:3]))
+
+    def run(self, seconds: float, speed: float = 0.0, turning: float = 0.0) -> None:
+        """``speed`` [m/s] and ``turning`` [rad/s] of the hand."""
         for _ in range(round(seconds / TICK)):
             self.t += TICK
-            x += speed * TICK
+            self.x += speed * TICK
+            self.angle += turning * TICK
             if self.t >= self._due:
                 self._due += PERIOD
-                sample = self._sample(x)
+                sample = self._sample()
                 self._filter.add(sample, self.t, self.t)
                 self._rest.add(sample)
-            plain = self._filter.at(self.t)
-            drawn = self._rest.draw(plain, self.t)
-            self.plain.append(np.array(plain[0]))
-            self.drawn.append(np.array(drawn[0]))
-            self.turned.append(np.array(rotation_vector(drawn[1])))
-        return x
+            self.plain.append(self._filter.at(self.t))
+            self.drawn.append(self._rest.draw(self.plain[-1], self.t))
+
+
+def places(poses: list[Pose]) -> np.ndarray:
+    return np.array([position for position, _ in poses])
+
+
+def angle(one: pin.SE3, other: pin.SE3) -> float:
+    return float(np.linalg.norm(pin.log3(one.rotation.T @ other.rotation)))
 
 
 def test_noise_of_a_resting_hand_is_a_third_of_what_the_filter_leaves_of_it_or_less() -> None:
-    filtered = Filtered(NOISE)
-    filtered.run(3.0)
-    filtered.run(20.0)
+    filtered = Filtered()
+    filtered.run(23.0)
     rested = slice(round(3.0 / TICK), None)
-    left = np.std(filtered.plain[rested], axis=0)
+    left = np.std(places(filtered.plain[rested]), axis=0)
     assert (left > 0.25 * NOISE).all()
-    assert (np.std(filtered.drawn[rested], axis=0) < left / 3.0).all()
-    assert (np.std(filtered.turned[rested], axis=0) < 0.1 * TURN_NOISE).all()
+    assert (np.std(places(filtered.drawn[rested]), axis=0) < left / 3.0).all()
+    turned = [pin.log3(se3_of(one).rotation) for one in filtered.drawn[rested]]
+    assert (np.std(turned, axis=0) < 0.1 * TURN_NOISE).all()
 
 
 @pytest.mark.parametrize("noise", [0.0, NOISE])
@@ -73,17 +81,17 @@ def test_noise_of_a_resting_hand_is_a_third_of_what_the_filter_leaves_of_it_or_l
 def test_a_hand_that_sets_off_is_followed_without_a_jump_and_at_once(speed: float, noise: float) -> None:
     filtered = Filtered(noise)
     filtered.run(2.0)
-    moved = filtered.run(1.0, speed)
-    filtered.run(3.0, 0.0, moved)
-    off = np.linalg.norm(np.subtract(filtered.drawn, filtered.plain), axis=1)
-    assert off.max() < max(0.45e-3, 2e-3 * min(speed, 0.6))
-    steps = np.linalg.norm(np.diff(filtered.drawn[round(0.5 / TICK) :], axis=0), axis=1) / TICK
+    filtered.run(1.0, speed)
+    filtered.run(3.0)
+    drawn, plain = places(filtered.drawn), places(filtered.plain)
+    assert np.linalg.norm(drawn - plain, axis=1).max() < max(0.45e-3, 2e-3 * min(speed, 0.6))
+    steps = np.linalg.norm(np.diff(drawn[round(0.5 / TICK) :], axis=0), axis=1) / TICK
     assert steps.max() < 1.05 * speed + 0.025
     # Once it moves, and faster than the noise, it is the filter's alone.
     if speed >= 0.03:
         moving = slice(round(2.3 / TICK), round(2.95 / TICK))
-        assert np.array_equal(filtered.drawn[moving], filtered.plain[moving])
-    assert np.linalg.norm(filtered.drawn[-1] - np.array([moved, 0.0, 0.0])) < 0.1e-3
+        assert np.array_equal(drawn[moving], plain[moving])
+    assert np.linalg.norm(drawn[-1] - filtered.hand.translation) < 0.1e-3
 
 
 class NoisyOperator(Operator):
@@ -117,41 +125,16 @@ def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool(
         after_engaging += [np.linalg.norm(driver.tools[arm].translation - before[arm].translation) for arm in SIDES]
         driver.press(*SIDES)
         assert driver.states == PAUSED
-    drift = [float(np.linalg.norm(driver.tools[arm].translation - start[arm].translation)) for arm in SIDES]
-    turned = [float(np.linalg.norm(pin.log3(driver.tools[arm].rotation @ start[arm].rotation.T))) for arm in SIDES]
-    assert max(drift) < 0.5e-3
-    assert max(turned) < 1e-3
+    for arm in SIDES:
+        assert np.linalg.norm(driver.tools[arm].translation - start[arm].translation) < 0.5e-3
+        assert angle(driver.tools[arm], start[arm]) < 1e-3
     assert np.mean(after_engaging) < 0.05e-3
 
 
-def turning(speed: float, seconds: float, then: float) -> tuple[list[pin.SE3], list[pin.SE3]]:
-    """A noisy hand that turns [rad/s] and then rests: what was drawn at each tick, and where the hand really was."""
-    random, rest, filtered = np.random.default_rng(6), RestingPose(), PoseFilter(FilterSettings())
-    axis = np.array([0.6, 0.0, 0.8])
-    drawn, real = [], []
-    due = 0.0
-    for tick in range(round((seconds + then) / TICK)):
-        t = tick * TICK
-        hand = pose(0.0, 0.0, 0.0, tuple(axis * speed * min(t, seconds)))
-        if t >= due:
-            due += PERIOD
-            noise = pin.SE3(pin.exp3(random.normal(0.0, TURN_NOISE, 3)), random.normal(0.0, NOISE, 3))
-            if tick == 0:
-                filtered.reset(floats_of(hand), t)
-                rest.begin(floats_of(hand), t)
-            filtered.add(floats_of(hand * noise), t, t)
-            rest.add(floats_of(hand * noise))
-        drawn.append(se3_of(rest.draw(filtered.at(t), t)))
-        real.append(hand)
-    return drawn, real
-
-
-def angle(one: pin.SE3, other: pin.SE3) -> float:
-    return float(np.linalg.norm(pin.log3(one.rotation.T @ other.rotation)))
-
-
-@pytest.mark.parametrize("speed", [0.1, 6.0])
-def test_a_hand_that_has_turned_however_far_is_known_as_well_as_any_when_it_rests(speed: float) -> None:
-    drawn, real = turning(speed, seconds=2.0, then=4.0)
-    settled = [angle(*both) for both in zip(drawn[-250:], real[-250:], strict=True)]
+@pytest.mark.parametrize("turning", [0.1, 6.0])
+def test_a_hand_that_has_turned_however_far_is_known_as_well_as_any_when_it_rests(turning: float) -> None:
+    filtered = Filtered()
+    filtered.run(2.0, turning=turning)
+    filtered.run(4.0)
+    settled = [angle(se3_of(one), filtered.hand) for one in filtered.drawn[-250:]]
     assert max(settled) < TURN_NOISE / 2.0, "a mean of 150 samples; the filter alone leaves more than that"

@@ -19,7 +19,6 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit, ArmTarget, LimitKind
 from q2r2_control.viewer.live import LiveTable, next_press, why
-from q2r2_control.wording import SENTENCES
 from tests.cli.test_output import printed
 from tests.viewer.conftest import tick_at
 
@@ -129,7 +128,7 @@ def test_an_arm_that_is_at_its_target_follows_whatever_is_at_work(robot: Robot) 
     [
         ("engaged", "lost", ReasonKind.CONNECTION_LOST, "lost: connection lost"),
         ("aligning", "engaged", ReasonKind.ALIGNED, "engaged: aligned anew"),
-        ("paused", "paused", ReasonKind.NO_RECORDING, SENTENCES[ReasonKind.NO_RECORDING]),
+        ("paused", "paused", ReasonKind.NO_RECORDING, ReasonKind.NO_RECORDING.template),
     ],
 )
 def test_an_arm_that_is_not_engaged_says_what_stopped_it(

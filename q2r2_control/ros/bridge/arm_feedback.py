@@ -31,7 +31,7 @@ from q2r2_control.types import ArmTarget, Array, RobotState, StepReport
 from q2r2_control.wording import event_line
 
 if TYPE_CHECKING:
-    from q2r2_control.loop.arm_conditions import ArmConditions
+    from q2r2_control.loop.control_loop import ArmConditions
 
 _AXIS_LENGTH, _AXIS_WIDTH, _PATH_WIDTH, _BALL = 0.1, 0.008, 0.004, 0.04  # [m]
 _PATH_POINTS = 200

@@ -24,8 +24,7 @@ from visualization_msgs.msg import Marker
 from q2r2_control.config.cell import Config
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.loop.arm_conditions import ArmConditions
-from q2r2_control.loop.control_loop import ControlLoop
+from q2r2_control.loop.control_loop import ArmConditions, ControlLoop
 from q2r2_control.recording.messages import CONTROLLER_TICK, REFERENCE
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import LATCHED_QOS, RECORDED_QOS, SENT_COMMAND_QOS, BaseNode

@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 import time
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import nanoseconds, pose_of, pose_of_numbers, time_message
+from q2r2_control.ros.bridge.messages import nanoseconds, pose_of, pose_of_numbers
 from q2r2_control.ros.monitoring import Publishers
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.targets import SequenceWatch
@@ -219,33 +218,3 @@ class PoseTopic:
     def _take(self, message: PoseStamped, now: float) -> None:
         self._newest = message.header.frame_id, nanoseconds(message.header.stamp), now
         self._pose = pose_of(message.pose)
-
-
-def link_transforms(model: Any, without: Collection[str]) -> tuple[LinkTransforms, LinkTransforms]:
-    """Of a ``mujoco.MjModel`` the links on a joint, and all others; bodies named in ``without`` are no links."""
-    links = [index for index in range(1, model.nbody) if model.body(index).name not in without]
-    moving = [index for index in links if model.body_jntnum[index]]
-    return LinkTransforms(model, moving), LinkTransforms(model, [index for index in links if index not in moving])
-
-
-class LinkTransforms:
-    def __init__(self, model: Any, bodies: list[int]) -> None:
-        self._bodies, self._parents = bodies, model.body_parentid[bodies].tolist()
-        self._message = TFMessage()
-        for body, parent in zip(bodies, self._parents, strict=True):
-            transform = TransformStamped(child_frame_id=model.body(body).name)
-            transform.header.frame_id = model.body(parent).name
-            self._message.transforms.append(transform)
-
-    def at(self, data: Any, t: float) -> TFMessage:
-        """The message for a ``mujoco.MjData`` at ``t`` [s]; the same object each time."""
-        stamp, inverse, position, quaternion = time_message(t), np.zeros(4), np.zeros(3), np.zeros(4)
-        for transform, body, parent in zip(self._message.transforms, self._bodies, self._parents, strict=True):
-            mujoco.mju_negQuat(inverse, data.xquat[parent])
-            mujoco.mju_rotVecQuat(position, data.xpos[body] - data.xpos[parent], inverse)
-            mujoco.mju_mulQuat(quaternion, inverse, data.xquat[body])
-            transform.header.stamp = stamp
-            p, o = transform.transform.translation, transform.transform.rotation
-            p.x, p.y, p.z = position.tolist()
-            o.w, o.x, o.y, o.z = quaternion.tolist()  # MuJoCo has w first
-        return self._message

@@ -9,13 +9,15 @@ the arms brake, and after ``hold_after`` they stand on their position servos, wh
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import mujoco
 import numpy as np
 from control_msgs.action import GripperCommand
+from geometry_msgs.msg import TransformStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
@@ -31,8 +33,7 @@ from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.plants.simulated_cell import SimulatedCell
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, STEADY, WARN, BaseNode
-from q2r2_control.ros.bridge.frames import link_transforms
-from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
+from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds, time_message
 from q2r2_control.supervision.targets import DelayWatch
 
 _LOG_PERIOD = 1.0  # of lines about refusals [s]
@@ -258,3 +259,33 @@ class MujocoRobot(BaseNode):
 
     def close(self) -> None:
         self._cell.plant.close()
+
+
+def link_transforms(model: Any, without: Collection[str]) -> tuple[LinkTransforms, LinkTransforms]:
+    """Of a ``mujoco.MjModel`` the links on a joint, and all others; bodies named in ``without`` are no links."""
+    links = [index for index in range(1, model.nbody) if model.body(index).name not in without]
+    moving = [index for index in links if model.body_jntnum[index]]
+    return LinkTransforms(model, moving), LinkTransforms(model, [index for index in links if index not in moving])
+
+
+class LinkTransforms:
+    def __init__(self, model: Any, bodies: list[int]) -> None:
+        self._bodies, self._parents = bodies, model.body_parentid[bodies].tolist()
+        self._message = TFMessage()
+        for body, parent in zip(bodies, self._parents, strict=True):
+            transform = TransformStamped(child_frame_id=model.body(body).name)
+            transform.header.frame_id = model.body(parent).name
+            self._message.transforms.append(transform)
+
+    def at(self, data: Any, t: float) -> TFMessage:
+        """The message for a ``mujoco.MjData`` at ``t`` [s]; the same object each time."""
+        stamp, inverse, position, quaternion = time_message(t), np.zeros(4), np.zeros(3), np.zeros(4)
+        for transform, body, parent in zip(self._message.transforms, self._bodies, self._parents, strict=True):
+            mujoco.mju_negQuat(inverse, data.xquat[parent])
+            mujoco.mju_rotVecQuat(position, data.xpos[body] - data.xpos[parent], inverse)
+            mujoco.mju_mulQuat(quaternion, inverse, data.xquat[body])
+            transform.header.stamp = stamp
+            p, o = transform.transform.translation, transform.transform.rotation
+            p.x, p.y, p.z = position.tolist()
+            o.w, o.x, o.y, o.z = quaternion.tolist()  # MuJoCo has w first
+        return self._message
