@@ -35,6 +35,7 @@ def test_an_unknown_key_of_an_external_controller_is_named_with_those_allowed_th
         ("external.arms.left.ctrl_prefix", "left_ctrl", "begins with /"),
         ("external.arms.left.ctrl_prefix", "/left ctrl", "allowed is a ROS name"),
         ("external.arms.left.ctrl_prefix", "/left_ctrl/", "without / at its end"),
+        ("external.arms.left.base_frame", "", "at least 1 character"),
         ("external.arms.left.gripper.closed_position", 0.0, "have to differ"),
     ],
     ids=lambda value: value if isinstance(value, str) else f"{value!r:.24}",
