@@ -11,7 +11,7 @@ that is pushed away from it meets this wall.
 d' the rate of distance, c the damping of ratio xi at the pair's effective mass m = 1 / (g' M^-1 g), g = dd/dq
 (Khatib, IJRR 1987), rising from 0 to its value in the first two millimetres. So the torque is continuous in q and v,
 never pulls two bodies together, and its elastic part is the gradient of  U = sum k x^2 / 2:  the wall gives back at
-most what was put in. Distances are those of smooth_distance.py, so that bodies that lie along each other do not make
+most what was put in. Distances are those of pair_distance.py, so that bodies that lie along each other do not make
 the torque switch from end to end.
 
 **Why many pairs do not add up to an unstable stiffness.** All pairs act through the same joints. With K = sum k g g'

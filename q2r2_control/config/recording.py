@@ -1,4 +1,4 @@
-"""What makes a recorded episode unfit to be learned from, with units and ranges."""
+"""Cameras of a cell, and what makes a recorded episode unfit to be learned from, with units and ranges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well the arms followed, and whether they moved at all."""
+"""How well the arms followed, how smoothly and how late, and whether they moved at all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where ROS packages are: those the cell names, those of the ROS environment, and example-robot-data."""
+"""Where ROS packages are, and what ``xacro`` makes of their models."""
 
 from __future__ import annotations
 

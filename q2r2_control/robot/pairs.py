@@ -1,4 +1,4 @@
-"""Which collision pairs are monitored."""
+"""Which collision pairs are monitored, and the roles of links that decide it."""
 
 from __future__ import annotations
 
