@@ -194,7 +194,8 @@ def test_colcon_installs_a_command_that_runs_with_its_own_settings_robots_and_in
     share = installed / "share" / "q2r2_control"
     assert Path(robot) == share / "robots" / "iiwa7.urdf"
     assert (share / "package.xml").is_file()
-    shipped = {file.name for folder in ("config", "robots", "launch") for file in (ROOT / folder).glob("*.*")}
+    patterns = ("config/*.yaml", "robots/*.urdf", "robots/*.srdf", "launch/*.py")
+    shipped = {file.name for pattern in patterns for file in ROOT.glob(pattern)}
     assert {file.name for file in share.glob("*/*.*")} >= shipped
     (package,) = installed.glob("lib/python3.*/site-packages/q2r2_control/ros/interfaces")
     definitions = [file.relative_to(INTERFACES) for file in INTERFACES.rglob("*") if file.is_file()]

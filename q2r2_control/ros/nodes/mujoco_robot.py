@@ -63,7 +63,7 @@ class GripperServer:
         self._command, self._refuse = command, refuse
         self._motion: _Motion | None = None
         self._newest: ServerGoalHandle | None = None
-        self._server = ActionServer(
+        self.server = ActionServer(
             node,
             GripperCommand,
             topic,
@@ -258,6 +258,8 @@ class MujocoRobot(BaseNode):
         return OK, mode, values
 
     def close(self) -> None:
+        for gripper in self._grippers.values():
+            gripper.server.destroy()  # rclpy leaves it behind when its node goes, and clients still find it
         self._cell.plant.close()
 
 
