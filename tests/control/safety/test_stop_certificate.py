@@ -122,6 +122,33 @@ def test_the_certificate_tells_motions_apart_that_end_just_inside_and_well_outsi
     assert accepted >= 0.5 * total
 
 
+def _swings(random: np.random.Generator, count: int, dip: float) -> Iterator[Motion]:
+    """Steps that bring the nearest pair closer by ``dip`` [m] and away again, and stops that keep all pairs apart."""
+    name, found = "dual_iiwa7", 0
+    for q in _starts_apart(name, random, True, 20 * count):
+        apart = distances(cell(name), q[None])[0]
+        moved = distances(cell(name), q + 1e-6 * np.eye(len(q)))
+        gradient = (moved[:, apart.argmin()] - apart.min()) / 1e-6
+        norm = np.linalg.norm(gradient)
+        start = q - (apart.min() - MIN_DISTANCE - 1e-4) * gradient / norm**2
+        v = -4.0 * dip / H * gradient / norm**2
+        motion = motion_of(name, start, v, -v)
+        if min(distances(cell(name), way).min() for way in (start[None], motion.stop())) >= MIN_DISTANCE:
+            found += 1
+            yield motion
+        if found == count:
+            return
+
+
+def test_a_pair_that_comes_too_close_within_a_step_is_refused_although_both_ends_are_apart() -> None:
+    swings = list(_swings(np.random.default_rng(21), 8, dip=5e-4))
+    assert len(swings) == 8
+    for motion in swings:
+        assert distances(cell("dual_iiwa7"), motion.step()).min() < MIN_DISTANCE - 1e-4
+        assert not _certified("dual_iiwa7", motion)
+    assert sum(_certified("dual_iiwa7", motion) for motion in _swings(np.random.default_rng(21), 8, dip=2e-5)) >= 6
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_lower_bounds_in_place_of_distances_prove_nothing_that_is_not_so(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(17)
