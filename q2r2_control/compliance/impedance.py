@@ -36,7 +36,6 @@ from q2r2_control.compliance.impedance_law import (
     PositionLimits,
     bound_torque,
     impedance_torque,
-    plausible,
 )
 from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
 from q2r2_control.control.geometry.kinematics import chain_of
@@ -87,12 +86,13 @@ class ImpedanceController:
         spring = settings.limit_stiffness, settings.limit_damping, settings.limit_distance
         limits = PositionLimits(robot.position_lower, robot.position_upper, *spring)
         largest_error = np.array([settings.max_position_error, settings.max_rotation_error])
-        model = ImpedanceModel(chain_of(robot.model), tools_of(robot), limits, largest_error)
+        model = ImpedanceModel(chain_of(robot.model), tools_of(robot), limits, self._limit, largest_error)
         values = [float(getattr(settings, name)) for name in LIVE_IMPEDANCE]
         self._springs = np.tile(values, (len(self._arms), 1))  # in force
         self._kernel_data = ImpedanceData.empty(model, self._springs)
+        self._inputs = self._kernel_data.inputs.reshape(-1)  # a view
         self._pointers = pointer_to(model), pointer_to(self._kernel_data)
-        self._impedance_torque = bound(impedance_torque, *self._pointers)
+        self._impedance_torque = bound(impedance_torque, *self._pointers, 0.0)
         self._model = robot.model.copy()  # to which payloads are added
         self._pinocchio_data = self._model.createData()
         self._wanted_springs = self._springs.copy()  # at the end of a ramp
@@ -116,9 +116,10 @@ class ImpedanceController:
         self._begin(q)
 
     def _begin(self, q: Array) -> None:
-        self._due = np.stack((q, np.zeros_like(q)))  # posture and speed of the reference that is due now
-        self._usable_q = q.copy()  # the newest measured posture that was of use
-        self._commanded: Array = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
+        data = self._kernel_data
+        data.due[:] = q, np.zeros_like(q)
+        self._usable_q = q  # the newest measured posture that was of use
+        data.commanded[:] = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
 
     def gravity(self, q: Array) -> Array:
         """Torque (nv,) that bears the arms, with what they hold, at a posture ``q`` (nv,) [rad], [Nm]."""
@@ -182,36 +183,28 @@ class ImpedanceController:
             self._ramping = bool((springs != self._wanted_springs).any())
         if self._borne != self._wanted_borne:
             self._bear(time / _PAYLOAD_TIME)
-        data, due, a = self._kernel_data, self._due, reference.a
-        data.wanted[:] = due
-        if plausible(reference.q, reference.v, reference.a):
-            due[0], due[1] = reference.q, reference.v
-        else:
-            due[1], a = 0.0, np.zeros(len(self._limit))
-        usable = plausible(state.q, state.v) and (extra is None or plausible(extra))
-        if usable and self._law(state, a):
-            self._usable_q = state.q.copy()
-            torque = data.torque if extra is None else data.torque + extra
-            errors = dict(zip(self._arms, data.error.copy(), strict=True))
-            clipped, repelled = _those(self._arms, data.clipped), _those(self.robot.joint_names, data.repulsion)
-            report = ImpedanceReport(errors, clipped, (), (), repelled, held=False)
-        else:
-            torque, report = self.gravity(self._usable_q), ImpedanceReport({}, (), (), (), (), held=True)
+        data, added = self._kernel_data, np.zeros_like(self._limit) if extra is None else extra
+        np.concatenate((state.q, state.v, reference.q, reference.v, reference.a, added), out=self._inputs)
+        data.torque[:] = pin.nonLinearEffects(self._model, self._pinocchio_data, state.q, state.v)
+        data.M[:] = pin.crba(self._model, self._pinocchio_data, state.q)
         change = self.settings.torque_rate_limit * time
-        self._commanded, saturated, late = bound_torque(torque, self._commanded, self._limit, change)
-        report.saturated, report.rate_limited = (_those(self.robot.joint_names, which) for which in (saturated, late))
-        return TorqueCommand(self._commanded.copy(), report)
-
-    def _law(self, state: RobotState, a: Array) -> bool:
-        """Torque of springs, postures and feed-forward, without bounds; False where no number comes of it."""
-        model, pinocchio_data, data = self._model, self._pinocchio_data, self._kernel_data
-        data.measured[0], data.measured[1] = state.q, state.v
-        data.torque[:] = pin.rnea(model, pinocchio_data, state.q, state.v, a)
-        data.M[:] = pin.crba(model, pinocchio_data, state.q)
-        try:
-            return bool(self._impedance_torque(*self._pointers))
-        except np.linalg.LinAlgError:
-            return False
+        usable, clipped, repelled, held_back = self._impedance_torque(*self._pointers, change)
+        if usable:
+            self._usable_q = state.q.copy()
+            errors = dict(zip(self._arms, data.error.copy(), strict=True))
+            report = ImpedanceReport(errors, (), (), (), (), held=False)
+        else:
+            bounds = bound_torque(self.gravity(self._usable_q), data.commanded, self._limit, change)
+            data.commanded[:], data.saturated[:], data.late[:] = bounds
+            held_back, report = True, ImpedanceReport({}, (), (), (), (), held=True)
+        joints = self.robot.joint_names
+        if clipped:
+            report.clipped = _those(self._arms, data.clipped)
+        if repelled:
+            report.repelled = _those(joints, data.repulsion)
+        if held_back:
+            report.saturated, report.rate_limited = _those(joints, data.saturated), _those(joints, data.late)
+        return TorqueCommand(data.commanded.copy(), report)
 
 
 def _those(names: tuple[str, ...], which: BoolArray | Array) -> tuple[str, ...]:
