@@ -185,6 +185,20 @@ def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certified_motion(name
     assert certified > 3
 
 
+def test_a_step_that_brings_a_pair_closer_which_is_too_close_is_refused_although_they_part_at_its_end() -> None:
+    name, found = "dual_iiwa7", 0
+    for q in _too_close(cell(name), np.random.default_rng(22), 200):
+        apart = distances(cell(name), q[None])[0]
+        if np.partition(apart, 1)[1] < MIN_DISTANCE:
+            continue  # another pair is too close, and could be the reason
+        gradient = (distances(cell(name), q + 1e-6 * np.eye(len(q)))[:, apart.argmin()] - apart.min()) / 1e-6
+        parting = 0.01 * gradient / np.linalg.norm(gradient) ** 2  # at 0.01 m/s
+        if _certified(name, motion_of(name, q, parting, parting)):
+            found += 1
+            assert not _certified(name, motion_of(name, q, -4.0 * parting, parting))
+    assert found >= 10
+
+
 def _turning_at_its_end(name: str, random: np.random.Generator, count: int) -> Iterator[Motion]:
     """Stops of all joints together out of postures that are too close, the fastest that are certified.
 
