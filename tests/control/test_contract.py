@@ -208,3 +208,30 @@ def test_a_pair_that_is_closer_by_rounding_keeps_its_certificate_and_its_distanc
     assert StepStatus.RECOVERING not in {report.status for report in reports}
     assert reports[-1].margin > 1e-4, "the pair opens to its buffer"
     assert -ROUNDING <= least_margin(robot, settings, 600, "towards_nearest", seed=2) < 0.0
+
+
+def test_a_start_whose_stop_is_not_proven_has_no_certificate_until_a_step_is_however_much_room_it_has() -> None:
+    controller, solver = controller_of("iiwa7")
+    q, turn = controller.robot.home.copy(), np.zeros(controller.robot.model.nv)
+    turn[[arm.joints[0] for arm in controller.robot.arms.values()]] = [-1.0, 1.0]  # towards each other
+    for speed in np.arange(0.5, 1.0, 5e-4):
+        controller.reset(q + 0.3 * turn, speed * turn)
+        if not controller.step({}, 0.0).report.certified:
+            break  # a little too fast
+    solver.fault = "none"
+    reports = [controller.step({}, 0.001).report for _ in range(5)]
+    assert not any(report.certified for report in reports)
+    assert min(report.margin for report in reports) > 0.015
+    solver.fault = None
+    reports = [controller.step({}, 0.001).report for _ in range(300)]
+    assert all(report.certified and report.margin >= 0.0 for report in reports)
+
+
+def test_the_first_step_out_of_a_pair_that_is_too_close_has_no_certificate_and_the_next_one_has() -> None:
+    robot = robot_of("iiwa7")
+    settings = ControllerSettings(min_distance=float(robot.distance_values(robot.home).min()) + 1e-5)
+    controller = CartesianController(robot, settings)
+    reports = [controller.step({}, 0.001).report for _ in range(100)]
+    apart = next(tick for tick, report in enumerate(reports) if report.margin >= 0.0)
+    assert apart > 0
+    assert [tick for tick, report in enumerate(reports) if not report.certified] == list(range(apart + 1))
