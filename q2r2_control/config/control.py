@@ -11,30 +11,8 @@ from q2r2_control.config.strict import StrictModel
 from q2r2_control.errors import ConfigError
 
 EQUAL = "equal"
-# What may change while a controller runs, of its settings.
-LIVE = (
-    "min_distance",
-    "position_gain",
-    "rotation_gain",
-    "linear_deceleration",
-    "angular_deceleration",
-    "max_linear_speed",
-    "max_angular_speed",
-    "posture_gain",
-    "posture_weight",
-    "yield_weight",
-    "stretch_gain",
-    "separation_gain",
-)
-# The same, of the settings of an impedance.
-LIVE_IMPEDANCE = (
-    "translational_stiffness",
-    "rotational_stiffness",
-    "damping_ratio",
-    "nullspace_stiffness",
-    "nullspace_damping_ratio",
-)
-
+_LIVE = "live"  # marks a setting that may change while a controller runs
+LiveFloat = Annotated[float, _LIVE]
 Distance = Annotated[float, Field(ge=0, le=0.2)]  # [m]
 ObjectDistance = Annotated[
     float, Field(ge=-0.05, le=0.2)
@@ -100,7 +78,9 @@ class ControllerSettings(StrictModel):
     position_margin: float = Field(0.01, ge=0, le=0.5, description="distance kept from position limits [rad]")
     recovery_velocity: float = Field(0.2, gt=0, le=1, description="inward speed when outside a limit [rad/s]")
 
-    min_distance: Distance = Field(0.02, description="monitored pairs stay this far apart unless said below [m]")
+    min_distance: Annotated[Distance, _LIVE] = Field(
+        0.02, description="monitored pairs stay this far apart unless said below [m]"
+    )
     distances: DistanceSettings = Field(DistanceSettings(), description="the same, by what the bodies are")
     pairs: tuple[NamedPairDistance, ...] = Field((), description="the same, by name; of several, the last one counts")
     contact_allowed: tuple[ContactPair, ...] = Field(
@@ -112,24 +92,26 @@ class ControllerSettings(StrictModel):
         le=0.05,
         description="the QP aims to stop this much earlier, but half a pair's distance at most [m]",
     )
-    separation_gain: float = Field(10.0, gt=0, le=50, description="closing speed per metre left after a stop [1/s]")
+    separation_gain: LiveFloat = Field(10.0, gt=0, le=50, description="closing speed per metre left after a stop [1/s]")
     separation_recovery_speed: float = Field(0.05, gt=0, le=0.5, description="when too close, moving apart [m/s]")
 
     priority: str = Field(EQUAL, description="equal, or the arm that the other one gives way to")
-    yield_weight: float = Field(0.01, gt=0, le=1, description="of the costs of the arm that gives way")
+    yield_weight: LiveFloat = Field(0.01, gt=0, le=1, description="of the costs of the arm that gives way")
 
-    position_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
-    rotation_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
-    max_linear_speed: float = Field(1.0, gt=0, le=3, description="tool speed [m/s]")
-    max_angular_speed: float = Field(2.5, gt=0, le=10, description="tool speed [rad/s]")
-    linear_deceleration: float = Field(2.0, gt=0, le=50, description="planned when approaching a target [m/s^2]")
-    angular_deceleration: float = Field(5.0, gt=0, le=100, description="planned when approaching a target [rad/s^2]")
+    position_gain: LiveFloat = Field(8.0, gt=0, le=50, description="[1/s]")
+    rotation_gain: LiveFloat = Field(8.0, gt=0, le=50, description="[1/s]")
+    max_linear_speed: LiveFloat = Field(1.0, gt=0, le=3, description="tool speed [m/s]")
+    max_angular_speed: LiveFloat = Field(2.5, gt=0, le=10, description="tool speed [rad/s]")
+    linear_deceleration: LiveFloat = Field(2.0, gt=0, le=50, description="planned when approaching a target [m/s^2]")
+    angular_deceleration: LiveFloat = Field(
+        5.0, gt=0, le=100, description="planned when approaching a target [rad/s^2]"
+    )
     feed_forward_time: float = Field(0.02, gt=0, le=1, description="smoothing of the target's velocity [s]")
 
-    posture_gain: float = Field(1.0, ge=0, le=20, description="pull towards the home posture [1/s]")
+    posture_gain: LiveFloat = Field(1.0, ge=0, le=20, description="pull towards the home posture [1/s]")
     posture_speed: float = Field(0.5, gt=0, le=3, description="of that pull, at most [rad/s]")
-    posture_weight: float = Field(1e-3, gt=0, le=1, description="against the tool task's 1; also regularises")
-    stretch_gain: float = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
+    posture_weight: LiveFloat = Field(1e-3, gt=0, le=1, description="against the tool task's 1; also regularises")
+    stretch_gain: LiveFloat = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
     tasks: dict[str, dict[str, Any]] = Field(
         {}, description="tasks of other packages, by their entry point's name, with the settings of each"
     )
@@ -178,11 +160,11 @@ class ImpedanceSettings(StrictModel):
     """Settings of :class:`ImpedanceController`. Nothing here may be zero or negative: a stiffness or a damping of -1,
     meant as "automatic", would drive an arm instead of holding it."""
 
-    translational_stiffness: float = Field(2000.0, gt=0, le=5000, description="of the tool, all directions [N/m]")
-    rotational_stiffness: float = Field(200.0, gt=0, le=300, description="of the tool, all axes [Nm/rad]")
-    damping_ratio: float = Field(1.0, ge=0.1, le=2, description="of every mode of the tool; 1: no overshoot")
-    nullspace_stiffness: float = Field(50.0, gt=0, le=500, description="towards the reference's posture [Nm/rad]")
-    nullspace_damping_ratio: float = Field(1.0, ge=0.1, le=2, description="of the posture's motion")
+    translational_stiffness: LiveFloat = Field(2000.0, gt=0, le=5000, description="of the tool, all directions [N/m]")
+    rotational_stiffness: LiveFloat = Field(200.0, gt=0, le=300, description="of the tool, all axes [Nm/rad]")
+    damping_ratio: LiveFloat = Field(1.0, ge=0.1, le=2, description="of every mode of the tool; 1: no overshoot")
+    nullspace_stiffness: LiveFloat = Field(50.0, gt=0, le=500, description="towards the reference's posture [Nm/rad]")
+    nullspace_damping_ratio: LiveFloat = Field(1.0, ge=0.1, le=2, description="of the posture's motion")
     max_position_error: float = Field(0.1, gt=0, le=1, description="a longer way from the reference is clipped [m]")
     max_rotation_error: float = Field(0.5, gt=0, le=3, description="a wider turn from the reference is clipped [rad]")
     limit_distance: float = Field(0.1, gt=0, le=0.5, description="joints are repelled nearer to a limit [rad]")
@@ -209,6 +191,14 @@ class AdmittanceSettings(StrictModel):
     filter_time: float = Field(0.01, ge=0, le=0.5, description="time constant of the wrench's low-pass [s]")
     max_displacement: float = Field(0.1, gt=0, le=0.5, description="[m]")
     max_rotation: float = Field(0.5, gt=0, le=1.5, description="[rad]")
+
+
+def _live_fields(settings: type[StrictModel]) -> tuple[str, ...]:
+    return tuple(name for name, field in settings.model_fields.items() if _LIVE in field.metadata)
+
+
+LIVE = _live_fields(ControllerSettings)  # names of what may change while a controller runs
+LIVE_IMPEDANCE = _live_fields(ImpedanceSettings)  # the same, of an impedance
 
 
 class SupervisionSettings(StrictModel):

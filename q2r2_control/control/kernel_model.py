@@ -11,7 +11,7 @@ from q2r2_control.control.geometry.collision import CollisionModel, collision_mo
 from q2r2_control.control.geometry.pair_distance import with_rounded_boxes
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_data import Approach, SafetyData, SafetyModel
-from q2r2_control.control.tasks.task_data import TaskData, TaskModel, task_model_of
+from q2r2_control.control.tasks.built_in import TaskData, TaskModel, task_model_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import KeptDistances, kept_distances
 from q2r2_control.robot.pairs import pair_names

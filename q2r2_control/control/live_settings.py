@@ -17,12 +17,15 @@ distance where that is less: so the stop at hand is proven with the object too, 
 to the same value for the d and S of later, and never falls. Two objects that overlap when the second one is gripped are
 one that both hands hold, and not watched against each other until one lets go.
 
-**Gains** and weights go to their new values on a straight line. The certificate reads none of them.
+**Gains** and weights go to their new values on a straight line: all arrays in the tasks' models that other settings
+make different. The certificate reads none of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +33,7 @@ import numpy.typing as npt
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.kernel_model import KernelData, KernelModel, stop_buffer
 from q2r2_control.control.safety.safety_data import provable_distances
-from q2r2_control.control.tasks.task_data import task_model_of
+from q2r2_control.control.tasks.built_in import task_model_of
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances, too_close_at_home
 from q2r2_control.robot.pairs import CLEARANCE
@@ -123,7 +126,8 @@ class LiveSettings:
     ) -> None:
         self._robot, self._objects = robot, objects
         self._model, self._safety, self._data = model, model.safety, data.safety
-        self._gains, self._ramp = self._gains_of(settings), 0.0  # and the time until they are reached [s]
+        self._gains, self._ramp = self._gains_of(settings), 0.0  # asked for, and the time until they are reached [s]
+        self._changing: list[tuple[Array, Array]] = []  # what kernels read of these, and what it goes to
         self._goal = self._least = kept_distances(robot, settings).values  # least: without any change
         self._growing, self._due = False, 0.0
         self.settings = settings
@@ -153,7 +157,9 @@ class LiveSettings:
         self._objects.change(settings)
         gains = self._gains_of(settings)
         if not all(map(np.array_equal, gains, self._gains)):
+            now = _arrays((self._model.tasks, self._safety.approach.gain))
             self._gains, self._ramp = gains, _RAMP_TIME
+            self._changing = [pair for pair in zip(now, gains, strict=True) if not np.array_equal(*pair)]
         return None
 
     def restart(self) -> None:
@@ -195,9 +201,18 @@ class LiveSettings:
 
     def _gains_of(self, settings: ControllerSettings) -> tuple[Array, ...]:
         tasks = task_model_of(self._robot, settings, self._model.tasks.chain)
-        return (*tasks.live, np.array([settings.separation_gain]))
+        return tuple(_arrays((tasks, np.array([settings.separation_gain]))))
 
     def _approach_gains(self, h: float) -> None:
         share, self._ramp = min(h / self._ramp, 1.0) if self._ramp else 1.0, max(self._ramp - h, 0.0)
-        for values, goal in zip((*self._model.tasks.live, self._safety.approach.gain), self._gains, strict=True):
+        for values, goal in self._changing:
             values[:] = goal if share == 1.0 else values + share * (goal - values)
+
+
+def _arrays(values: tuple[Any, ...]) -> Iterator[Array]:
+    """All arrays in a tuple and the tuples within it."""
+    for value in values:
+        if isinstance(value, tuple):
+            yield from _arrays(value)
+        elif isinstance(value, np.ndarray):
+            yield value

@@ -24,18 +24,7 @@ from q2r2_control.control.kernel_model import KernelData
 from q2r2_control.control.safety.joint_limits import next_velocity_box
 from q2r2_control.control.safety.separation_rows import write_separation_rows
 from q2r2_control.control.targets import update_targets
-from q2r2_control.control.tasks.frame import (
-    accumulate_stretch_damping,
-    accumulate_tool_cost,
-    tool_jacobian,
-    wanted_twist,
-)
-from q2r2_control.control.tasks.task_data import (
-    accumulate_hold_cost,
-    accumulate_posture_cost,
-    project_to_nullspace,
-    pull_to_posture,
-)
+from q2r2_control.control.tasks.built_in import write_task_cost
 from q2r2_control.types import Array
 
 SOFTNESS = 1e-5  # part of its correction by which a row gives way
@@ -142,26 +131,11 @@ def assemble(
     whether all targets were usable, whether all joints are within their limits, and what :func:`find_minimum` says.
     """
     model, targets, data = pointee(model_pointer), pointee(targets_pointer), pointee(data_pointer)
-    state, tasks = data.safety.state, data.tasks
-    usable = True
+    state, usable = data.safety.state, True
     if tick >= 0.0:
         usable = update_targets(targets, state.q, state.v, tick)
         state.a[:] = 0.0
-    tasks.H[:] = 0.0
-    tasks.g[:] = 0.0
-    tasks.J[:] = 0.0
-    pull_to_posture(model.tasks, tasks, targets, state.q)
-    for i in range(targets.follows.shape[0]):
-        if targets.follows[i] == 0:
-            accumulate_hold_cost(tasks, targets, i, state.q)
-            continue
-        J, weight = tasks.J[6 * i : 6 * i + 6], model.tasks.priority.weight[i]
-        tool_jacobian(model.tasks.chain, tasks.placements, model.tasks.tools, i, tasks.translation[i], J)
-        wanted_twist(model.tasks.motion, tasks, targets, i)
-        accumulate_tool_cost(J, tasks.twist[i], weight, tasks.H, tasks.g)
-        accumulate_stretch_damping(model.tasks, tasks, i)
-    project_to_nullspace(tasks.J, tasks.tools_factor, tasks.tools_moved, tasks.posture)
-    accumulate_posture_cost(model.tasks, tasks)
+    write_task_cost(model.tasks, data.tasks, targets, state.q)
     write_separation_rows(model.safety, data.safety, h)
     inside = next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
     return usable, inside, find_minimum(data_pointer)

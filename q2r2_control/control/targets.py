@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.closest_points import dot, size_of
+from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import kernel, pointer_to
+from q2r2_control.control.tasks.built_in import TaskModel
 from q2r2_control.control.tasks.frame import rotation_vector, times_transposed
-from q2r2_control.control.tasks.task_data import PoseScratch, TaskModel, TaskTargets
 from q2r2_control.types import Array
 
 # Farther than any cell; keeps squares of what is merely far away finite.
@@ -19,6 +21,57 @@ _FARTHEST = 100.0  # [m]
 _ORTHONORMAL = 1e-3
 _AT_REST = 1e-2  # [rad/s]
 _NONE, _POSE, _NO_POSE = 0, 1, 2  # what was offered to an arm
+# A target faster than this many times the tool's own limit did not move, it was put elsewhere.
+_TELEPORT = 3.0
+
+
+class PoseScratch(NamedTuple):
+    """Scratch of an offered pose that is being checked."""
+
+    rotation: Array  # (3, 3)
+    gram: Array  # (3, 3)
+    correction: Array  # (3, 3)
+    translation: Array  # (3,)
+    moved: Array  # (6,)
+
+
+class TaskTargets(NamedTuple):
+    """What the arms are asked to do."""
+
+    member: Array  # (n, nv) 1 where a joint is the arm's
+    follows: IntArray  # (n,) 1: the tool follows its target, 0: the arm's joints hold
+    rotation: Array  # (n, 3, 3)
+    translation: Array  # (n, 3) [m]
+    feed_forward: Array  # (n, 6) the target's own twist [m/s, rad/s]
+    hold: Array  # (nv,) joint positions to hold [rad]
+    posture: Array  # (nv,) joint positions that the arms take where the tools leave them free to [rad]
+    latched: IntArray  # (n,) 1: the arm has come to rest where it holds
+    offered: IntArray  # (n,) what this tick brought: nothing, a pose, something else
+    pose: Array  # (n, 4, 4) homogeneous, as offered
+    feed_forward_time: float  # in which the feed-forward is smoothed [s]
+    teleport_speed: float  # a faster target did not move, it was put elsewhere [m/s]
+    teleport_turn: float  # [rad/s]
+    scratch: PoseScratch
+
+    @classmethod
+    def empty(cls, model: TaskModel, settings: ControllerSettings) -> TaskTargets:
+        n, nv = model.tools.member.shape
+        return cls(
+            member=model.tools.member,
+            follows=np.zeros(n, dtype=np.int64),
+            rotation=np.zeros((n, 3, 3)),
+            translation=np.zeros((n, 3)),
+            feed_forward=np.zeros((n, 6)),
+            hold=np.zeros(nv),
+            posture=model.posture.home.copy(),
+            latched=np.zeros(n, dtype=np.int64),
+            offered=np.zeros(n, dtype=np.int64),
+            pose=np.zeros((n, 4, 4)),
+            feed_forward_time=settings.feed_forward_time,
+            teleport_speed=_TELEPORT * settings.max_linear_speed,
+            teleport_turn=_TELEPORT * settings.max_angular_speed,
+            scratch=PoseScratch(*np.zeros((3, 3, 3)), *np.zeros((1, 3)), *np.zeros((1, 6))),
+        )
 
 
 class TargetTracker:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from itertools import islice, pairwise
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -29,6 +30,24 @@ _SPREAD = 0.6  # of random way points [rad]
 _INSIDE = 0.02  # of joint limits [rad]
 
 
+class HomingStep(NamedTuple):
+    """One tick of a way home."""
+
+    joints: Array | None  # (nv,) where arms without a target shall be [rad]; None: where they rest
+    targets: dict[str, pin.SE3 | None]  # of tools; an arm that is missing has none
+
+
+class WayHome(Protocol):
+    """Leads all arms home, from where it was made on."""
+
+    @property
+    def outcome(self) -> ReasonKind | None:
+        """How it ended, or None while it goes on."""
+
+    def step(self, q: Array, v: Array, dt: float) -> HomingStep:
+        """Where the arms shall be in ``dt`` [s], with the reference at ``q``, ``v`` (nv,)."""
+
+
 class JointHoming:
     """Leads all joints to a goal, from where they come to rest."""
 
@@ -44,11 +63,11 @@ class JointHoming:
         self._waited = 0.0  # without progress [s]
         self.outcome: ReasonKind | None = None  # how it ended
 
-    def step(self, q: Array, v: Array, dt: float) -> Array | None:
-        """Where the joints shall be (nv,) in ``dt`` [s], with the reference at ``q``, ``v``; None: where they rest."""
+    def step(self, q: Array, v: Array, dt: float) -> HomingStep:
+        """See :class:`WayHome`."""
         if self._search is None:
             if float(np.abs(v).max()) > _AT_REST:
-                return None
+                return HomingStep(None, {})
             # A pair that has less room where the way begins needs no more than that.
             self._needed = np.minimum(self._kept + _ROOM, self._robot.distance_values(q) - 1e-4)
             self._at = self._leg = q.copy()
@@ -60,7 +79,7 @@ class JointHoming:
                 self.outcome = ReasonKind.HOMING_NO_WAY
         elif self._points:
             self._go(self._points, q, dt)
-        return self._at
+        return HomingStep(self._at, {})
 
     def _go(self, points: list[Array], q: Array, dt: float) -> None:
         goal, last = points[0], len(points) == 1
@@ -134,8 +153,8 @@ class ToolHoming:
         self._duration = max(max(way / _LINEAR_SPEED, turn / _ANGULAR_SPEED, 0.1) for way, turn in ways)
         self._time = 0.0
 
-    def targets(self, dt: float) -> dict[str, pin.SE3 | None]:
-        """Where the tools have to be after another ``dt`` [s]."""
+    def step(self, q: Array, v: Array, dt: float) -> HomingStep:
+        """See :class:`WayHome`."""
         self._time += dt
         share = min(self._time / self._duration, 1.0)
         targets: dict[str, pin.SE3 | None] = {}
@@ -143,11 +162,11 @@ class ToolHoming:
             way = self._home[arm].translation - start.translation
             turn = pin.log3(start.rotation.T @ self._home[arm].rotation)
             targets[arm] = pin.SE3(start.rotation @ pin.exp3(share * turn), start.translation + share * way)
-        return targets
+        return HomingStep(None, targets)
 
     @property
     def outcome(self) -> ReasonKind | None:
-        """How the homing ended, or None while it goes on."""
+        """See :class:`WayHome`."""
         if self._time < self._duration:
             return None
         errors = [apart(self._tool_pose(arm), home) for arm, home in self._home.items()]
@@ -162,7 +181,7 @@ class Homing:
     def __init__(self, robot: Robot, controller: CartesianController, tools_only: bool) -> None:
         self._robot, self._controller, self._tools_only = robot, controller, tools_only
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
-        self._way: JointHoming | ToolHoming | None = None
+        self._way: WayHome | None = None
         self.outcome: Reason | None = None  # how the last way home ended, where it did by itself
 
     @property
@@ -177,12 +196,12 @@ class Homing:
             self._way = JointHoming(self._robot, self._controller.kept_distances, self._robot.home)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """What each tool is asked for in ``dt`` [s]: nothing where joints are led, from the ``last`` reference."""
-        if isinstance(self._way, ToolHoming):
-            return self._way.targets(dt)
-        if self._way is not None and last is not None:
-            self._controller.hold_at(self._way.step(last.q, last.v, dt))
-        return dict.fromkeys(self._robot.arms)
+        """The target of each tool in ``dt`` [s], from the ``last`` reference: none where joints are led."""
+        if self._way is None or last is None:
+            return dict.fromkeys(self._robot.arms)
+        step = self._way.step(last.q, last.v, dt)
+        self._controller.hold_at(step.joints)
+        return dict.fromkeys(self._robot.arms) | step.targets
 
     def check(self, reference: Reference) -> Reason | None:
         """End the way where it has an outcome at the tick's ``reference``; returns that, or None."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,8 @@ from q2r2_control.verification.adversary import Adversary, Stream
 
 # "towards_nearest": the vertex of the box that brings the pair with the least margin together fastest.
 # "corner": a random vertex, for a while. "again": the last answer, whatever the box is now.
-ATTACKS = ("towards_nearest", "corner", "again")
+# "no_rows": the QP's solution without a separation row, which is straight on to the targets.
+ATTACKS = ("towards_nearest", "corner", "again", "no_rows")
 _PATIENCE = 200  # ticks that one pair or one corner is pursued for, at most
 _CANDIDATES = 4  # the pairs with the least margins, of which one is pursued
 
@@ -77,7 +78,7 @@ class WorstSolver:
 # Solver failures after which the certified stop is due. A solution of absurd numbers is cut to the limits instead.
 STOPPING_FAULTS = ("none", "nan", "one_nan", "infinite", "late")
 FAULTS = (*STOPPING_FAULTS, "absurd", "noise")
-_ATTACK_SHARES = (0.7, 0.2, 0.1)
+_ATTACK_SHARES = (0.6, 0.15, 0.1, 0.15)
 _FAULTY, _ATTACKED = 0.2, 0.3  # share of the segments whose solver fails, or works against the arms
 _TIMINGS = ("1 ms", "1 ms, jittering", "a few ms", "any", "tiny", "long", "partly invalid")
 _TIMING_SHARES = (0.42, 0.20, 0.15, 0.08, 0.05, 0.04, 0.06)  # of the segments
@@ -91,20 +92,22 @@ class FaultySolver:
     """A real solver that fails as :attr:`fault` says: one of ``FAULTS`` or ``ATTACKS``, or None for a healthy one.
 
     Its solve times are made up, so that no outcome depends on the load of the machine. ``worst`` answers while
-    :attr:`fault` is an attack; ``q`` (nv,) [rad] and ``kept`` (p,) [m] are what it aims by.
+    :attr:`fault` is an attack that needs no solver; ``q`` (nv,) [rad] and ``kept`` (p,) [m] are what it aims by.
     """
 
     def __init__(
         self, inner: Solver, random: np.random.Generator | None = None, worst: WorstSolver | None = None
     ) -> None:
         self._inner, self._random = inner, np.random.default_rng(0) if random is None else random
-        self._worst = worst
+        self.worst = worst
         self.fault: str | None = None
         self.q, self.kept = np.zeros(0), np.zeros(0)
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        if self.fault in ATTACKS and self._worst is not None:
-            return QpSolution(self._worst.answer(self.fault, problem, self.q, self.kept), 0.0)
+        if self.fault == "no_rows":
+            problem = replace(problem, rows=problem.rows[:0], rows_lower=problem.rows_lower[:0], minimum=None)
+        elif self.fault in ATTACKS and self.worst is not None:
+            return QpSolution(self.worst.answer(self.fault, problem, self.q, self.kept), 0.0)
         v, nv = self._inner.solve(problem).v, len(problem.g)
         if self.fault is None or self.fault in ATTACKS:
             return QpSolution(v, 0.0)

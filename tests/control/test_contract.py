@@ -11,12 +11,12 @@ import pytest
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution
+from q2r2_control.control.qp import DaqpSolver
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, StepStatus
 from q2r2_control.verification.contract import Contract
-from q2r2_control.verification.fault_injection import FaultySolver, WorstSolver
+from q2r2_control.verification.fault_injection import ATTACKS, FaultySolver, WorstSolver
 from q2r2_control.wording import limit_name
 from tests.control.scenarios import SCENARIOS, crossing
 from tests.control.test_scenarios import controller_of, robot_of
@@ -170,28 +170,20 @@ def test_the_report_names_what_holds_the_arms_back(controller: CartesianControll
     assert not report.fallback
 
 
-class Attack:
-    """A solver that works against the arms and sees no separation row: only the certificate stands between."""
-
-    def __init__(self, robot: Robot, attack: str, seed: int) -> None:
-        self._worst, self._attack = WorstSolver(robot, np.random.default_rng(seed)), attack
-        self.q, self.kept = robot.home, np.zeros(len(robot.collision_model.collisionPairs))
-
-    def solve(self, problem: QpProblem) -> QpSolution:
-        return QpSolution(self._worst.answer(self._attack, problem, self.q, self.kept), 0.0)
-
-
 def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack: str, seed: int) -> float:
     """Least margin of a pair at any tick by Coal [m], all of which have a certificate."""
-    solver = Attack(robot, attack, seed)
+    solver = FaultySolver(DaqpSolver(robot.model.nv), worst=WorstSolver(robot, np.random.default_rng(seed)))
     controller = CartesianController(robot, settings, solver=solver)
     solver.kept, solver.q = controller.kept_distances, robot.home
     controller.reset(robot.home)
+    targets = crossing(0.0, {arm: controller.tool_pose(arm) for arm in robot.arms})
     contract = Contract(controller, robot.home, random=np.random.default_rng(seed))
     least = np.inf
     for tick in range(ticks):
         dt = (0.001, 0.004, 0.0005, 0.01, 0.03)[tick // 150 % 5]
-        reference = controller.step({}, dt)
+        # There has to be an answer to repeat.
+        solver.fault = "towards_nearest" if attack == "again" and tick % 5 == 0 else attack
+        reference = controller.step(targets, dt)
         contract.check(reference, dt)
         solver.q = reference.q
         least = min(least, float((robot.distance_values(reference.q) - controller.kept_distances).min()))
@@ -199,7 +191,7 @@ def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack:
     return least
 
 
-@pytest.mark.parametrize("attack", ["towards_nearest", "corner"])
+@pytest.mark.parametrize("attack", ATTACKS)
 def test_the_worst_solver_brings_no_pair_closer_than_it_keeps(attack: str) -> None:
     least = least_margin(robot_of("iiwa7"), load_config("config/dual_iiwa7.yaml").control, 1500, attack, seed=1)
     assert -ROUNDING <= least < 1e-4, "it has to get there, and no further"
@@ -216,3 +208,30 @@ def test_a_pair_that_is_closer_by_rounding_keeps_its_certificate_and_its_distanc
     assert StepStatus.RECOVERING not in {report.status for report in reports}
     assert reports[-1].margin > 1e-4, "the pair opens to its buffer"
     assert -ROUNDING <= least_margin(robot, settings, 600, "towards_nearest", seed=2) < 0.0
+
+
+def test_a_start_whose_stop_is_not_proven_has_no_certificate_until_a_step_is_however_much_room_it_has() -> None:
+    controller, solver = controller_of("iiwa7")
+    q, turn = controller.robot.home.copy(), np.zeros(controller.robot.model.nv)
+    turn[[arm.joints[0] for arm in controller.robot.arms.values()]] = [-1.0, 1.0]  # towards each other
+    for speed in np.arange(0.5, 1.0, 5e-4):
+        controller.reset(q + 0.3 * turn, speed * turn)
+        if not controller.step({}, 0.0).report.certified:
+            break  # a little too fast
+    solver.fault = "none"
+    reports = [controller.step({}, 0.001).report for _ in range(5)]
+    assert not any(report.certified for report in reports)
+    assert min(report.margin for report in reports) > 0.015
+    solver.fault = None
+    reports = [controller.step({}, 0.001).report for _ in range(300)]
+    assert all(report.certified and report.margin >= 0.0 for report in reports)
+
+
+def test_the_first_step_out_of_a_pair_that_is_too_close_has_no_certificate_and_the_next_one_has() -> None:
+    robot = robot_of("iiwa7")
+    settings = ControllerSettings(min_distance=float(robot.distance_values(robot.home).min()) + 1e-5)
+    controller = CartesianController(robot, settings)
+    reports = [controller.step({}, 0.001).report for _ in range(100)]
+    apart = next(tick for tick, report in enumerate(reports) if report.margin >= 0.0)
+    assert apart > 0
+    assert [tick for tick, report in enumerate(reports) if not report.certified] == list(range(apart + 1))

@@ -19,12 +19,13 @@ from q2r2_control.control.qp import DaqpSolver
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, StepStatus
 from q2r2_control.verification.contract import Contract
-from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver
+from q2r2_control.verification.fault_injection import ATTACKS, STOPPING_FAULTS, FaultySolver, WorstSolver
 from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
 DURATION = 2.0  # [s]
 FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2  # a faulty solver fails at the end of every period [s]
+AGAINST_US = "against us"  # one attack after the other, a period each
 Start = Callable[[Robot], tuple[Array, Array]]
 
 
@@ -99,6 +100,8 @@ class Case:
     fault: str | None = None
 
     def fault_at(self, t: float) -> str | None:
+        if self.fault == AGAINST_US:
+            return ATTACKS[int(t / FAULT_PERIOD) % len(ATTACKS)]
         return self.fault if t % FAULT_PERIOD >= (1.0 - FAULT_SHARE) * FAULT_PERIOD else None
 
     @property
@@ -116,6 +119,7 @@ CASES = {
     "solver not finite": Case(crossing, fault="nan"),
     "solver late": Case(crossing, fault="late"),
     "solver absurd": Case(crossing, fault="absurd"),
+    "solver against us": Case(crossing, fault=AGAINST_US),
 }
 
 
@@ -141,6 +145,8 @@ def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> N
     controller, solver = controller_of(robot)
     q, v = case.start(controller.robot)
     controller.reset(q, v)
+    solver.q, solver.kept = q, controller.kept_distances
+    solver.worst = WorstSolver(controller.robot, np.random.default_rng(6))
     contract = Contract(controller, q, v)
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     t, statuses, failed, unfounded = 0.0, set(), 0, 0
@@ -149,6 +155,7 @@ def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> N
         reference = controller.step(case.scenario(t, start), length)
         contract.check(reference, length, failed=solver.fault in STOPPING_FAULTS)
         failed += solver.fault in STOPPING_FAULTS
+        solver.q = reference.q
         unfounded += reference.report.fallback and solver.fault is None
         statuses.add(reference.report.status)
         t += length

@@ -8,8 +8,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.targets import TargetTracker, update_targets
-from q2r2_control.control.tasks.task_data import TaskTargets
+from q2r2_control.control.targets import TargetTracker, TaskTargets, update_targets
 from q2r2_control.types import Array
 from tests.control.cells import kernel_model
 

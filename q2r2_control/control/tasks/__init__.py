@@ -1,6 +1,6 @@
 """What the arms should do, as costs of the QP: kernels that add to H and g of  1/2 v' H v + g' v.
 
-``frame`` follows a tool target; ``task_data`` holds joints and uses those that no tool needs; ``external`` has costs
-of other packages. Which arm gives way is a matter of their weights. Each kernel
-takes a ``TaskModel`` (fixed) and ``TaskData`` (rewritten at each tick).
+``frame`` follows a tool target, ``hold`` holds joints, ``posture`` uses those that no tool needs; which arm gives way
+is a matter of the weights in ``priority``. Each of these modules has its model, data and kernels, and a line in each
+part of ``built_in``. ``external`` loads the costs of other packages.
 """

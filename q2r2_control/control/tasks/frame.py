@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.closest_points import dot, size_of
 from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
 from q2r2_control.control.jit import kernel
@@ -25,7 +26,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 if TYPE_CHECKING:
-    from q2r2_control.control.tasks.task_data import TaskData, TaskModel, TaskTargets
+    from q2r2_control.control.targets import TaskTargets
+    from q2r2_control.control.tasks.built_in import TaskData, TaskModel
 
 
 class Tools(NamedTuple):
@@ -60,6 +62,42 @@ class Motion(NamedTuple):
     deceleration: Array  # (2,) [m/s^2, rad/s^2]
     full_speed: Array  # (2,) [m/s, rad/s]
     stretch_gain: Array  # (1,) k [1/s]
+
+
+def motion_of(settings: ControllerSettings) -> Motion:
+    """Gains and speeds as the kernels read them."""
+    return Motion(
+        gain=np.array([settings.position_gain, settings.rotation_gain]),
+        deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
+        full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
+        stretch_gain=np.array([settings.stretch_gain]),
+    )
+
+
+class FrameData(NamedTuple):
+    """Written at each tick."""
+
+    twist: Array  # (n, 6) wanted [m/s, rad/s]
+    feedback: Array  # (n, 6) the part of it that the error makes
+    turn: Array  # (3, 3) scratch: rotation from tool to target
+
+    @classmethod
+    def empty(cls, n: int) -> FrameData:
+        return cls(np.zeros((n, 6)), np.zeros((n, 6)), np.zeros((3, 3)))
+
+
+@kernel
+def accumulate_frame_cost(model: TaskModel, data: TaskData, targets: TaskTargets) -> None:
+    """Add the cost of every tool that follows its target, and write its Jacobian."""
+    data.J[:] = 0.0
+    for i in range(targets.follows.shape[0]):
+        if targets.follows[i] == 0:
+            continue
+        J = data.J[6 * i : 6 * i + 6]
+        tool_jacobian(model.chain, data.placements, model.tools, i, data.translation[i], J)
+        wanted_twist(model.motion, data, targets, i)
+        accumulate_tool_cost(J, data.frame.twist[i], model.priority.arm[i], data.H, data.g)
+        accumulate_stretch_damping(model, data, i)
 
 
 @kernel
@@ -97,7 +135,10 @@ def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, tr
 
 @kernel
 def rotation_vector(R: Array, out: Array) -> None:
-    """Rotation vector [rad] of a rotation matrix (3, 3), angle in [0, pi], through its quaternion of largest part."""
+    """Rotation vector [rad] of a rotation matrix (3, 3), angle in [0, pi], through its quaternion of largest part.
+
+    That of :mod:`q2r2_control.quaternions` takes a quaternion of Python floats, which a kernel has none of.
+    """
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace > 0.0:
         w = 1.0 + trace
@@ -141,12 +182,12 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 
 @kernel
 def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -> None:
-    """Twist of tool ``i`` towards its target into ``data.twist``, and the part that the error makes."""
-    twist, feedback, feed_forward = data.twist[i], data.feedback[i], targets.feed_forward[i]
-    times_transposed(targets.rotation[i], data.rotation[i], data.turn)
+    """Twist of tool ``i`` towards its target into ``data.frame.twist``, and the part that the error makes."""
+    twist, feedback, feed_forward = data.frame.twist[i], data.frame.feedback[i], targets.feed_forward[i]
+    times_transposed(targets.rotation[i], data.rotation[i], data.frame.turn)
     for k in range(3):
         twist[k] = targets.translation[i, k] - data.translation[i, k]
-    rotation_vector(data.turn, twist[3:6])
+    rotation_vector(data.frame.turn, twist[3:6])
     for part in range(2):
         piece = twist[3 * part : 3 * part + 3]
         error, cap = size_of(piece), motion.full_speed[part]
@@ -189,9 +230,9 @@ def accumulate_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None
     second derivative is no Hessian, the same bound in magnitude stands in: J_j turns with joint k by at most |z_k|.
     """
     chain, placements, H = model.chain, data.placements, data.H
-    J, feedback = data.J[6 * i : 6 * i + 6], data.feedback[i]
+    J, feedback = data.J[6 * i : 6 * i + 6], data.frame.feedback[i]
     turning = ROTATION_LENGTH * ROTATION_LENGTH * size_of(feedback[3:6])
-    scale = model.priority.weight[i] / model.motion.stretch_gain[0]
+    scale = model.priority.arm[i] / model.motion.stretch_gain[0]
     far = model.tools.joint[i]
     while far != 0:
         j = far - 1

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.targets import TaskTargets
 from q2r2_control.control.tasks.frame import (
     ROTATION_LENGTH,
     Motion,
@@ -18,7 +19,6 @@ from q2r2_control.control.tasks.frame import (
     tools_of,
     wanted_twist,
 )
-from q2r2_control.control.tasks.task_data import TaskTargets
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, kernel_data, kernel_model, placed, random_posture
 
@@ -92,7 +92,7 @@ def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array) -> Array:
     targets.rotation[arm], targets.translation[arm] = target.rotation, target.translation
     targets.feed_forward[arm] = feed_forward
     wanted_twist(MOTION, data, targets, arm)
-    return data.twist[arm]
+    return data.frame.twist[arm]
 
 
 def _poses(random: np.random.Generator) -> tuple[pin.SE3, pin.SE3]:

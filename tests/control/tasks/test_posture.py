@@ -8,7 +8,7 @@ import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot
 from q2r2_control.control.tasks.frame import tool_jacobian, tool_pose, tools_of
-from q2r2_control.control.tasks.task_data import project_to_nullspace
+from q2r2_control.control.tasks.posture import project_to_nullspace
 from q2r2_control.types import Array
 from q2r2_control.verification.contract import Contract
 from tests.control.cells import NAMES, cell, placed

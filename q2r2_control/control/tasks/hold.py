@@ -1,0 +1,28 @@
+"""The cost of arms without a target, whose joints return to where they were latched: w |v - k (hold - q)|^2."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from q2r2_control.control.jit import kernel
+from q2r2_control.types import Array
+
+if TYPE_CHECKING:
+    from q2r2_control.control.targets import TaskTargets
+    from q2r2_control.control.tasks.built_in import TaskData
+
+# A held arm is not pushed about by the other one's task, but may give way to recover separation.
+_WEIGHT = 300.0
+_GAIN = 4.0  # [1/s]
+
+
+@kernel
+def accumulate_hold_cost(data: TaskData, targets: TaskTargets, q: Array) -> None:
+    """Add the cost of every arm that follows no target."""
+    for i in range(targets.follows.shape[0]):
+        if targets.follows[i] == 1:
+            continue
+        for j in range(q.shape[0]):
+            if targets.member[i, j] == 1.0:
+                data.H[j, j] += _WEIGHT
+                data.g[j] -= _WEIGHT * _GAIN * (targets.hold[j] - q[j])

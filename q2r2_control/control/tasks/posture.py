@@ -1,0 +1,87 @@
+"""The cost of joints that no tool needs, which are pulled towards a posture.
+
+For all joints w |v - v_p|^2 with the posture velocity v_p projected into the tools' nullspace, so that at rest it
+leaves no tool error. Joints of an arm without a target are not pulled.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.cholesky import factorise, substitute
+from q2r2_control.control.geometry.closest_points import clamp, dot
+from q2r2_control.control.jit import kernel
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+if TYPE_CHECKING:
+    from q2r2_control.control.targets import TaskTargets
+    from q2r2_control.control.tasks.built_in import TaskData, TaskModel
+
+_PROJECTION_DAMPING = 1e-3
+
+
+class Posture(NamedTuple):
+    """Where joints go that the tools leave free; gain and weight may change between ticks."""
+
+    home: Array  # (nv,) [rad]
+    gain: Array  # (1,) [1/s]
+    weight: Array  # (1,) against the tool task's 1
+    speed: float  # at most [rad/s]
+
+
+def posture_of(robot: Robot, settings: ControllerSettings) -> Posture:
+    """Home, and how strongly the joints are pulled there."""
+    gain, weight = np.array([settings.posture_gain]), np.array([settings.posture_weight])
+    return Posture(np.array(robot.home), gain, weight, settings.posture_speed)
+
+
+class PostureData(NamedTuple):
+    """Written at each tick."""
+
+    v: Array  # (nv,) wanted where the tools leave joints free [rad/s]
+    factor: Array  # (6 n, 6 n) Cholesky factor of J J', damped
+    moved: Array  # (6 n,) scratch
+
+    @classmethod
+    def empty(cls, n: int, nv: int) -> PostureData:
+        return cls(np.zeros(nv), np.zeros((6 * n, 6 * n)), np.zeros(6 * n))
+
+
+@kernel
+def accumulate_posture_cost(model: TaskModel, data: TaskData, targets: TaskTargets, q: Array) -> None:
+    """Add the cost of all joints' distance from the posture velocity; needs the Jacobians of the tools."""
+    gain, speed, v = model.posture.gain[0], model.posture.speed, data.posture.v
+    for j in range(q.shape[0]):
+        v[j] = clamp(gain * (targets.posture[j] - q[j]), -speed, speed)
+    for i in range(targets.follows.shape[0]):
+        if targets.follows[i] == 0:
+            for j in range(q.shape[0]):
+                if targets.member[i, j] == 1.0:
+                    v[j] = 0.0
+    project_to_nullspace(data.J, data.posture.factor, data.posture.moved, v)
+    for j in range(q.shape[0]):
+        weight = model.posture.weight[0] * model.priority.joint[j]
+        data.H[j, j] += weight
+        data.g[j] -= weight * v[j]
+
+
+@kernel
+def project_to_nullspace(J: Array, factor: Array, moved: Array, v: Array) -> None:
+    """Remove from ``v`` (nv,) what moves the tools with Jacobians J (6n, nv): v -= J' (J J' + d I)^-1 J v.
+
+    ``factor`` (6n, 6n) and ``moved`` (6n,) are scratch.
+    """
+    for i in range(J.shape[0]):
+        for j in range(i, J.shape[0]):
+            factor[i, j] = dot(J[i], J[j])
+        factor[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
+        moved[i] = dot(J[i], v)
+    factorise(factor)  # positive definite for any finite J; of another, J v is not finite either
+    substitute(factor, moved)
+    for j in range(J.shape[1]):
+        for i in range(J.shape[0]):
+            v[j] -= J[i, j] * moved[i]

@@ -1,0 +1,38 @@
+"""Which arm gives way where two arms are in each other's way: weights of the other tasks' costs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.config.control import EQUAL, ControllerSettings
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+
+class Priority(NamedTuple):
+    """Which arm gives way where two arms are in each other's way; the weights may change between ticks.
+
+    Arms meet in the QP only where separation rows couple their joints. There all costs of an arm that gives way, also
+    posture and damping, are multiplied by a small weight, so that its motion pays for a row that both arms need. Where
+    no row is active nothing changes. An arm without a target holds its joints, and does not give way.
+    """
+
+    arm: Array  # (n,) of an arm's costs while it follows a target: 1, less if it gives way
+    joint: Array  # (nv,) the same for each joint
+
+
+def priority_of(robot: Robot, settings: ControllerSettings) -> Priority:
+    """The weights of the arms' costs; ``settings.priority`` names an arm, or none."""
+    priority = Priority(np.ones(len(robot.arms)), np.ones(robot.model.nv))
+    if settings.priority == EQUAL:
+        return priority
+    first = robot.arms[settings.priority].joints
+    for i, (name, arm) in enumerate(robot.arms.items()):
+        if name == settings.priority:
+            continue
+        priority.arm[i] = settings.yield_weight
+        # A joint that also moves the arm with priority keeps its full cost.
+        priority.joint[np.setdiff1d(arm.joints, first)] = settings.yield_weight
+    return priority
