@@ -24,7 +24,8 @@ class Plant(Protocol):
     One tick: ``apply`` says where the plant has to be at the end of the tick, ``advance`` lets that time pass,
     ``state`` says where it got. On hardware, where time passes by itself, ``advance`` is where a plant waits for the
     next measurement. A new plant stands at home with open grippers, and stays there until a command comes. A plant
-    that is found by its name has a class method ``from_config(robot, config)`` as well.
+    that is found by its name has a class method ``from_config(robot, config)`` as well, and one with a window is a
+    :class:`WindowedPlant`.
     """
 
     modes: tuple[CommandMode, ...]  # of the commands that this plant follows
@@ -58,6 +59,19 @@ class Plant(Protocol):
 
     def close(self) -> None:
         """Give back every resource; may be called twice."""
+        ...
+
+
+@runtime_checkable
+class WindowedPlant(Protocol):
+    """The methods that a plant with a window has besides those of :class:`Plant`, for ``--viewer``."""
+
+    def launch_viewer(self) -> None:
+        """Open the window. Raises :class:`PlantError` where there is no display."""
+        ...
+
+    def viewer_sync(self) -> bool:
+        """Show the plant as it is now; False once the window has been closed."""
         ...
 
 
