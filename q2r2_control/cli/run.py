@@ -69,19 +69,11 @@ def run(
     """
     cell = load_config(config)
     source = input or cell.input
-    asked = {
-        "trajectory": trajectory,
-        "human": human or None,
-        "seed": seed or None,
-        "fast": fast or None,
-        "host": host,
-        "port": port,
-    }
+    asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
+    asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}
     given = {option: value for option, value in asked.items() if value is not None}
-    taken = options_of(source)
-    for option in given:
-        if option not in taken:
-            raise ConfigError(f"--{option} cannot be used with --input {source}")
+    if unfit := [option for option in given if option not in options_of(source)]:
+        raise ConfigError(f"--{unfit[0]} cannot be used with --input {source}")
     if fast and duration is None:
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
     _check_times(fast, rt)

@@ -24,11 +24,9 @@ class Input(Protocol):
     @property
     def connected(self) -> bool:
         """Whether samples can arrive now. The loop reports every change from True to False to the teleop layer."""
-        ...
 
     def start(self) -> None:
         """Begin to receive; returns at once. Raises :class:`Q2R2Error` when the source cannot be opened."""
-        ...
 
     def poll(self, now: float) -> list[HandSample]:
         """Samples that came in since the last poll, oldest first; empty when there are none.
@@ -36,15 +34,12 @@ class Input(Protocol):
         ``now`` [s] is on the clock of the samples' stamps. Never waits, and never raises because of what was received.
         What it has returned stays as it is: others keep it for some ticks.
         """
-        ...
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
         """Vibrate a hand controller if the source has any; otherwise nothing happens. Never waits."""
-        ...
 
     def close(self) -> None:
         """Release every resource; may be called twice."""
-        ...
 
 
 def options_of(source: str) -> tuple[str, ...]:

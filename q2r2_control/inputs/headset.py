@@ -51,7 +51,7 @@ class HeadsetServer:
         listener: Callable[[Watched], None] | None = None,
         allow: Sequence[Network] | None = None,
         watch: HandsWatch | None = None,
-        say: Callable[[str], None] = lambda line: None,
+        say: Callable[[str], None] = _LOG.debug,
     ) -> None:
         self.address = host, port  # after ``start`` the port that was bound
         self._allow, self._clock, self._tell, self._say = allow, clock, listener, say
@@ -69,11 +69,7 @@ class HeadsetServer:
 
     @classmethod
     def from_config(
-        cls,
-        config: Config,
-        host: str | None = None,
-        port: int | None = None,
-        say: Callable[[str], None] = lambda line: None,
+        cls, config: Config, host: str | None = None, port: int | None = None, say: Callable[[str], None] = _LOG.debug
     ) -> HeadsetServer:
         """At the cell's address, or another ``host`` or ``port``."""
         given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}

@@ -32,7 +32,6 @@ class Plant(Protocol):
 
     def reset(self, q: Array | None = None) -> None:
         """Start over at time 0, at rest at ``q`` (nv,) or else at home, grippers open. Raises :class:`PlantError`."""
-        ...
 
     def apply(self, command: Command) -> None:
         """Take ``command``: posture and velocity are due at the end of the next ``advance``, a torque acts at once.
@@ -40,26 +39,21 @@ class Plant(Protocol):
         Without a newer one, later advances hold its posture at rest, or its torque. Raises :class:`PlantError` on a
         mode that the plant does not have and on numbers that are not finite; the previous command stays in force.
         """
-        ...
 
     def advance(self, dt: float) -> None:
         """Let ``dt`` [s], 0 .. 1, pass. Raises :class:`PlantError` on any other time; nothing moves then."""
-        ...
 
     def state(self) -> RobotState:
         """The newest measurement; its stamp is on the plant's own clock, which starts at 0 on ``reset``.
 
         Its arrays stay as they are: others keep them for some ticks.
         """
-        ...
 
     def gripper_openings(self) -> dict[str, float]:
         """Measured opening of each arm that has a gripper, 0 closed .. 1 fully open; another mapping at each call."""
-        ...
 
     def close(self) -> None:
         """Give back every resource; may be called twice."""
-        ...
 
 
 @runtime_checkable
@@ -68,11 +62,9 @@ class WindowedPlant(Protocol):
 
     def launch_viewer(self) -> None:
         """Open the window. Raises :class:`PlantError` where there is no display."""
-        ...
 
     def viewer_sync(self) -> bool:
         """Show the plant as it is now; False once the window has been closed."""
-        ...
 
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,16 +26,7 @@ from q2r2_control.recording.tick_rows import NOT_REPLAYED, TickPacker, tick_labe
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import (
-    QUEST_CONTROLS,
-    Array,
-    Command,
-    CommandMode,
-    DeviceControls,
-    HandSample,
-    HapticFeedback,
-    RobotState,
-)
+from q2r2_control.types import QUEST_CONTROLS, Array, Command, CommandMode, HandSample, HapticFeedback, RobotState
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +106,9 @@ class ReplayPipeline(Pipeline):
 
     def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, about: About, plant: str | None) -> None:
         """``plant`` by its name; None: the recorded one, which no command moves."""
-        recorded = _Recorded(ticks, about.plant_modes, self._ask_again, config.teleop.bindings.of_device)
+        recorded = _Recorded(ticks, about.plant_modes, self._ask_again)
+        # A recording does not say which buttons of its own the device had.
+        recorded.controls = replace(QUEST_CONTROLS, buttons=QUEST_CONTROLS.buttons + config.teleop.bindings.of_device)
         moves = recorded if plant is None else make_plant(plant, robot, config)
         super().__init__(config, robot, recorded, moves, about.mode)
         self._recorded = ticks
@@ -153,15 +146,9 @@ class _Clock(LoopClock):
 class _Recorded:
     """Samples and measured states of the recorded tick; commands move nothing. Implements Input and Plant."""
 
-    def __init__(
-        self,
-        ticks: RecordedTicks,
-        modes: tuple[str, ...],
-        on_tick: Callable[[RecordedTick], None],
-        buttons: tuple[str, ...],
-    ) -> None:
-        """``buttons`` of the device's own, which a recording does not declare."""
-        self.controls = DeviceControls(QUEST_CONTROLS.buttons + buttons, QUEST_CONTROLS.axes)
+    controls = QUEST_CONTROLS
+
+    def __init__(self, ticks: RecordedTicks, modes: tuple[str, ...], on_tick: Callable[[RecordedTick], None]) -> None:
         self._ticks, self._on_tick = ticks, on_tick
         self.modes = tuple(CommandMode(mode) for mode in modes)
 

@@ -17,14 +17,10 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.types import DeviceControls
 from tests.cli.command import CELL, q2r2
-from tests.support.modules import ROOT
+from tests.support.modules import blocks_of, install
 from tests.support.processes import cell
 
-PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+PAGE = "docs/extending.md"
 
 
 def merged(data: Any, changes: Any) -> Any:
@@ -36,22 +32,18 @@ def merged(data: Any, changes: Any) -> Any:
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The shipped cell with what the page writes in its YAML; the page's package is installed, with a broken entry."""
-    (tmp_path / "my_package.py").write_text("\n".join(blocks("python")))
     groups: dict[str, dict[str, str]] = {}
-    for block in blocks("toml"):
+    for block in blocks_of(PAGE, "toml"):
         groups |= tomllib.loads(block)["project"]["entry-points"]
     groups["q2r2_control.inputs"]["broken"] = "my_package:Nothing"
     lines: list[str] = []
     for group, entries in groups.items():
         lines += [f"[{group}]", *(f"{name} = {at}" for name, at in entries.items())]
-    metadata = tmp_path / "my_package-1.0.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text("\n".join(lines))
+    install(tmp_path, "my_package", "\n".join(blocks_of(PAGE, "python")), "\n".join(lines))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "my_package", raising=False)
     data = yaml.safe_load(find_resource(CELL).read_text(encoding="utf-8"))
-    for block in blocks("yaml"):
+    for block in blocks_of(PAGE, "yaml"):
         data = merged(data, yaml.safe_load(block))
     return changed(tmp_path / "cell.yaml", data)
 
