@@ -154,7 +154,7 @@ def test_lost_connections_numbers_that_are_none_and_faults_that_the_input_found_
     assert set(samples[:, SAMPLE_FIELDS.index("fault")]) == {0.0, 1.0}
     assert np.isnan(samples[:, SAMPLE_FIELDS.index("x")]).any()
     assert "pose_unusable" in [event.kind for event in result.summary.events if event.destination == "lost"]
-    assert "commanded" in [event.kind for event in result.summary.events]
+    assert "mark" in [event.kind for event in result.summary.events]
 
 
 class LosesItsSensors(KinematicPlant):
