@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 import typer
 
-from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report, record_table
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.inputs.assembly import minimum_jerk
@@ -30,6 +30,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array, HandInputs
+from q2r2_control.viewer.tables import record_table
 
 Way = Callable[[float], float]  # of a hand along one axis [m], over time [s]
 

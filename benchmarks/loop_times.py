@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from q2r2_control.cli.output import DEMO_CONFIG, Json, figure_table, print_progress, print_report
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -28,6 +28,7 @@ from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, CommandMode
+from q2r2_control.viewer.tables import figure_table
 
 CASES = (("kinematic", CommandMode.POSITION), ("mujoco", CommandMode.POSITION), ("mujoco", CommandMode.TORQUE))
 PHYSICS, REST = "physics", "rest of the loop"

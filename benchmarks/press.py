@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 import typer
 
-from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report, record_table
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import TorqueDrive
@@ -29,6 +29,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.contract import Contract
 from q2r2_control.verification.fault_injection import TABLE_ONLY, with_contact
+from q2r2_control.viewer.tables import record_table
 
 COMMANDED = 0.010  # inside the table [m]
 _ARM, _TABLE = "left", "table"

@@ -16,12 +16,13 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control.cli.output import DEMO_CONFIG, Json, figure_table, print_progress, print_report
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.launch.processes import NodeProcess, nodes_of
 from q2r2_control.types import Array
+from q2r2_control.viewer.tables import figure_table
 from ros_processes import private_domain, processor_time, started
 
 _START_TIMEOUT = 300.0  # kernels may have to be compiled [s]

@@ -22,12 +22,13 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report, record_table
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.recording.messages import ARM_FIELDS, arm_flags, asked_target
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
 from q2r2_control.ros.launch.processes import nodes_of
 from q2r2_control.types import Array
+from q2r2_control.viewer.tables import record_table
 from ros_processes import private_domain, started
 
 _LATER = 4  # presses that engage after the first one, at each start

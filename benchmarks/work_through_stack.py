@@ -18,7 +18,7 @@ import typer
 
 from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair, without_pairs
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS, WorkMotion, motions_named
-from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report, record_table
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import PlantError
 from q2r2_control.events import Event
@@ -30,6 +30,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.arm_states import AT_REST
 from q2r2_control.types import Array, CommandMode
 from q2r2_control.verification.contract import Contract
+from q2r2_control.viewer.tables import record_table
 from q2r2_control.wording import sentence
 from work_hands import MOVES, WorkHands
 

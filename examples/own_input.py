@@ -1,10 +1,4 @@
-"""Your own input device: anything that knows where two hands are can move the arms.
-
-An installed package names it, so that a YAML and the commands find it, and has a class method ``from_config(config)``:
-
-    [project.entry-points."q2r2_control.inputs"]
-    swing = "my_package:SwingingHands"
-"""
+"""Your own input device: anything that knows where two hands are. docs/extending.md says how to install one."""
 
 import numpy as np
 
@@ -17,14 +11,12 @@ class SwingingHands:
 
     controls = DeviceControls(buttons=("button_lower", "button_upper"), axes=())
     connected = True
-    controls = DeviceControls(buttons=("button_lower", "button_upper"), axes=())
 
     def start(self) -> None:
-        """Open the device here."""
         self._next = 0.0
 
     def poll(self, now: float) -> list[HandSample]:
-        """What came in since the last poll: 90 samples a second of each hand."""
+        """Samples since the last poll, 90 a second of each hand."""
         if now < self._next:
             return []
         self._next = now + 1.0 / 90.0
@@ -33,11 +25,8 @@ class SwingingHands:
         upright = np.array([0.0, 0.0, 0.0, 1.0])
         return [HandSample(hand, position, upright, now, inputs, now) for hand in ("left", "right")]
 
-    def send_haptic(self, feedback: HapticFeedback) -> None:
-        """These hands feel nothing."""
-
-    def close(self) -> None:
-        """Close the device here."""
+    def send_haptic(self, feedback: HapticFeedback) -> None: ...
+    def close(self) -> None: ...
 
 
 config = load_config("config/dual_iiwa7.yaml")

@@ -5,31 +5,21 @@ import pinocchio as pin
 
 from q2r2_control import CartesianController, ControllerSettings, Robot
 
+# Links of 0.2 m along z, and the axis of the joint at the end of each.
+LINK = """<link name="link_{0}">
+  <inertial><mass value="1"/><origin xyz="0 0 0.1"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+  <collision><origin xyz="0 0 0.1"/><geometry><cylinder radius="0.03" length="0.14"/></geometry></collision>
+</link>"""
+JOINT = """<joint name="joint_{1}" type="revolute">
+  <parent link="link_{0}"/><child link="link_{1}"/><origin xyz="0 0 0.2"/><axis xyz="{2}"/>
+  <limit lower="-2" upper="2" velocity="2" effort="50"/>
+</joint>"""
 AXES = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")
-LENGTH = 0.2  # of each link [m]
 
-
-def link(name: str) -> str:
-    """A capsule-like cylinder along z, with a mass."""
-    return (
-        f'<link name="{name}"><inertial><mass value="1"/><origin xyz="0 0 {LENGTH / 2}"/>'
-        '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
-        f'<collision><origin xyz="0 0 {LENGTH / 2}"/><geometry><cylinder radius="0.03" length="0.14"/></geometry>'
-        "</collision></link>"
-    )
-
-
-def joint(number: int, axis: str) -> str:
-    """A joint with the limits that the controller keeps."""
-    return (
-        f'<joint name="joint_{number}" type="revolute"><parent link="link_{number - 1}"/><child link="link_{number}"/>'
-        f'<origin xyz="0 0 {LENGTH}"/><axis xyz="{axis}"/>'
-        '<limit lower="-2" upper="2" velocity="2" effort="50"/></joint>'
-    )
-
-
-joints = "".join(joint(number, axis) for number, axis in enumerate(AXES, 1))
-urdf = f'<robot name="mine">{"".join(link(f"link_{number}") for number in range(7))}{joints}</robot>'
+links = [LINK.format(number) for number in range(7)]
+joints = [JOINT.format(number, number + 1, axis) for number, axis in enumerate(AXES)]
+urdf = f'<robot name="mine">{"".join(links + joints)}</robot>'
 
 robot = Robot.from_urdf(urdf, arms={"left": "link_6"})
 controller = CartesianController(robot, ControllerSettings())

@@ -19,24 +19,19 @@ controller = CartesianController(robot, config.control)
 controller.reset(robot.home)
 starts = {arm: controller.tool_pose(arm) for arm in robot.arms}
 
-asked: dict[str, list[np.ndarray]] = {arm: [] for arm in robot.arms}
+phase = 2.0 * np.pi * np.arange(0.0, PERIOD, DT) / PERIOD
+figure = np.column_stack([np.zeros_like(phase), 0.04 * np.sin(2.0 * phase), 0.08 * np.sin(phase)])  # (n, 3) [m]
 drawn: dict[str, list[np.ndarray]] = {arm: [] for arm in robot.arms}
-for t in np.arange(0.0, PERIOD, DT):
-    phase = 2.0 * np.pi * t / PERIOD
-    offset = np.array([0.0, 0.04 * np.sin(2.0 * phase), 0.08 * np.sin(phase)])
-    targets = {arm: pin.SE3(start.rotation, start.translation + offset) for arm, start in starts.items()}
-    controller.step(targets, DT)
-    for arm, target in targets.items():
-        asked[arm].append(target.translation)
-        drawn[arm].append(controller.tool_pose(arm).translation)
+for offset in figure:
+    controller.step({arm: pin.SE3(at.rotation, at.translation + offset) for arm, at in starts.items()}, DT)
+    for arm, points in drawn.items():
+        points.append(controller.tool_pose(arm).translation)
 
-for arm in robot.arms:
-    targets_yz, tools_yz = np.array(asked[arm])[:, 1:], np.array(drawn[arm])[:, 1:]
-    plt.plot(*tools_yz.T, label=f"{arm} tool")
-    plt.plot(*targets_yz.T, "k:", linewidth=1.0)
-    print(f"{arm} arm: largest error {1e3 * np.linalg.norm(tools_yz - targets_yz, axis=1).max():.1f} mm")
+for arm, points in drawn.items():
+    targets = starts[arm].translation + figure
+    print(f"{arm} arm: largest error {1e3 * np.linalg.norm(points - targets, axis=1).max():.1f} mm")
+    plt.plot(*np.array(points)[:, 1:].T, label=f"{arm} tool")
+    plt.plot(*targets[:, 1:].T, "k:", linewidth=1.0)
 plt.axis("equal")
-plt.xlabel("y [m]")
-plt.ylabel("z [m]")
 plt.legend()
 plt.savefig(sys.argv[1] if len(sys.argv) > 1 else "figure.png")

@@ -10,43 +10,31 @@ from typing import TYPE_CHECKING
 
 from q2r2_control._lazy import lazy_exports
 
-if TYPE_CHECKING:
-    from q2r2_control.config.cell import load_config
-    from q2r2_control.config.control import ControllerSettings
-    from q2r2_control.control.controller import CartesianController
-    from q2r2_control.errors import ConfigError, Q2R2Error
-    from q2r2_control.pipeline.pipeline import Pipeline
-    from q2r2_control.robot.robot import Robot
-    from q2r2_control.summary.run_summary import RunSummary
-    from q2r2_control.teleop.relative import RelativeMotion
+if TYPE_CHECKING:  # "as" says to type checkers that a name is public
+    from q2r2_control.config.cell import load_config as load_config
+    from q2r2_control.config.control import ControllerSettings as ControllerSettings
+    from q2r2_control.control.controller import CartesianController as CartesianController
+    from q2r2_control.errors import ConfigError as ConfigError
+    from q2r2_control.errors import Q2R2Error as Q2R2Error
+    from q2r2_control.pipeline.pipeline import Pipeline as Pipeline
+    from q2r2_control.robot.robot import Robot as Robot
+    from q2r2_control.summary.run_summary import RunSummary as RunSummary
+    from q2r2_control.teleop.relative import RelativeMotion as RelativeMotion
 
-__all__ = [
-    "CartesianController",
-    "ConfigError",
-    "ControllerSettings",
-    "Pipeline",
-    "Q2R2Error",
-    "RelativeMotion",
-    "Robot",
-    "RunSummary",
-    "load_config",
-]
-
-__getattr__ = lazy_exports(
-    __name__,
-    {
-        "CartesianController": "control.controller",
-        "ConfigError": "errors",
-        "ControllerSettings": "config.control",
-        "Pipeline": "pipeline.pipeline",
-        "Q2R2Error": "errors",
-        "RelativeMotion": "teleop.relative",
-        "Robot": "robot.robot",
-        "RunSummary": "summary.run_summary",
-        "load_config": "config.cell",
-    },
-)
+_MODULES = {
+    "CartesianController": "control.controller",
+    "ConfigError": "errors",
+    "ControllerSettings": "config.control",
+    "Pipeline": "pipeline.pipeline",
+    "Q2R2Error": "errors",
+    "RelativeMotion": "teleop.relative",
+    "Robot": "robot.robot",
+    "RunSummary": "summary.run_summary",
+    "load_config": "config.cell",
+}
+__all__ = list(_MODULES)
+__getattr__ = lazy_exports(__name__, _MODULES)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*globals(), *_MODULES])

@@ -6,7 +6,7 @@ gamepad = "my_package.gamepad:Gamepad"
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any
 
 from q2r2_control.errors import ConfigError
@@ -15,19 +15,13 @@ INPUTS = "q2r2_control.inputs"
 PLANTS = "q2r2_control.plants"
 
 
-def check_installed(group: str, name: str) -> EntryPoint:
-    """The entry point called ``name``. Raises :class:`ConfigError` with the names that are installed."""
+def load_class(group: str, name: str) -> Any:
+    """The class called ``name``. Raises :class:`ConfigError` where there is none, or it cannot be imported."""
     found = {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
     if name not in found:
         kind = group.rpartition(".")[2].removesuffix("s")
         raise ConfigError(f"{kind} {name!r:.60}: allowed are {', '.join(found)}; installed as entry points {group}")
-    return found[name]
-
-
-def load_class(group: str, name: str) -> Any:
-    """The class called ``name``. Raises :class:`ConfigError` where there is none, or it cannot be imported."""
-    point = check_installed(group, name)
     try:
-        return point.load()
+        return found[name].load()
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{group}: {name} = {point.value}: {error}") from error
+        raise ConfigError(f"{group}: {name} = {found[name].value}: {error}") from error

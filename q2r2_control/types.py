@@ -7,6 +7,7 @@ clock that is passed in. An arm or hand is named ``"left"`` or ``"right"``.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
@@ -42,9 +43,10 @@ def moved_by(pose: pin.SE3, way: Array) -> pin.SE3:
 
 @dataclass(frozen=True, slots=True)
 class HandInputs:
-    """Buttons, triggers and stick of one hand controller, as the headset names them.
+    """Buttons, triggers and stick of one hand controller, as the headset names them, and those of other devices.
 
-    ``button_lower`` is A (right) or X (left), ``button_upper`` B or Y; triggers 0..1, sticks -1..1.
+    ``button_lower`` is A (right) or X (left), ``button_upper`` B or Y; triggers 0..1, sticks -1..1. ``more`` has what
+    a device declares beyond these, by name: 0 at rest, 1 pressed. A name that is left out is at rest.
     """
 
     button_upper: bool = False
@@ -53,14 +55,19 @@ class HandInputs:
     thumb_stick_vertical: float = 0.0
     press_index: float = 0.0
     press_middle: float = 0.0
+    more: Mapping[str, float] = field(default_factory=dict, hash=False)
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceControls:
-    """Buttons and axes of each hand of an input device, by the names of :class:`HandInputs`."""
+    """Buttons and axes of each hand of an input device: fields of :class:`HandInputs`, and names of its own."""
 
     buttons: tuple[str, ...]
     axes: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.buttons + self.axes
 
 
 QUEST_CONTROLS = DeviceControls(

@@ -13,19 +13,12 @@ from typer import Exit, Option
 from q2r2_control.benchmark.motion_run import PATIENCE, BenchReport, BenchRow, MotionFigures, run_bench
 from q2r2_control.benchmark.peers.base import PEERS, WITHOUT_ACCELERATION_LIMIT
 from q2r2_control.benchmark.work_motions import TIMED_MOTIONS, WORK_MOTIONS, motions_named
-from q2r2_control.cli.output import (
-    DEMO_CONFIG,
-    Cell,
-    Json,
-    figure_table,
-    notice_of_compiling,
-    print_progress,
-    print_report,
-)
+from q2r2_control.cli.output import DEMO_CONFIG, Json, notice_of_compiling, print_progress, print_report
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.verification.fault_injection import FINGERS, with_contact
 from q2r2_control.verification.soak import COUNTED, MEMORY_ALLOWED, SoakReport, run_soak
+from q2r2_control.viewer.tables import Cell, figure_table
 
 _ROUNDS = 3
 _NOTES = (

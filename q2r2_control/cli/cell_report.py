@@ -15,11 +15,12 @@ from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.plugins import INPUTS, PLANTS, check_installed, load_class
+from q2r2_control.plugins import INPUTS, PLANTS, load_class
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.robot.stop_torque import StopTorque, stop_torques
 from q2r2_control.supervision.homing import preflight_faults
+from q2r2_control.types import DeviceControls
 
 _NEAREST = 8
 
@@ -71,8 +72,10 @@ class CellCheck:
 
 def check_cell(config: Config) -> CellCheck:
     """Build the cell and look at it at home. Raises :class:`Q2R2Error` where it cannot be built."""
-    config.teleop.bindings.check_device(load_class(INPUTS, config.input).controls)
-    check_installed(PLANTS, config.plant)
+    controls = getattr(load_class(INPUTS, config.input), "controls", None)
+    if isinstance(controls, DeviceControls):  # otherwise only a device that is connected knows them
+        config.teleop.bindings.check_device(controls)
+    load_class(PLANTS, config.plant)
     robot = Robot.from_config(config)
     with notice_of_compiling():
         # With what may touch too, so that every name and number is checked; what is kept is that of position mode.

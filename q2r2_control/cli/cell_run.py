@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -24,14 +25,13 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
-from q2r2_control.inputs.base import Input, make_input
-from q2r2_control.inputs.headset import HeadsetServer, watch_of
-from q2r2_control.inputs.listener import access_lines, written
-from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.inputs.base import make_input
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.base import WindowedPlant
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.scheduling import real_time
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
@@ -45,25 +45,11 @@ from q2r2_control.viewer.live import LiveTable
 _PERIOD = 1.0 / 30.0  # [s]
 
 
-class AnnouncedHeadset(HeadsetServer):
-    """A headset server that says where it listens, for scripts that asked for port 0, and who can drive, for people."""
-
-    def __init__(self, config: Config, console: Console) -> None:
-        headset = config.headset
-        super().__init__(headset.host, headset.port, allow=headset.networks, watch=watch_of(config))
-        self._headset, self._console = headset, console
-
-    def start(self) -> None:
-        super().start()
-        for line in (f"listening on {written(*self.address)}", *access_lines(*self.address, self._headset.networks)):
-            say(f"headset: {line}", self._console)
-
-
 def check_window(plant: str | None) -> None:
     """Raises :class:`ConfigError` for a plant without a window."""
-    if plant != "mujoco":
+    if plant is None or not issubclass(load_class(PLANTS, plant), WindowedPlant):
         which = "without --plant there is no window" if plant is None else f"the {plant} plant has no window"
-        raise ConfigError(f"--viewer: {which}; allowed: --plant mujoco")
+        raise ConfigError(f"--viewer: {which}; allowed: a plant that has one, as --plant mujoco")
 
 
 def show_window(pipeline: Pipeline, *, paced: bool = False) -> None:
@@ -73,7 +59,7 @@ def show_window(pipeline: Pipeline, *, paced: bool = False) -> None:
     there is no display.
     """
     plant, due, began = pipeline.plant, 0.0, -math.inf
-    if not isinstance(plant, MujocoPlant):
+    if not isinstance(plant, WindowedPlant):
         return
     plant.launch_viewer()
 
@@ -102,9 +88,7 @@ class RunOptions:
     mode: str
     duration: float | None  # [s]; None: until Ctrl-C
     fast: bool  # simulated time
-    trajectory: str  # of the scripted input
-    human: bool
-    seed: int
+    input_options: Mapping[str, object]  # by name, those that the input takes
     table: bool
     window: bool
     real_time: bool  # ask the system for locked memory and SCHED_FIFO
@@ -133,7 +117,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
     if options.record is None:
         return _run_cell(config, options, None)
     # Before the pipeline, which takes longer to build than the recorder's process to start.
-    pictures = bool(config.simulated_cameras) and options.plant == "mujoco"
+    pictures = bool(config.simulated_cameras) and issubclass(load_class(PLANTS, options.plant), MujocoPlant)
     recorder = Recorder(options.record, options.name, waits=options.fast, pictures=pictures)
     try:
         with recorder:
@@ -147,7 +131,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
 def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None) -> CellRun:
     console = Console(stderr=True)
     with notice_of_compiling():
-        source = _input_of(config, options, console)
+        source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
         pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
         faults = preflight_faults(pipeline.robot, config.control.without_contact(), pipeline.controller)
     if faults and not options.force:
@@ -210,14 +194,6 @@ def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
     return judged
 
 
-def _input_of(config: Config, options: RunOptions, console: Console) -> Input:
-    if options.input == "headset":
-        return AnnouncedHeadset(config, console)
-    if options.input == "scripted":
-        return ScriptedInput(options.trajectory, human=options.human, seed=options.seed)
-    return make_input(options.input, config)
-
-
 def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, console: Console) -> RunSummary:
     """Run with what is to be shown and recorded of it."""
     with ExitStack() as stack:
@@ -242,9 +218,7 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
                 cameras = ()
             recorder.record_outcome = pipeline.record_outcome
             notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
-            if options.input == "scripted":
-                human = str(options.human).lower()
-                notes |= {"trajectory": options.trajectory, "human": human, "seed": str(options.seed)}
+            notes |= {name: str(value) for name, value in options.input_options.items()}
             recorder.begin(About.of(pipeline, not options.fast, notes, cameras), pipeline.robot)
             pipeline.listeners.append(recorder)
             if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):

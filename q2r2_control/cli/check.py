@@ -12,11 +12,12 @@ from rich.table import Table
 from typer import Exit, Option
 
 from q2r2_control.cli.cell_report import CellCheck, check_cell
-from q2r2_control.cli.output import ConfigFile, Json, as_json_text, counting, figure_table, print_report
+from q2r2_control.cli.output import ConfigFile, Json, as_json_text, counting, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import Robot
+from q2r2_control.viewer.tables import figure_table
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,6 @@ from q2r2_control.cli.output import (
     Json,
     as_json_text,
     counting,
-    figure_table,
     notice_of_compiling,
     say,
     summary_table,
@@ -30,6 +29,7 @@ from q2r2_control.judging.page import COLUMNS, page_of
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.reader import recordings_in
 from q2r2_control.recording.replay import replay as replay_recording
+from q2r2_control.viewer.tables import figure_table
 
 _SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
 

@@ -15,24 +15,14 @@ from rich.live import Live
 from rich.text import Text
 from typer import Argument, Exit, Option
 
-from q2r2_control.cli.output import (
-    DEMO_CONFIG,
-    Cell,
-    Json,
-    Operator,
-    Task,
-    as_json_text,
-    figure_table,
-    notes_of,
-    positive,
-    say,
-)
+from q2r2_control.cli.output import DEMO_CONFIG, Json, Operator, Task, as_json_text, notes_of, positive, say
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
 from q2r2_control.ros.launch.processes import check_rclpy, nodes_of, run_together
 from q2r2_control.ros.watching.findings import Finding, examine_environment, examine_set
 from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView
+from q2r2_control.viewer.tables import Cell, figure_table
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
 _ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]

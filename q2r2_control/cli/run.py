@@ -6,20 +6,22 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 from rich.console import Console
 from typer import Argument, Exit, Option
 
-from q2r2_control.cli.cell_run import AnnouncedHeadset, RunOptions, print_summary, run_cell
-from q2r2_control.cli.output import DEMO_CONFIG, ConfigFile, Json, Operator, Task, notes_of, positive, print_report
-from q2r2_control.config.cell import Config, HeadsetConfig, load_config
+from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
+from q2r2_control.cli.output import DEMO_CONFIG, ConfigFile, Json, Operator, Task, notes_of, positive, print_report, say
+from q2r2_control.config.cell import load_config
 from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
 from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.base import options_of
+from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import watch_headset
-from q2r2_control.inputs.scripted import DEFAULT_TRAJECTORY, TRAJECTORIES, trajectory_named
-from q2r2_control.plugins import INPUTS, check_installed
+from q2r2_control.inputs.scripted import TRAJECTORIES, trajectory_named
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
@@ -65,15 +67,13 @@ def run(
     A cell in which q2r2 check finds a fault is refused with the same line and exit code 2, unless --force is given.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
-    scripted_only = {"--trajectory": trajectory is not None, "--human": human, "--fast": fast, "--seed": seed != 0}
-    headset_only = {"--host": host is not None, "--port": port is not None}
     cell = load_config(config)
     source = input or cell.input
-    check_installed(INPUTS, source)
-    unfit = ({} if source == "scripted" else scripted_only) | ({} if source == "headset" else headset_only)
-    for option, given in unfit.items():
-        if given:
-            raise ConfigError(f"{option} cannot be used with --input {source}")
+    asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
+    asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}
+    given = {option: value for option, value in asked.items() if value is not None}
+    if unfit := [option for option in given if option not in options_of(source)]:
+        raise ConfigError(f"--{unfit[0]} cannot be used with --input {source}")
     if fast and duration is None:
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
     _check_times(fast, rt)
@@ -84,9 +84,7 @@ def run(
         mode=mode.value,
         duration=positive("--duration", duration),
         fast=fast,
-        trajectory=trajectory or DEFAULT_TRAJECTORY,
-        human=human,
-        seed=seed,
+        input_options=given,
         table=_shows_table(headless, viewer),
         window=viewer,
         force=force,
@@ -94,7 +92,7 @@ def run(
         record=record,
         notes=notes_of(task, operator, record),
     )
-    print_summary(run_cell(with_address(cell, host, port), options), json)
+    print_summary(run_cell(cell, options), json)
 
 
 def demo(
@@ -125,9 +123,7 @@ def demo(
         mode=mode.value,
         duration=positive("--duration", duration) or trajectory_named(trajectory).duration,
         fast=fast,
-        trajectory=trajectory,
-        human=human,
-        seed=seed,
+        input_options={"trajectory": trajectory, "human": human, "seed": seed},
         table=_shows_table(headless, viewer),
         window=viewer,
         real_time=rt,
@@ -152,12 +148,6 @@ def _shows_table(headless: bool, viewer: bool) -> bool:
     return not headless and sys.stderr.isatty()
 
 
-def with_address(config: Config, host: str | None, port: int | None) -> Config:
-    """The config with another address for the headset to connect to."""
-    given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
-    return config.model_copy(update={"headset": HeadsetConfig(**(config.headset.model_dump() | given))})
-
-
 def headset_check(
     config: Annotated[str, Argument(metavar="[CONFIG]", help="Whose address and teleop.axes to use.")] = (DEMO_CONFIG),
     host: Host = None,
@@ -170,9 +160,9 @@ def headset_check(
     Move a hand forwards, to the left, up: where the words do not agree, change teleop.axes in the config.
     Exit 1 unless poses and inputs came of every hand that leads an arm; without both, run has nothing to engage.
     """
-    cell, console = with_address(load_config(config), host, port), Console(stderr=True)
+    cell, console, stop = load_config(config), Console(stderr=True), StopRequest()
     positive("--duration", duration)
-    server, stop = AnnouncedHeadset(cell, console), StopRequest()
+    server = HeadsetServer.from_config(cell, host, port, partial(say, console=console))
     # From before the announcement on. KeyboardInterrupt would be lost where it comes in the middle of a finaliser.
     with stop_on_signals(stop.ask):
         server.start()

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from q2r2_control.config.strict import StrictModel
 from q2r2_control.errors import ConfigError
-from q2r2_control.types import DeviceControls
+from q2r2_control.types import QUEST_CONTROLS, DeviceControls
 
 
 class Action(StrEnum):
@@ -96,7 +96,7 @@ class Binding(NamedTuple):
     @property
     def field(self) -> str:
         """The setting's name."""
-        return self.control + _SUFFIXES[self.gesture]
+        return ("" if self.control in CONTROLS else "device.") + self.control + _SUFFIXES[self.gesture]
 
     @property
     def words(self) -> str:
@@ -129,9 +129,14 @@ class BindingSettings(StrictModel):
     stick_left_hold: Action = Field(Action.NONE, description="as trigger_hold")
     stick_right: Action = Field(Action.NONE, description="as stick_up")
     stick_right_hold: Action = Field(Action.NONE, description="as trigger_hold")
+    device: dict[str, Action] = Field(
+        default_factory=dict, description="of each button or axis NAME that only the input device has, and NAME_hold"
+    )
 
     @model_validator(mode="after")
     def _mean_one_thing(self) -> BindingSettings:
+        if taken := {*self.of_device} & {*CONTROLS, *QUEST_CONTROLS.names}:
+            raise ValueError(f"device.{min(taken)}: a control of every headset; allowed: {', '.join(CONTROLS)}")
         bound: dict[str, Binding] = {}
         for binding in self.bound():
             if other := bound.get(binding.action):
@@ -160,29 +165,35 @@ class BindingSettings(StrictModel):
             raise ValueError(f"{control} is stop, {why}; allowed: {control}_hold, or another control")
         if action in LASTING and (gesture is not Gesture.TAP or control in BUTTONS):
             raise ValueError(f"{binding.field} is {action}, which lasts; allowed: {', '.join(HELD)}")
-        if action is Action.GRIPPER_ANALOG and control not in TRIGGERS:
+        if action is Action.GRIPPER_ANALOG and control in CONTROLS and control not in TRIGGERS:
             raise ValueError(f"{control} is gripper_analog; allowed: trigger or grip")
         if action in LASTING:
             for other in self.bound():
                 if other.control == control and other.gesture is not Gesture.TAP:
                     raise ValueError(f"{control} is {action} and {other.field} is {other.action}; allowed: one of them")
 
-    def check_device(self, controls: DeviceControls) -> None:
+    def check_device(self, controls: DeviceControls, device: str = "this input") -> None:
         """Raise :class:`ConfigError` for a binding to a control that an input device does not have."""
-        names = (*controls.buttons, *controls.axes)
-        allowed = [control for control, (name, _) in DEVICE_NAMES.items() if name in names]
+        allowed = {control: control for control, (name, _) in DEVICE_NAMES.items() if name in controls.names}
+        allowed |= {name: f"device.{name}" for name in controls.names if name not in QUEST_CONTROLS.names}
         for binding in self.bound():
             if binding.control not in allowed:
-                no, has = DEVICE_NAMES[binding.control][0], ", ".join(allowed) or "no control at all"
+                no, _ = DEVICE_NAMES.get(binding.control, (binding.control, 1.0))
+                has = ", ".join(allowed.values()) or "no control at all"
                 key = f"teleop.bindings.{binding.field}"
-                raise ConfigError(f"{key} = {binding.action}: this input has no {no}; allowed: {has}")
+                raise ConfigError(f"{key} = {binding.action}: {device} has no {no}; allowed: {has}")
 
     def bound(self) -> Iterator[Binding]:
         """All that is bound, control by control."""
-        for control in CONTROLS:
-            for gesture, suffix in _SUFFIXES.items():
-                if (action := getattr(self, control + suffix)) is not Action.NONE:
+        for control in (*CONTROLS, *self.of_device):
+            for gesture in _SUFFIXES:
+                if (action := self.action_of(control, gesture)) is not Action.NONE:
                     yield Binding(control, gesture, action)
+
+    @property
+    def of_device(self) -> tuple[str, ...]:
+        """Controls that only the device has, each once."""
+        return tuple(dict.fromkeys(key.removesuffix(_SUFFIXES[Gesture.HOLD]) for key in self.device))
 
     def meanings(self) -> dict[str, str]:
         """In words what each control of a hand does that does something."""
@@ -191,7 +202,10 @@ class BindingSettings(StrictModel):
 
     def action_of(self, control: str, gesture: Gesture) -> Action:
         """What a gesture of a control does; its beginning does nothing by itself."""
-        return Action.NONE if gesture is Gesture.DOWN else getattr(self, control + _SUFFIXES[gesture])
+        if gesture is Gesture.DOWN:
+            return Action.NONE
+        key = control + _SUFFIXES[gesture]
+        return getattr(self, key) if control in CONTROLS else self.device.get(key, Action.NONE)
 
     def words_of(self, action: str) -> str | None:
         """The gesture that an action is bound to, as an operator calls it."""

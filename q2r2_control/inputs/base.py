@@ -14,7 +14,9 @@ class Input(Protocol):
     """A source of hand samples, polled once per control tick by the loop's own thread.
 
     Order of use: ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``. An input that is found by
-    its name has a class method ``from_config(config)`` as well.
+    its name has a class method ``from_config(config)`` as well. Its class may have two attributes more: ``options``,
+    names of what ``from_config`` takes by keyword, which are options of ``q2r2 run`` and ``say``, a function that
+    prints a line; and ``executable``, the ROS executable that stands for it instead of ``hand_input``.
     """
 
     controls: DeviceControls  # the buttons and axes that its samples have
@@ -22,11 +24,9 @@ class Input(Protocol):
     @property
     def connected(self) -> bool:
         """Whether samples can arrive now. The loop reports every change from True to False to the teleop layer."""
-        ...
 
     def start(self) -> None:
         """Begin to receive; returns at once. Raises :class:`Q2R2Error` when the source cannot be opened."""
-        ...
 
     def poll(self, now: float) -> list[HandSample]:
         """Samples that came in since the last poll, oldest first; empty when there are none.
@@ -34,20 +34,26 @@ class Input(Protocol):
         ``now`` [s] is on the clock of the samples' stamps. Never waits, and never raises because of what was received.
         What it has returned stays as it is: others keep it for some ticks.
         """
-        ...
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
         """Vibrate a hand controller if the source has any; otherwise nothing happens. Never waits."""
-        ...
 
     def close(self) -> None:
         """Release every resource; may be called twice."""
-        ...
 
 
-def make_input(source: Input | str, config: Config) -> Input:
-    """The input called ``source``, or ``source`` itself. Raises :class:`ConfigError` for an unknown name."""
+def options_of(source: str) -> tuple[str, ...]:
+    """The options that the input called ``source`` takes. Raises :class:`ConfigError` for an unknown name."""
+    return tuple(getattr(load_class(INPUTS, source), "options", ()))
+
+
+def make_input(source: Input | str, config: Config, **options: object) -> Input:
+    """The input called ``source``, with those of the ``options`` that it takes, or ``source`` itself.
+
+    Raises :class:`ConfigError` for an unknown name.
+    """
     if not isinstance(source, str):
         return source
-    made: Input = load_class(INPUTS, source).from_config(config)
+    taken = {name: value for name, value in options.items() if name in options_of(source)}
+    made: Input = load_class(INPUTS, source).from_config(config, **taken)
     return made

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
-from q2r2_control.config.cell import Config
+from q2r2_control.config.cell import Config, HeadsetConfig
 from q2r2_control.config.strict import Network
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.connections import TURN, Client, Connections, Handlers
-from q2r2_control.inputs.listener import HostLog, TcpListener, written
+from q2r2_control.inputs.listener import HostLog, TcpListener, access_lines, written
 from q2r2_control.inputs.messages import WireFrame, warm_up
 from q2r2_control.inputs.samples import HandsWatch, SampleQueue, Watched
 from q2r2_control.inputs.session import HeadsetStatistics, TopicRecorder
@@ -35,10 +35,13 @@ class HeadsetServer:
     or for decoding. A client that breaks the protocol, floods, or is silent for 2 s is dropped with one logged line.
     ``allow`` names the networks whose hosts may connect, None all of them; :func:`~q2r2_control.inputs.listener.decide`
     says who of those drives. ``watch`` finds poses that must not be followed. A ``listener`` gets each message at once,
-    in the receiving thread; then :meth:`poll` returns nothing.
+    in the receiving thread; then :meth:`poll` returns nothing. ``say`` gets lines for people once it listens: where,
+    and who can drive.
     """
 
     controls = QUEST_CONTROLS
+    options = ("host", "port", "say")
+    executable = "tcp_endpoint"
 
     def __init__(
         self,
@@ -48,9 +51,10 @@ class HeadsetServer:
         listener: Callable[[Watched], None] | None = None,
         allow: Sequence[Network] | None = None,
         watch: HandsWatch | None = None,
+        say: Callable[[str], None] = _LOG.debug,
     ) -> None:
         self.address = host, port  # after ``start`` the port that was bound
-        self._allow, self._clock, self._tell = allow, clock, listener
+        self._allow, self._clock, self._tell, self._say = allow, clock, listener, say
         self._watch = watch or HandsWatch()
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
@@ -64,9 +68,13 @@ class HeadsetServer:
         self._last_disconnect: str | None = None
 
     @classmethod
-    def from_config(cls, config: Config) -> HeadsetServer:
-        headset = config.headset
-        return cls(headset.host, headset.port, allow=headset.networks, watch=watch_of(config))
+    def from_config(
+        cls, config: Config, host: str | None = None, port: int | None = None, say: Callable[[str], None] = _LOG.debug
+    ) -> HeadsetServer:
+        """At the cell's address, or another ``host`` or ``port``."""
+        given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
+        headset = HeadsetConfig(**(config.headset.model_dump() | given))
+        return cls(headset.host, headset.port, allow=headset.networks, watch=watch_of(config), say=say)
 
     def start(self) -> None:
         """Listen. Raises :class:`InputError` when host and port cannot be bound, or when already started."""
@@ -84,6 +92,8 @@ class HeadsetServer:
         self._stop.clear()
         self._thread = threading.Thread(target=self._run, args=(self._connections,), name="headset", daemon=True)
         self._thread.start()
+        for line in (f"listening on {written(*self.address)}", *access_lines(*self.address, self._allow)):
+            self._say(f"headset: {line}")
 
     @property
     def connected(self) -> bool:

@@ -7,7 +7,7 @@ distinguishes the dialects: read with the wrong one, a pose is noise and a butto
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.types import Array, HandInputs, HapticFeedback
+from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, HapticFeedback
 
 
 class Dialect(StrEnum):
@@ -108,7 +108,7 @@ def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
         case MessageType.TWIST:
             return HandTwist(_vector(message.linear), _vector(message.angular))
         case _:
-            return HandInputs(**{field.name: getattr(message, field.name) for field in fields(HandInputs)})
+            return HandInputs(**{name: getattr(message, name) for name in QUEST_CONTROLS.names})
 
 
 def fits(kind: MessageType, payload: bytes, dialect: Dialect) -> bool:

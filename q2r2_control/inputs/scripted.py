@@ -155,6 +155,9 @@ class ScriptedInput(PlayedInput):
     Raises :class:`ConfigError` for an unknown trajectory or hand, and for a number that is not allowed.
     """
 
+    options = ("trajectory", "human", "seed", "fast")
+    executable = "SimulationInput"
+
     def __init__(
         self,
         trajectory: str,
@@ -186,8 +189,16 @@ class ScriptedInput(PlayedInput):
         super().__init__(self._ideal, self._trajectory.inputs, {hand: sampling(hand) for hand in hands})
 
     @classmethod
-    def from_config(cls, config: Config) -> ScriptedInput:
-        return cls(DEFAULT_TRAJECTORY)
+    def from_config(
+        cls,
+        config: Config,
+        trajectory: str = DEFAULT_TRAJECTORY,
+        human: bool = False,
+        seed: int = 0,
+        fast: bool = False,
+    ) -> ScriptedInput:
+        """``fast`` changes nothing: samples come by the time that passes, simulated or not."""
+        return cls(trajectory, human=human, seed=seed)
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """How ``hand`` ideally moves at ``t`` [s], in the axes that its poses have [m/s, rad/s]."""

@@ -24,14 +24,14 @@ class Plant(Protocol):
     One tick: ``apply`` says where the plant has to be at the end of the tick, ``advance`` lets that time pass,
     ``state`` says where it got. On hardware, where time passes by itself, ``advance`` is where a plant waits for the
     next measurement. A new plant stands at home with open grippers, and stays there until a command comes. A plant
-    that is found by its name has a class method ``from_config(robot, config)`` as well.
+    that is found by its name has a class method ``from_config(robot, config)`` as well, and one with a window is a
+    :class:`WindowedPlant`.
     """
 
     modes: tuple[CommandMode, ...]  # of the commands that this plant follows
 
     def reset(self, q: Array | None = None) -> None:
         """Start over at time 0, at rest at ``q`` (nv,) or else at home, grippers open. Raises :class:`PlantError`."""
-        ...
 
     def apply(self, command: Command) -> None:
         """Take ``command``: posture and velocity are due at the end of the next ``advance``, a torque acts at once.
@@ -39,26 +39,32 @@ class Plant(Protocol):
         Without a newer one, later advances hold its posture at rest, or its torque. Raises :class:`PlantError` on a
         mode that the plant does not have and on numbers that are not finite; the previous command stays in force.
         """
-        ...
 
     def advance(self, dt: float) -> None:
         """Let ``dt`` [s], 0 .. 1, pass. Raises :class:`PlantError` on any other time; nothing moves then."""
-        ...
 
     def state(self) -> RobotState:
         """The newest measurement; its stamp is on the plant's own clock, which starts at 0 on ``reset``.
 
         Its arrays stay as they are: others keep them for some ticks.
         """
-        ...
 
     def gripper_openings(self) -> dict[str, float]:
         """Measured opening of each arm that has a gripper, 0 closed .. 1 fully open; another mapping at each call."""
-        ...
 
     def close(self) -> None:
         """Give back every resource; may be called twice."""
-        ...
+
+
+@runtime_checkable
+class WindowedPlant(Protocol):
+    """The methods that a plant with a window has besides those of :class:`Plant`, for ``--viewer``."""
+
+    def launch_viewer(self) -> None:
+        """Open the window. Raises :class:`PlantError` where there is no display."""
+
+    def viewer_sync(self) -> bool:
+        """Show the plant as it is now; False once the window has been closed."""
 
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:

@@ -17,7 +17,7 @@ from q2r2_control.recording.tick_rows import HAND_FAULTS, NOT_MEASURED, SAMPLE_F
 from q2r2_control.recording.writer import RecordedRobot
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import RunStart
-from q2r2_control.types import SIDES, Array, HandInputs, HandSample, RobotState
+from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, HandInputs, HandSample, RobotState
 
 _SAME_POSE = 1e-6  # [m], and of a quaternion
 
@@ -84,6 +84,7 @@ class RecordedTicks:
                 at_start = RobotState(**numbers, tau_external=felt, stamp=start["stamp"])
                 self._starts.append(RunStart(start["now"], at_start))
             samples, openings = chunk.samples[first:end], row["arms"]["opening"].tolist()
+            more = (json.loads(state) if state else {}).get("more_inputs", [{}] * len(samples))
             external = row["tau_external"].copy() if row["external"] else None
             yield RecordedTick(
                 number=number,
@@ -91,7 +92,7 @@ class RecordedTicks:
                 dt=float(row["dt"]),
                 following=bool(row["following"]),
                 connected=bool(row["connected"]),
-                samples=[_sample(sample) for sample in samples],
+                samples=list(map(_sample, samples, more)),
                 state=RobotState(
                     row["q"].copy(), row["v"].copy(), row["tau"].copy(), external, float(row["state_stamp"])
                 ),
@@ -108,17 +109,17 @@ class NoMoreTicksError(Exception):
     """There are no more ticks: the run was killed, or some were lost."""
 
 
-def _sample(numbers: Array) -> HandSample:
+def _sample(numbers: Array, more: dict[str, float]) -> HandSample:
     values = dict(zip(SAMPLE_FIELDS, numbers.tolist(), strict=True))
-    inputs = {name: values[name] for name in HandInputs.__slots__}
-    for button in ("button_upper", "button_lower"):
+    inputs = {name: values[name] for name in QUEST_CONTROLS.names}
+    for button in QUEST_CONTROLS.buttons:
         inputs[button] = bool(inputs[button])
     return HandSample(
         hand=SIDES[int(values["hand"])],
         position=numbers[4:7].copy(),
         quaternion=numbers[7:11].copy(),
         pose_stamp=values["pose_stamp"],
-        inputs=HandInputs(**inputs),
+        inputs=HandInputs(**inputs, more=more),
         inputs_stamp=values["inputs_stamp"],
         fault=HAND_FAULTS[int(values["fault"])],
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +107,8 @@ class ReplayPipeline(Pipeline):
     def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, about: About, plant: str | None) -> None:
         """``plant`` by its name; None: the recorded one, which no command moves."""
         recorded = _Recorded(ticks, about.plant_modes, self._ask_again)
+        # A recording does not say which buttons of its own the device had.
+        recorded.controls = replace(QUEST_CONTROLS, buttons=QUEST_CONTROLS.buttons + config.teleop.bindings.of_device)
         moves = recorded if plant is None else make_plant(plant, robot, config)
         super().__init__(config, robot, recorded, moves, about.mode)
         self._recorded = ticks

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
-from q2r2_control.types import SIDES, Array, CommandMode, HandFault, HandInputs, HandSample, StepStatus
+from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, CommandMode, HandFault, HandSample, StepStatus
 
 if TYPE_CHECKING:  # the writer's process does without the loop's modules
     from q2r2_control.summary.tick import Tick
@@ -25,8 +25,8 @@ COMMAND_MODES, STATUSES = tuple(CommandMode), tuple(StepStatus)
 HAND_FAULTS = (None, *HandFault)
 UNSOLVED_MAX = 2**53  # more substeps than a float64 has bits for cannot be told apart
 SAMPLE_FIELDS = (
-    *("tick", "hand", "pose_stamp", "inputs_stamp", "x", "y", "z", "qx", "qy", "qz", "qw", "button_upper"),
-    *("button_lower", "thumb_stick_horizontal", "thumb_stick_vertical", "press_index", "press_middle"),
+    *("tick", "hand", "pose_stamp", "inputs_stamp", "x", "y", "z", "qx", "qy", "qz", "qw"),
+    *QUEST_CONTROLS.names,
     "fault",
 )
 POSE_FIELDS = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -41,7 +41,7 @@ _CONTROLLER = ("step", "unsolved", "status", "certified", "fallback", "closest_d
 _DECIDED = ("reference_q", "reference_v", "reference_a", "command_q", "command_v", "command_tau")
 _LAST = ("command_mode", "compute_time", "solve_time")
 
-_values_of = attrgetter(*HandInputs.__slots__)
+_values_of = attrgetter(*QUEST_CONTROLS.names)
 _NO_POSE = (0.0,) * len(POSE_FIELDS)  # whose quaternion is none
 
 
@@ -50,7 +50,7 @@ class PackedTick(NamedTuple):
 
     row: bytes  # of tick_type
     samples: bytes  # float64 of SAMPLE_FIELDS, one after the other
-    state: str  # JSON where it changed, else empty
+    state: str  # JSON where it changed or samples have controls of their device's own, else empty
 
     @property
     def size(self) -> int:
@@ -121,7 +121,7 @@ class TickPacker:
             row += joints.tolist()
         row += (COMMAND_MODES.index(command.mode), tick.compute_time, report.solve_time)
         packed_samples = b"".join([_packed_sample(number, sample) for sample in samples])
-        return PackedTick(self._row.pack(*row), packed_samples, self._state_text(tick))
+        return PackedTick(self._row.pack(*row), packed_samples, self._state_text(tick, samples))
 
     def _of_arm(self, arm: str, tick: Tick) -> tuple[float, ...]:
         target, opening = tick.targets[arm], tick.openings.get(arm, NOT_MEASURED)
@@ -136,7 +136,7 @@ class TickPacker:
             *_NO_POSE,
         )
 
-    def _state_text(self, tick: Tick) -> str:
+    def _state_text(self, tick: Tick, samples: Sequence[HandSample]) -> str:
         """What has names, as JSON; empty where it is what it was."""
         report = tick.reference.report
         state: dict[str, Any] = {
@@ -148,11 +148,14 @@ class TickPacker:
             "held_grippers": tick.held_grippers,
             "holding": tick.holding,
         }
-        if state == self._state and not tick.events:
+        more = [sample.inputs.more for sample in samples]
+        if state == self._state and not tick.events and not any(more):
             return ""
         before, self._state = self._state, dict(state)
         if tick.events:
             state["events"] = [event.as_json() for event in tick.events]
+        if any(more):
+            state["more_inputs"] = [{name: float(value) for name, value in of_hand.items()} for of_hand in more]
         if before is None:
             at_start = tick.start.state
             felt = None if at_start.tau_external is None else at_start.tau_external.tolist()

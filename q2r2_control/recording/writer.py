@@ -20,7 +20,7 @@ from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.bag import BagWriter
 from q2r2_control.recording.messages import NANOSECONDS, Message, MessageTemplate, Topic
 from q2r2_control.recording.tick_rows import POSE_FIELDS, SAMPLE_FIELDS, PackedTick, numbers_in, tick_type
-from q2r2_control.types import SIDES, Array, HandInputs
+from q2r2_control.types import QUEST_CONTROLS, SIDES, Array
 
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
@@ -127,7 +127,7 @@ class TickEncoder:
                 made.add(messages.hand_pose(hand), [at], [messages.serialized(messages.POSE, pose)])
             if self._is_new(sample, _INPUTS_STAMP):
                 with np.errstate(over="ignore"):  # float32, whatever an input sends
-                    values = sample[_BUTTONS : _BUTTONS + len(HandInputs.__slots__)].astype(np.float32)
+                    values = sample[_BUTTONS : _BUTTONS + len(QUEST_CONTROLS.names)].astype(np.float32)
                 upper, lower, *analog = values.tolist()
                 inputs = messages.make(messages.HAND_INPUTS, bool(upper), bool(lower), *analog)
                 made.add(messages.hand_buttons(hand), [at], [messages.serialized(messages.HAND_INPUTS, inputs)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from q2r2_control.config.bindings import BUTTONS, DEVICE_NAMES, HELD, LASTING, Action, BindingSettings, Gesture
+from q2r2_control.config.bindings import BUTTONS, DEVICE_NAMES, LASTING, Action, BindingSettings, Gesture
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.types import HandInputs
@@ -24,6 +24,8 @@ class Press(NamedTuple):
 
 def travel(control: str, inputs: HandInputs) -> float:
     """How far a control is pressed or pushed, 0 at rest and 1 at its end."""
+    if control not in DEVICE_NAMES:
+        return float(inputs.more.get(control, 0.0))
     name, way = DEVICE_NAMES[control]
     return way * float(getattr(inputs, name))
 
@@ -85,8 +87,7 @@ class GestureRecognizer:
                 hold=settings.hold_time if control in holds else math.inf,
                 stops=stops.get(control),
             )
-            for control in (*BUTTONS, *HELD)
-            if control in BUTTONS or control in {binding.control for binding in bound}
+            for control in dict.fromkeys((*BUTTONS, *(binding.control for binding in bound)))
         }
         self._buttons = [self._controls[control] for control in BUTTONS]
         self.forget()

@@ -16,24 +16,24 @@ from q2r2_control.inputs.headset_check import HeadsetCheck
 from q2r2_control.inputs.listener import written
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist
 from q2r2_control.inputs.session import TopicStatistics
+from q2r2_control.viewer.tables import Cell, figure_table
 
 _REFRESH_RATE = 6.0  # [Hz]
+_COLUMNS = ("topic", "messages", "rate [Hz]", "age [s]", "last value")
 
 
 def topic_table(title: str, topics: Mapping[str, TopicStatistics | None], silent: Collection[str] = ()) -> Table:
     """One row a topic, in the order given; None where nothing has come yet. Those in ``silent`` are marked."""
-    table = Table(title=Text(title), title_justify="left", min_width=76)
-    table.add_column("topic")
-    for column in ("messages", "rate [Hz]", "age [s]"):
-        table.add_column(Text(column), justify="right")
-    table.add_column("last value")
+    return figure_table(title, _COLUMNS, _topic_rows(topics, silent))
+
+
+def _topic_rows(topics: Mapping[str, TopicStatistics | None], silent: Collection[str] = ()) -> Iterator[list[Cell]]:
     for name, topic in topics.items():
-        figures, last = ("0", "", ""), "nothing yet"
+        figures, last = ["0", "", ""], "nothing yet"
         if topic is not None:
-            figures, last = (str(topic.count), f"{topic.rate:.0f}", f"{topic.age:.2f}"), short_text(topic.last)
-        late = name in silent
-        table.add_row(name, *figures, Text(f"timeout  {last}" if late else last), style="red" if late else None)
-    return table
+            figures, last = [str(topic.count), f"{topic.rate:.0f}", f"{topic.age:.2f}"], short_text(topic.last)
+        cells = [name, *figures, f"timeout  {last}" if name in silent else last]
+        yield [Text(cell, style="red" if name in silent else "") for cell in cells]
 
 
 def topic_line(name: str, topic: TopicStatistics | None, is_silent: bool) -> str:
@@ -65,20 +65,14 @@ def headset_table(check: HeadsetCheck) -> Table:
     statistics = check.statistics
     state = f"{statistics.peer} connected" if statistics.peer else "not connected"
     dialect = f", dialect {statistics.dialect}" if statistics.dialect else ""
-    table = topic_table(
-        f"headset on {written(*statistics.address)}: {state}{dialect}", dict(sorted(statistics.topics.items()))
-    )
-    for name, count in statistics.unknown_topics.items():
-        table.add_row(Text(name), str(count), "", "", "not read")
-    table.add_section()
+    rows = list(_topic_rows(dict(sorted(statistics.topics.items()))))
+    rows += [[name, count, "", "", "not read"] for name, count in statistics.unknown_topics.items()]
     for hand, direction in check.directions.items():
         position = check.positions[hand]
         where = "" if position is None else "at " + " ".join(f"{value:.2f}" for value in position)
-        table.add_row(f"{hand} hand moves", "", "", "", f"{direction}  {where}")
-    # Text without markup, since a reason may quote what the client sent.
-    table.caption = Text("\n".join(check.advice)) if check.advice else None
-    table.caption_justify = "left"
-    return table
+        rows.append([f"{hand} hand moves", "", "", "", f"{direction}  {where}"])
+    title = f"headset on {written(*statistics.address)}: {state}{dialect}"
+    return figure_table(title, _COLUMNS, rows, check.advice)
 
 
 @contextmanager

@@ -10,11 +10,12 @@ from rich.console import Console
 from rich.table import Table
 
 from q2r2_control import Pipeline, RunSummary
-from q2r2_control.cli.output import figure_table, record_table, recording_line, short_figure, summary_table, task_line
+from q2r2_control.cli.output import recording_line, summary_table, task_line
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import Percentiles
+from q2r2_control.viewer.tables import figure_table, record_table, short_figure
 from q2r2_control.wording import sentence
 from tests.support.hands_input import HandsInput
 from tests.support.processes import cell

@@ -56,7 +56,10 @@ def test_on_another_plant_it_says_how_far_the_tools_are_off(recorded: Path) -> N
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--viewer",), "--viewer: without --plant there is no window; allowed: --plant mujoco"),
+        (
+            ("--viewer",),
+            "--viewer: without --plant there is no window; allowed: a plant that has one, as --plant mujoco",
+        ),
         (("--plant", "kinematic", "--viewer"), "--viewer: the kinematic plant has no window"),
         (("--plant", "mujoco", "--compare"), "recorded with KinematicPlant"),
     ],

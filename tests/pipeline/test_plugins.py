@@ -1,91 +1,101 @@
-"""An input and a plant of another package: found by their names, and driven like our own."""
+"""An input, a plant and a task of another package, written, declared and named as docs/extending.md says."""
 
 from __future__ import annotations
 
+import re
 import sys
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.types import DeviceControls
+from tests.cli.command import CELL, q2r2
+from tests.support.modules import blocks_of, install
 from tests.support.processes import cell
 
-PACKAGE = """
-from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.plants.kinematic import KinematicPlant
-from q2r2_control.types import DeviceControls
+PAGE = "docs/extending.md"
 
 
-class Pedal(ScriptedInput):
-    controls = DeviceControls(buttons=("button_lower",), axes=())
-
-    @classmethod
-    def from_config(cls, config):
-        return cls("circle")
-
-
-class Sluggish(KinematicPlant):
-    @classmethod
-    def from_config(cls, robot, config):
-        return cls(robot, config)
-"""
-ENTRY_POINTS = """
-[q2r2_control.inputs]
-pedal = outsider:Pedal
-broken = outsider:Nothing
-
-[q2r2_control.plants]
-sluggish = outsider:Sluggish
-"""
+def merged(data: Any, changes: Any) -> Any:
+    if not (isinstance(data, dict) and isinstance(changes, dict)):
+        return changes
+    return data | {key: merged(data.get(key), value) for key, value in changes.items()}
 
 
 @pytest.fixture
-def outsider(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "outsider.py").write_text(PACKAGE)
-    metadata = tmp_path / "outsider-1.0.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: outsider\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text(ENTRY_POINTS)
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The shipped cell with what the page writes in its YAML; the page's package is installed, with a broken entry."""
+    groups: dict[str, dict[str, str]] = {}
+    for block in blocks_of(PAGE, "toml"):
+        groups |= tomllib.loads(block)["project"]["entry-points"]
+    groups["q2r2_control.inputs"]["broken"] = "my_package:Nothing"
+    lines: list[str] = []
+    for group, entries in groups.items():
+        lines += [f"[{group}]", *(f"{name} = {at}" for name, at in entries.items())]
+    install(tmp_path, "my_package", "\n".join(blocks_of(PAGE, "python")), "\n".join(lines))
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "outsider", raising=False)
+    monkeypatch.delitem(sys.modules, "my_package", raising=False)
+    data = yaml.safe_load(find_resource(CELL).read_text(encoding="utf-8"))
+    for block in blocks_of(PAGE, "yaml"):
+        data = merged(data, yaml.safe_load(block))
+    return changed(tmp_path / "cell.yaml", data)
 
 
-def lower_and(**bindings: str) -> dict[str, object]:
-    config = cell()
-    changed = type(config.teleop.bindings)(**{"upper": "none", **bindings})
-    teleop = config.teleop.model_copy(update={"bindings": changed})
-    return {"teleop": teleop, "input": "pedal", "plant": "sluggish"}
+def changed(file: Path, data: Any) -> Path:
+    file.write_text(yaml.safe_dump(merged(yaml.safe_load(file.read_text()) if file.exists() else {}, data)))
+    return file
 
 
-@pytest.mark.usefixtures("outsider")
-def test_a_cell_names_an_input_and_a_plant_of_another_package_and_both_arms_follow() -> None:
-    loop = Pipeline.from_config(cell().model_copy(update=lower_and()))
-    assert type(loop.plant).__name__ == "Sluggish"
-    summary = loop.run(1.5, realtime=False)
-    assert all(arm.engaged_s > 0.2 for arm in summary.arms.values())
+def elbow_at_the_end(config: Config) -> float:
+    """Angle of the left arm's third joint [rad], after both arms have followed."""
+    loop = Pipeline.from_config(config.model_copy(update={"loop_rate_hz": 500.0}))
+    angles: list[float] = []
+    loop.listeners.append(lambda tick: angles.append(tick.reference.q[2]))
+    summary = loop.run(2.0, realtime=False)
+    assert (type(loop.input).__name__, type(loop.plant).__name__) == ("SwingWithPedal", "LaggingPlant")
+    assert all(arm.engaged_s > 1.5 for arm in summary.arms.values())
+    return angles[-1]
 
 
-@pytest.mark.usefixtures("outsider")
-def test_a_binding_to_a_control_that_the_device_does_not_declare_is_refused() -> None:
-    config = cell().model_copy(update=lower_and(grip="precision"))
-    with pytest.raises(ConfigError, match=r"grip = precision.*no press_middle; allowed: lower"):
-        Pipeline.from_config(config)
+def test_an_input_a_plant_and_a_task_written_as_the_page_says_run_in_one_pipeline(file: Path) -> None:
+    config = load_config(str(file))
+    assert "elbows_out" in config.control.tasks
+    without = config.model_copy(update={"control": config.control.model_copy(update={"tasks": {}})})
+    assert elbow_at_the_end(config) > elbow_at_the_end(without) + 0.05
 
 
-@pytest.mark.usefixtures("outsider")
-def test_an_unknown_name_is_one_line_that_lists_what_is_installed() -> None:
-    with pytest.raises(ConfigError, match=r"input 'joystick': allowed are broken, headset, pedal, scripted"):
-        Pipeline.from_config(cell(), input="joystick")
-    with pytest.raises(ConfigError, match=r"plant 'gazebo': allowed are kinematic, mujoco, sluggish"):
-        Pipeline.from_config(cell(), plant="gazebo")
-
-
-@pytest.mark.usefixtures("outsider")
-def test_an_input_that_cannot_be_imported_is_one_line_too() -> None:
-    with pytest.raises(ConfigError, match="broken = outsider:Nothing"):
-        Pipeline.from_config(cell(), input="broken")
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"input": "joystick"}, "input 'joystick': allowed are broken, headset, scripted, swing"),
+        ({"input": "broken"}, "broken = my_package:Nothing"),
+        ({"plant": "gazebo"}, "plant 'gazebo': allowed are kinematic, lagging, mujoco"),
+        (
+            {"teleop": {"bindings": {"grip": "carry"}}},
+            "grip = carry: this input has no press_middle; allowed: device.pedal",
+        ),
+        (
+            {"teleop": {"bindings": {"device": {"knob": "carry"}}}},
+            "device.knob = carry: this input has no knob; allowed:",
+        ),
+    ],
+    ids=["input", "cannot be imported", "plant", "binding", "binding by name"],
+)
+def test_what_is_not_installed_or_not_on_the_device_is_one_line_of_check_and_run(
+    file: Path, change: dict[str, Any], told: str
+) -> None:
+    checked = q2r2("check", str(changed(file, change)))
+    assert (checked.exit_code, checked.stderr.count("\n")) == (2, 1)
+    assert told in checked.stderr
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        Pipeline.from_config(load_config(str(file)))
 
 
 def test_a_device_without_controls_engages_nothing() -> None:

@@ -21,7 +21,7 @@ from q2r2_control.recording.replay import replay
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import HandFault, HandSample, RobotState
+from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandFault, HandSample, RobotState
 from tests.recording.runs import RATE, file_of, number_of, pipeline, record, rewrite
 from tests.support.object_cell import cell as object_cell
 from tests.support.processes import cell
@@ -122,7 +122,9 @@ def test_what_a_gripper_holds_is_replayed(tmp_path: Path) -> None:
 
 
 class FaultyHands(ScriptedInput):
-    """Loses its connection for a moment, sends no poses, hands that nobody has, and a fault of its left hand."""
+    """Loses its connection, sends no poses, hands that nobody has, a fault of its left hand, and a pedal of its own."""
+
+    controls = DeviceControls((*QUEST_CONTROLS.buttons, "pedal"), QUEST_CONTROLS.axes)
 
     @property
     def connected(self) -> bool:
@@ -133,7 +135,8 @@ class FaultyHands(ScriptedInput):
         samples = super().poll(now)
         if 0.9 <= now < 0.95:
             samples = [changed(sample, position=np.array([np.nan, np.inf, -0.0])) for sample in samples]
-        samples = [changed(one, inputs=changed(one.inputs, thumb_stick_horizontal=1e300)) for one in samples]
+        more = {"pedal": float(now > 0.7)} if now < 1.2 else {}
+        samples = [changed(one, inputs=changed(one.inputs, thumb_stick_horizontal=1e300, more=more)) for one in samples]
         faults = {"left": HandFault.FROZEN if now > 1.1 else None}
         samples = [changed(sample, fault=faults.get(sample.hand)) for sample in samples]
         return samples + [changed(sample, hand="third") for sample in samples]
@@ -142,7 +145,8 @@ class FaultyHands(ScriptedInput):
 
 
 def test_lost_connections_numbers_that_are_none_and_faults_that_the_input_found_are_replayed(tmp_path: Path) -> None:
-    file = file_of(record(tmp_path, pipeline(source=FaultyHands("circle")), 1.3))
+    teleop = TeleopSettings.model_validate({"bindings": {"device": {"pedal": "record_mark"}}})
+    file = file_of(record(tmp_path, pipeline(source=FaultyHands("circle"), teleop=teleop), 1.3))
     result = replay(file)
     assert result.difference is None
     assert result.summary is not None
@@ -150,6 +154,7 @@ def test_lost_connections_numbers_that_are_none_and_faults_that_the_input_found_
     assert set(samples[:, SAMPLE_FIELDS.index("fault")]) == {0.0, 1.0}
     assert np.isnan(samples[:, SAMPLE_FIELDS.index("x")]).any()
     assert "pose_unusable" in [event.kind for event in result.summary.events if event.destination == "lost"]
+    assert "mark" in [event.kind for event in result.summary.events]
 
 
 class LosesItsSensors(KinematicPlant):

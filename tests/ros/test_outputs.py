@@ -24,7 +24,9 @@ from tests.ros.processes import CONFIG, Processes, RosProcess, as_arguments, sub
 need_ros()
 
 from geometry_msgs.msg import PoseStamped
+from rclpy.qos import qos_profile_sensor_data
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
@@ -35,6 +37,7 @@ from q2r2_control.ros.base_node import COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge import joint_outputs
 from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers, listen_to_condition
 from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, PositionArray, TorqueArray, make_output
+from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import Command, CommandMode
@@ -244,3 +247,14 @@ def test_a_node_that_the_graph_had_lost_is_known_when_it_comes_back(node: Any, l
     wait_until(lambda: nodes() == [], "the graph has lost it")
     os.kill(listener.pid, signal.SIGCONT)
     wait_until(lambda: nodes() == ["/listener"], "it is found again")
+
+
+def test_the_example_of_an_external_controller_answers_a_target(processes: Processes, node: Any, robot: Robot) -> None:
+    example = processes.start(sys.executable, "examples/external_controller.py")
+    targets = node.create_publisher(PoseStamped, "/cartesian_controller/safe_target/left", qos_profile_sensor_data)
+    commands = subscribed(node, JointState, "/joint_commands")
+    target = robot.tool_pose(robot.home, "left") * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.05]))
+    while commands.empty() and example.running:
+        targets.publish(stamped_pose(target, "world", 0.0))
+        time.sleep(0.1)
+    assert example.wait_for("target") == "target 50.0 mm away"

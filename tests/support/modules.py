@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 from types import ModuleType
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def install(folder: Path, package: str, source: str, entries: str) -> None:
+    """A package of one module with its entry points, as pip writes them; found where ``folder`` is on the path."""
+    (folder / f"{package}.py").write_text(source)
+    (folder / f"{package}-1.0.dist-info").mkdir()
+    (folder / f"{package}-1.0.dist-info/entry_points.txt").write_text(entries)
+
+
+def blocks_of(page: str, language: str) -> list[str]:
+    """The blocks of code in a page, as they stand."""
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
 
 
 def load_script(path: str) -> ModuleType:

@@ -14,7 +14,7 @@ from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.gestures import HeldControls, travel
 from q2r2_control.types import SIDES, HandInputs
 from tests.teleop import hands
-from tests.teleop.hands import ENGAGED, IDLE, LOST, PAUSED, PUSHED, Operator, assert_smooth, spoilt, waving
+from tests.teleop.hands import ENGAGED, IDLE, LOST, PAUSED, PUSHED, STOPPED, Operator, assert_smooth, spoilt, waving
 
 
 def engaged(**bindings: str) -> Operator:
@@ -157,6 +157,15 @@ class TestADeadMan:
         assert driver.states == PAUSED
 
 
+def test_a_pedal_that_only_the_device_has_engages_while_it_is_held_and_another_one_taps() -> None:
+    driver = hands.operator(bindings={"lower": "none", "device": {"pedal": "dead_man", "knob_hold": "stop"}})
+    driver.run(0.1)
+    for more, expected in (({"pedal": 1.0}, ENGAGED), ({}, PAUSED), ({"knob": 0.9}, PAUSED), ({"knob": 0.9}, STOPPED)):
+        driver.alter = lambda received, more=more: spoilt(received, inputs=HandInputs(more=more))  # type: ignore[misc]
+        driver.run(0.4)
+        assert driver.states == expected
+
+
 def test_a_control_that_trembles_about_its_threshold_is_held_and_let_go_once() -> None:
     controls = HeldControls(BindingSettings(grip=Action.PRECISION))
     seen = []
@@ -184,6 +193,11 @@ def test_every_control_moves_from_0_to_1_and_no_other_with_it(control: str) -> N
         ({"upper": "precision"}, "upper is precision, which lasts; allowed: trigger, grip, stick_up,"),
         ({"stick_up": "gripper_analog"}, "stick_up is gripper_analog; allowed: trigger or grip"),
         ({"grip": "precision", "grip_hold": "home"}, "grip is precision and grip_hold is home; allowed: one of them"),
+        ({"device": {"grip": "home"}}, "device.grip: a control of every headset; allowed: lower,"),
+        (
+            {"grip": "home", "device": {"pedal_hold": "home"}},
+            "grip and device.pedal_hold are both home; allowed: one of",
+        ),
         ({"grip": "gripper_analog"}, "upper is gripper_toggle and grip is gripper_analog; allowed: one of them"),
     ],
 )

@@ -16,7 +16,7 @@ from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
 from q2r2_control.inputs.messages import HandPose, HandTwist
-from q2r2_control.types import Array, HandInputs, RobotState
+from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, RobotState
 
 _UNIT = 1e-3  # a quaternion's norm may be off by this
 _OLDEST = 0.1  # a message waits for the next tick, and no longer: more is a clock that was set [s]
@@ -114,11 +114,11 @@ def hand_twist_message(twist: HandTwist) -> Twist:
 
 
 def hand_inputs(message: OVR2ROSInputs) -> HandInputs:
-    return HandInputs(**{name: getattr(message, name) for name in HandInputs.__slots__})
+    return HandInputs(**{name: getattr(message, name) for name in QUEST_CONTROLS.names})
 
 
 def inputs_message(inputs: HandInputs) -> OVR2ROSInputs:
-    return OVR2ROSInputs(**{name: getattr(inputs, name) for name in HandInputs.__slots__})
+    return OVR2ROSInputs(**{name: getattr(inputs, name) for name in QUEST_CONTROLS.names})
 
 
 def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t: float) -> JointState:

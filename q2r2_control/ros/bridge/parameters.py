@@ -16,6 +16,7 @@ from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.config.teleop import GuardSettings, Stance, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import BaseNode
+from q2r2_control.types import QUEST_CONTROLS
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -156,7 +157,11 @@ def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
         read_only=False,
     )
     default = default.model_copy(update={"stance": stance_of(mirror, reflected)})
-    return settings_from_parameters(node, "teleop", default, frozenset({"stance", "workspace"}), read_only=False)
+    settings = settings_from_parameters(
+        node, "teleop", default, frozenset({"stance", "workspace", "device"}), read_only=False
+    )
+    settings.bindings.check_device(QUEST_CONTROLS, "a hand's ROS message")
+    return settings
 
 
 def stance_of(mirror: bool, reflected: bool) -> Stance:

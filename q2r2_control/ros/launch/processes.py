@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.plugins import INPUTS, check_installed
+from q2r2_control.plugins import INPUTS, load_class
 from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_signals
 from q2r2_control.types import SIDES
 
@@ -66,8 +66,6 @@ def nodes_of(
         raise ConfigError(f"robot = {robot!r:.60}: allowed are {', '.join(ROBOTS)}")
     cell = load_config(path)
     source = source or cell.input
-    if source != NO_INPUT:
-        check_installed(INPUTS, source)
     config: dict[str, str | float] = {"config": path}
     nodes = [] if recording is None else [NodeProcess("recorder", {**config, **recording})]
     controller: dict[str, str | float] = {} if cell.external is None else _relayed(cell.external)
@@ -81,8 +79,8 @@ def nodes_of(
     together = not separate and len(arms) == len(SIDES)
     nodes += [NodeProcess(name, config) for name in (["arm_controllers"] if together else arms)]
     if source != NO_INPUT:
-        known = {"scripted": NodeProcess("SimulationInput"), "headset": NodeProcess("tcp_endpoint", config)}
-        nodes.append(known.get(source) or NodeProcess("hand_input", config | {"input": source}))
+        executable = getattr(load_class(INPUTS, source), "executable", "hand_input")
+        nodes.append(NodeProcess(executable, config | {"input": source}))
     return nodes
 
 

@@ -14,6 +14,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.types import Array
 from tests.control.cells import cell, random_posture
 from tests.support.driven import Driven
+from tests.support.modules import blocks_of, install
 
 
 def test_the_angle_is_that_between_the_planes_through_the_line_up_and_to_the_elbow() -> None:
@@ -82,19 +83,7 @@ def test_settings_that_mean_nothing_are_refused_by_name(settings: dict[str, obje
         CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks={"swivel": settings}))
 
 
-TASK = """
-import numpy as np
-
-class ElbowTask:
-    def __init__(self, robot, joint, angle, weight=0.1):
-        self.index, self.angle, self.weight, self.nv = robot.joint_names.index(joint), angle, weight, robot.model.nv
-
-    def cost(self, q, v):
-        H, g = np.zeros((self.nv, self.nv)), np.zeros(self.nv)
-        H[self.index, self.index] = self.weight
-        g[self.index] = -self.weight * 2.0 * (self.angle - q[self.index])
-        return H, g
-
+BROKEN = """
 class BrokenTask:
     def __init__(self, robot):
         self.nv = robot.model.nv
@@ -102,17 +91,13 @@ class BrokenTask:
     def cost(self, q, v):
         return np.full((self.nv, self.nv), np.nan), np.zeros(self.nv)
 """
-ENTRIES = "[q2r2_control.tasks]\nelbow = elbow_package:ElbowTask\nbroken = elbow_package:BrokenTask\n"
+ENTRIES = "[q2r2_control.tasks]\nelbow = elbow_package:KeepElbowsOut\nbroken = elbow_package:BrokenTask\n"
 
 
 @pytest.fixture(autouse=True)
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An installed package with two tasks."""
-    (tmp_path / "elbow_package.py").write_text(TASK)
-    information = tmp_path / "elbow_package-1.0.dist-info"
-    information.mkdir()
-    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: elbow-package\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text(ENTRIES)
+    """An installed package with two tasks, one as docs/extending.md has it."""
+    install(tmp_path, "elbow_package", "\n".join([*blocks_of("docs/extending.md", "python"), BROKEN]), ENTRIES)
     monkeypatch.syspath_prepend(tmp_path)
 
 
@@ -126,7 +111,7 @@ def moved_by(settings: ControllerSettings) -> float:
 
 
 def test_a_task_of_another_package_moves_the_arm_within_every_promise() -> None:
-    settings = {"joint": "left_A3", "angle": float(cell("dual_iiwa7").robot.home[2]) + 0.3}
+    settings = {"angle": float(cell("dual_iiwa7").robot.home[2]) + 0.3, "weight": 0.1}
     assert moved_by(ControllerSettings(tasks={"elbow": settings})) > 0.1
 
 
