@@ -11,7 +11,7 @@ from q2r2_control.config.strict import StrictModel
 from q2r2_control.errors import ConfigError
 
 EQUAL = "equal"
-# What may change while a controller runs, of its settings.
+# Settings that may change while a controller runs.
 LIVE = (
     "min_distance",
     "position_gain",
@@ -45,8 +45,8 @@ LinkPattern = Annotated[str, Field(min_length=1)]
 class DistanceSettings(StrictModel):
     """How far pairs of bodies stay apart, by what they are; left out: ``min_distance``.
 
-    A finger is what a gripper's joints move, a tool what carries it (the hand), an obstacle what stands in the cell,
-    its floor included, an object what ``gripper.object`` describes, while it is held. ``arm_self`` is all of one arm
+    A gripper's joints move a finger, and a tool (the hand) carries it. An obstacle stands in the cell, and the floor is
+    one. An object is the body that ``gripper.object`` describes, while it is held. ``arm_self`` is all of one arm
     against itself and against the robot that it is a part of, its own object included; the other classes without
     obstacles are about different arms.
     """

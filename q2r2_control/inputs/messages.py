@@ -1,8 +1,9 @@
-"""What the Quest2ROS app sends and is sent: frames of ROS-TCP-Connector 0.7, and the messages in them. No sockets.
+"""The data of the Quest2ROS app in both directions: frames of ROS-TCP-Connector 0.7, and the messages in them. No
+sockets.
 
 A frame is ``u32 n | n bytes destination | u32 m | m bytes payload``, little-endian, in both directions (public source
 of Unity ROS-TCP-Connector 0.7.0). Messages are (de)serialised by rosbags and checked more strictly than it does, which
-distinguishes the dialects: read with the wrong one, a pose is noise and a button stays pressed.
+distinguishes the dialects. Read with the wrong one, a pose is noise and a button stays pressed.
 """
 
 from __future__ import annotations

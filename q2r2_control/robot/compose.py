@@ -49,8 +49,8 @@ class ComposedCell:
 def compose(config: Config) -> ComposedCell:
     """Build the cell of ``config``.
 
-    Raises :class:`ConfigError` that names key, value and what is allowed: a model or link that does not exist, a home
-    posture of the wrong length or outside the limits, clashing or reserved names.
+    Raises :class:`ConfigError` that names key, value and the allowed values, for a model or link that does not exist, a
+    home posture of the wrong length or outside the limits, clashing or reserved names.
     """
     if not config.name.isprintable():
         raise ConfigError(f"name = {config.name!r:.60}: allowed: printable characters")

@@ -21,7 +21,7 @@ _LED = FOLLOWING - {ArmState.CARRIED}  # by their own hand, which does not move 
 
 
 class Teleop:
-    """Hands drive arms relative to anchors; faults stop them. What leads where is the table of :mod:`arm_states`.
+    """Hands drive arms relative to anchors; faults stop them. The table of transitions is that of :mod:`arm_states`.
 
     An engaged arm is stopped by: no pose or no button data for ``gate.timeout`` of receipt time, a pose that is not
     finite or not a rotation, a jump or a speed past the gate, a fault that the input found, a lost connection, a loop
@@ -162,7 +162,7 @@ class Teleop:
         self._pair.change(Cause.HOMED if arrived else Cause.FAULT, now, outcome)
 
     def record_event(self, now: float, reason: Reason) -> None:
-        """What the operator should know of both arms."""
+        """The things that the operator should know of both arms."""
         for arm in self._arms.values():
             arm.record_event(now, reason)
 
