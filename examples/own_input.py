@@ -24,7 +24,7 @@ class SwingingHands:
         self._next = 0.0
 
     def poll(self, now: float) -> list[HandSample]:
-        """What came in since the last poll: 90 samples a second of each hand."""
+        """The samples since the last poll: 90 samples a second of each hand."""
         if now < self._next:
             return []
         self._next = now + 1.0 / 90.0

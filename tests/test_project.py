@@ -39,7 +39,7 @@ PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["
 
 
 def modules(*extras: str) -> set[str]:
-    """What the dependencies, or these extras, bring."""
+    """The packages that the dependencies, or these extras, bring."""
     optional = PROJECT["optional-dependencies"]
     entries = [entry for extra in extras for entry in optional[extra]] if extras else PROJECT["dependencies"]
     names = [re.split(r"[<>=]", entry)[0].removeprefix("ros-jazzy-") for entry in entries]
