@@ -166,7 +166,7 @@ class ImpedanceController:
         self._ramping = True
 
     def in_force(self, arm: str) -> dict[str, float]:
-        """What of ``LIVE_IMPEDANCE`` an arm goes by now."""
+        """The part of ``LIVE_IMPEDANCE`` an arm goes by now."""
         return dict(zip(LIVE_IMPEDANCE, self._springs[self._arms.index(arm)].tolist(), strict=True))
 
     def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:

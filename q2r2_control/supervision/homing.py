@@ -177,7 +177,7 @@ class Homing:
             self._way = JointHoming(self._robot, self._controller.kept_distances, self._robot.home)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """What each tool is asked for in ``dt`` [s]: nothing where joints are led, from the ``last`` reference."""
+        """The target of each tool in ``dt`` [s]: nothing where joints are led, from the ``last`` reference."""
         if isinstance(self._way, ToolHoming):
             return self._way.targets(dt)
         if self._way is not None and last is not None:

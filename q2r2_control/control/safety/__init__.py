@@ -1,4 +1,4 @@
-"""What keeps every limit and every distance, whatever targets and solver do; the argument is in README.md.
+"""The functions that keep every limit and every distance, whatever targets and solver do; the argument is in README.md.
 
 ``joint_limits`` bounds the next velocities; ``stop_certificate`` proves a step and the stop after it, by
 ``speed_bound`` or, where distances leave no room for that, ``separating_plane``;

@@ -1,4 +1,5 @@
-"""What the arms are asked to do, the cost of joints that no tool needs, and what the task kernels write at each tick.
+"""The targets of the arms, the cost of joints that no tool needs, and the data that the task kernels write at each
+tick.
 
 For all joints w |v - v_p|^2 with the posture velocity v_p projected into the tools' nullspace, so that at rest it
 leaves no tool error. An arm without a target holds its joints by a cost of their own.
@@ -111,7 +112,7 @@ def priority_of(robot: Robot, settings: ControllerSettings) -> Priority:
 
 
 class TaskModel(NamedTuple):
-    """What does not change in a tick, and between ticks but for gains and weights."""
+    """Data that do not change in a tick, and between ticks but for gains and weights."""
 
     chain: Chain
     tools: Tools
@@ -152,7 +153,7 @@ class PoseScratch(NamedTuple):
 
 
 class TaskTargets(NamedTuple):
-    """What the arms are asked to do."""
+    """The targets of the arms."""
 
     member: Array  # (n, nv) 1 where a joint is the arm's
     follows: IntArray  # (n,) 1: the tool follows its target, 0: the arm's joints hold

@@ -192,7 +192,7 @@ class MujocoRobot(BaseNode):
         if late := delays.take(delay(info), time.monotonic()):
             self._note(topic, f"{late:.2f} s late; its sender or this node stood still")
             return
-        # What came while this process stood still is as new as what came since the last tick.
+        # A message that came while this process stood still is as new as one that came since the last tick.
         self._received = time.monotonic() - min(age(info), self._period)
         self._note(topic, command(message))
 
