@@ -47,7 +47,7 @@ class DistanceSettings(StrictModel):
 
     A gripper's joints move a finger, and a tool (the hand) carries it. An obstacle stands in the cell, and the floor is
     one. An object is the body that ``gripper.object`` describes, while it is held. ``arm_self`` is all of one arm
-    against itself and against the robot that it is a part of, its own object included; the other classes without
+    against itself and against the robot that it is a part of, its own object included. The other classes without
     obstacles are about different arms.
     """
 

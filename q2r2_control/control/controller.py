@@ -222,8 +222,8 @@ class CartesianController:
         """Say that the gripper of ``arm`` holds its object from the next step on, or, as after :meth:`reset`, does not.
 
         The object then is part of the tool. Each of its pairs begins with the distance that there is and keeps more as
-        it gets more, until it keeps its own (:attr:`object_distances`): so it is always accepted, and nothing moves for
-        it. Raises :class:`RobotError` for an arm that has no object.
+        it gets more, until it keeps its own (:attr:`object_distances`). The object is therefore always accepted, and
+        nothing moves for it. Raises :class:`RobotError` for an arm that has no object.
         """
         if not self._objects.set_holding(arm, holds):
             return

@@ -43,8 +43,8 @@ def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan
     """The observations and commands at each of n frames of the ``span``, whose first tick gives t_0.
 
     Measured are ``position``, ``velocity``, ``effort`` (n, joints) [rad, rad/s, Nm] and ``opening`` (n, arms), 0 closed
-    .. 1 open, -inf: not measured. Commanded are ``reference`` (n, joints), ``gripper`` (n, arms), and as poses x y z qx
-    qy qz qw in the world (n, arms, 7) ``reference_tool`` and the operator's ``target``, or else that tool. ``time``
+    .. 1 open, -inf: not measured. Commanded are ``reference`` (n, joints) and ``gripper`` (n, arms). ``reference_tool``
+    and the operator's ``target``, or else that tool, are poses x y z qx qy qz qw in the world (n, arms, 7). ``time``
     (n,) [s] is since t_0, ``stamp`` (n,) the time of day [ns]. ``trim``: from the first to the last tick at which an
     arm is engaged or the reference moves. Raises :class:`RecordingError` for a damaged file, one without a tick to
     take, and one in which ticks were lost for longer than a frame.

@@ -202,8 +202,8 @@ class FrameDecoder:
     def next_frame(self) -> WireFrame | None:
         """The next whole frame, or None until more bytes come.
 
-        Raises :class:`ProtocolError` for a frame above ``MAX_FRAME_BYTES``, as soon as its length fields say so, for a
-        destination that is not UTF-8, and for payload without a destination.
+        Raises :class:`ProtocolError` for a frame above ``MAX_FRAME_BYTES``, as soon as its length fields say so. Raises
+        it too for a destination that is not UTF-8, and for payload without a destination.
         """
         name_size = self._length_at(0)
         if name_size is None:

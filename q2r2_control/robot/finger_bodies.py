@@ -92,7 +92,7 @@ def sweep_fingers(
     Capsules of two fingers of one gripper that slide on one line and are equally thick become one. It keeps the first
     one's name, and the space between the fingers is part of it. Returns the bodies of which less counts where the
     gripper's opening is known: those along whose line the fingers slide, and those that turn. A finger that slides
-    across its body is all of its way always; one that is moved by a joint of more than one axis stays as it is.
+    across its body is all of its way always. One that is moved by a joint of more than one axis stays as it is.
     """
     bodies: list[FingerBody | TurningBody] = []
     for arm, joints in parts.finger_joints.items():

@@ -4,9 +4,9 @@ drawn.
 **Claim.** The capsule of an interval encloses the shape at every opening in that interval, not only at samples.
 
 *Proof.* A shape is the hull of two balls, so it is enough to hold the balls' centres with the balls' radius. Where a
-driven joint goes from one position to another in m equal steps, and joints that mimic it with it, a centre x is a
-function of that one parameter. In a step in which these joints move by w_i, linear interpolation between both ends of
-the step is off by at most an eighth of the greatest second derivative,
+driven joint goes from one position to another in m equal steps, with the joints that mimic it, a centre x is a function
+of that one parameter. In a step in which these joints move by w_i, linear interpolation between both ends of the step
+is off by at most an eighth of the greatest second derivative,
 
     1/8 sum_ik w_i w_k r_(the outer one of i and k),
 

@@ -4,7 +4,7 @@ An arm that is stretched out or blocked cannot follow its hand. Without a leash 
 back before the arm moves again. Where a target would go beyond the leash, the anchor of the relative motion shifts. The
 target stays where the leash ends and the hand moves it from there. Position and rotation have a leash each.
 
-**Slack.** When a leash is taut, the tool is blocked in its direction, and the hand comes back by more than tremor, the
+**Slack.** A leash is taut, the tool is blocked in its direction, and the hand comes back by more than tremor. Then the
 target is put at the tool, which follows the hand from there. Whether the hand comes back is read from its unfiltered
 poses: when a hand stops, the filtered ones swing back by millimetres. Position and rotation are put there together. A
 blocked tool rests where the pulls of both balance, and would follow the one that is left, up to 50 mm.

@@ -104,8 +104,8 @@ def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
 def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
     """Signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
 
-    Writes the closest points and the unit normal from the segment to the box. The squared distance along the segment
-    is convex and piecewise quadratic, so the zero of its slope is found exactly between two of the at most six
+    Writes the closest points and the unit normal from the segment to the box. The squared distance along the segment is
+    convex and piecewise quadratic. The zero of its slope is therefore found exactly between two of the at most six
     parameters where the segment crosses a face plane. A segment that enters the box is pushed out the least way.
     """
     s = _minimum_along(a0, a1, half)

@@ -3,9 +3,9 @@
 The bound by reach (stop_certificate.py) counts every way a joint travels as if it led straight to the other body. A
 pair that rests at min_distance to the micrometre could then never be shown to part again. Here the direction counts.
 
-**Claim.** Let n be the unit normal of two convex cores that do not meet, e_1 and e_2 their corners (the ends of a
-segment, the corners of a box), J_e the Jacobian of a corner at the start, r the joints' reach. If the joints move by
-D(t) with |D_j(t)| <= w_j, then at every t the distance is at least
+**Claim.** Let n be the unit normal of two convex cores that do not meet, and e_1 and e_2 their corners (the ends of a
+segment, the corners of a box). Let J_e be the Jacobian of a corner at the start, and r the joints' reach. If the joints
+move by D(t) with |D_j(t)| <= w_j, then at every t the distance is at least
 
     min over corners of  n'(e_2 - e_1) + n'(J_e2 - J_e1) D(t)   -   K_1 - K_2   -   radii,
 

@@ -24,10 +24,10 @@ where w_j is the way of joint j in the step and the stop.
 h + s - s^2 / 2T at the time s of the stop, so at most h + T / 2. In the step, |D_j - v_j t| = |v+_j - v_j| t^2 / 2h is
 at most |v+_j - v_j| h / 2, and no more is left of it in the stop. There, v+_j takes the place of v_j, which changes v_j
 (s - s^2 / 2T) by at most |v+_j - v_j| T / 2. The joint itself travels B_j(s) from the step's end. Since d_j >= |v+_j| /
-T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never falls, and at T it is |v+_j| T / 2 -
-v+_j^2 / 2 d_j. Together |D_j - v_j sigma| <= rho_j. A point of a body moves by J D + R, with |R| <= sum reach_j kappa_j
-over the joints that move it (separating_plane.py has why). Two points, one of each body's core, therefore get closer by
-at most |(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V. The radii cancel. []
+T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never falls. At T it is |v+_j| T / 2 - v+_j^2 /
+2 d_j. Together |D_j - v_j sigma| <= rho_j. A point of a body moves by J D + R, with |R| <= sum reach_j kappa_j over the
+joints that move it (separating_plane.py has why). Two points, one of each body's core, therefore get closer by at most
+|(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V. The radii cancel. []
 
 The velocity of a joint that carries both bodies is part of V, but such a joint is not in the sum. V could then be less
 than the speed at which the bodies close in. Pairs that share a joint are therefore left to the other proofs.

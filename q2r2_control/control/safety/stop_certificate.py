@@ -30,8 +30,8 @@ from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, w
 # Distances of a pair that is too close are compared to this.
 _CLOSER = 1e-12  # [m], and relative
 _STILL = 1e-9  # [m/s]
-# The gap along a plane is less than the distance that it is made of by up to this much, since the closest points of a
-# box and a segment are found to so many digits. Without it a pair at its distance could never be proven to part again.
+# The gap along a plane is less than the distance that it is made of by up to this much. The closest points of a box and
+# a segment are found to so many digits. Without it a pair at its distance could never be proven to part again.
 _LAST_DIGITS = 1e-11  # [m]
 
 

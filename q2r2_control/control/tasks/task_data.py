@@ -87,8 +87,8 @@ class Priority(NamedTuple):
     """Which arm gives way where two arms are in each other's way; the weights may change between ticks.
 
     Arms meet in the QP only where separation rows couple their joints. There all costs of an arm that gives way, also
-    posture and damping, are multiplied by a small weight, so that its motion pays for a row that both arms need. Where
-    no row is active nothing changes. An arm without a target holds its joints, and does not give way.
+    posture and damping, are multiplied by a small weight. Its motion then pays for a row that both arms need. Where no
+    row is active nothing changes. An arm without a target holds its joints, and does not give way.
     """
 
     weight: Array  # (n,) of an arm's costs while it follows a target: 1, less if it gives way
