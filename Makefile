@@ -28,7 +28,7 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot -m 'not slow'
 
-# What plays minutes of motion, or whole runs again and again.
+# Tests that play minutes of motion, or whole runs again and again.
 test-slow: setup
 	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot -m slow
 
@@ -37,11 +37,11 @@ test-ros: setup
 	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone and not slow'; failed=$$?; \
 		$(BIN)/python -m pytest tests/ros -m 'alone and not slow' && exit $$failed
 
-# What plays motions with whole sets of nodes for minutes, or builds packages.
+# Tests that play motions with whole sets of nodes for minutes, or builds packages.
 test-ros-slow: setup
 	$(BIN)/python -m pytest tests/ros -m 'slow and not soak'
 
-# What .ci/run leaves out.
+# Tests that .ci/run leaves out.
 soak-ros: setup
 	$(BIN)/python -m pytest tests/ros -m soak
 

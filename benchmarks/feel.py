@@ -1,10 +1,10 @@
-"""What does an operator feel of a filter: how late is the tool, what is left of tremor and noise, how does it stop?
+"""How does a filter feel to an operator: how late is the tool, how much tremor and noise is left, how does it stop?
 
-Nothing is taken from the settings: a hand moves in tones, reaches, trembles, rests, and moves and stops, and the tool
-is measured, through samples at a headset's rate, teleoperation, controller and an arm in MuJoCo. Delay and gain of a
-tone come from the least-squares fit of a sine and a cosine to the hand's way and to the tool's. Hands do not move in
-tones: the delay of reaches is that of the highest correlation of velocities, and of a tremor within a band everything
-counts that it does to the tool, in the band or not.
+Nothing is taken from the settings. A hand moves in tones, reaches, trembles, rests, and moves and stops. The tool is
+measured, through samples at a headset's rate, teleoperation, controller and an arm in MuJoCo. Delay and gain of a tone
+come from the least-squares fit of a sine and a cosine to the hand's way and to the tool's. Hands do not move in tones.
+The delay of reaches is that of the highest correlation of velocities. Of a tremor within a band everything counts that
+it does to the tool, in the band or not.
 """
 
 from __future__ import annotations
@@ -233,8 +233,8 @@ def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:
 def tremor(band: tuple[float, float], rms: float, period: float, seed: int, speed: float = 0.0) -> Way:
     """Noise that is flat within ``band`` [Hz], nothing outside, with this ``rms`` [m], on top of a steady motion [m/s].
 
-    It repeats after ``period`` [s], over which its RMS is exact: the sum of all tones of the band that do, equally
-    large, with phases drawn from ``seed``.
+    It repeats after ``period`` [s], over which its RMS is exact. It is the sum of all tones of the band that do,
+    equally large, with phases drawn from ``seed``.
     """
     low, high = (round(frequency * period) for frequency in band)
     turns = 2.0 * math.pi * np.arange(low, high + 1) / period

@@ -1,9 +1,9 @@
 """Where does a tick of the whole live loop go, stage by stage, with each plant and mode?
 
-Ticks come at the loop's rate, since one that comes right after another finds warmer caches; time in the run is
+Ticks come at the loop's rate, since one that comes right after another finds warmer caches. Time in the run is
 simulated all the same, so that every round moves the same way whatever the machine does. The cases run in turns. Rounds
-with clocks in the stages alternate with rounds without, whose whole is what counts, and with rounds whose ticks come
-right after one another: what the program itself takes, whatever else the machine does while a loop sleeps.
+with clocks in the stages alternate with rounds without, whose whole counts. Other rounds have ticks that come right
+after one another. They show the time of the program itself, whatever else the machine does while a loop sleeps.
 """
 
 from __future__ import annotations

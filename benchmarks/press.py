@@ -1,9 +1,9 @@
-"""What does the table feel of a finger that presses on it on purpose, in torque mode?
+"""How does the table feel a finger that presses on it on purpose, in torque mode?
 
-The left tool is asked to go straight down until :data:`COMMANDED` inside the table, much faster than contact allows,
+The left tool is asked to go straight down until :data:`COMMANDED` inside the table, much faster than contact allows. It
 stays, slides away from the arm's base or towards it while it presses, and is lifted. That way is the hardest: the arm
-moves in its own plane, where pressing and sliding are coupled by its masses. Controller and impedance are whole.
-Forces are read from MuJoCo's contacts at every tick.
+moves in its own plane, where pressing and sliding are coupled by its masses. Controller and impedance are whole. Forces
+are read from MuJoCo's contacts at every tick.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How long does it take from a message on an input topic to the joint command that answers it, through real nodes?
 
 Runs real processes on this machine, in a ROS domain that nothing else uses: the simulated robot, the controller, and
-one arm's teleoperation. The input steps up and down by millimetres at random times; the command that answers a step is
+one arm's teleoperation. The input steps up and down by millimetres at random times. The command that answers a step is
 the first after it with an acceleration that only a step causes.
 """
 
@@ -66,7 +66,7 @@ class LatencyRow:
 
 @dataclass(frozen=True, slots=True)
 class LatencyReport:
-    """What was measured."""
+    """The measured latencies."""
 
     loop_rate_hz: float  # of the controller, as configured
     transport_p50_ms: float  # of a joint command between two processes, contained in all rows
@@ -142,8 +142,8 @@ class _Probe:
     def engage_hand(self) -> None:
         """Press the lower button until the arm's node publishes targets, and goes on.
 
-        A press that is answered late may meet the next one, which pauses the arm again: so what follows is asked after
-        the buttons rest, and not of what came while they were pressed.
+        A press that is answered late may meet the next one, which pauses the arm again. The answer is therefore looked
+        for after the buttons rest, not among messages that came while they were pressed.
         """
         targets: list[PoseStamped] = []
         subscription = self._node.create_subscription(PoseStamped, "/q2r2/left/target_frame", targets.append, 1)

@@ -43,7 +43,7 @@ class NodeLoad:
 
 @dataclass(frozen=True, slots=True)
 class LoadReport:
-    """What was measured of the whole set."""
+    """The measured figures of the whole set."""
 
     seconds: float  # of each of both
     jitter: float  # each sample of the hands comes later by up to this, at random [s]
@@ -138,7 +138,7 @@ class _Watcher:
             self._executor.spin_once(left)
 
     def shares(self, processes: Mapping[str, int], duration: float) -> dict[str, float]:
-        """What each process takes of one core for ``duration`` [s], in percent."""
+        """The share of one core that each process takes for ``duration`` [s], in percent."""
         began, before = time.monotonic(), {name: processor_time(pid) for name, pid in processes.items()}
         self.spin(duration)
         passed = time.monotonic() - began

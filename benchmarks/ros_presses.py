@@ -45,7 +45,7 @@ _MOVES = 0.02  # a joint command that is faster belongs to a motion [rad/s]
 
 @dataclass(frozen=True, slots=True)
 class PressRecording:
-    """What followed one press that was to engage an arm at rest; times of one clock [s], ascending."""
+    """The answers to one press that was to engage an arm at rest; times of one clock [s], ascending."""
 
     press: float  # when it was published
     ticks: Sequence[float]  # of the arm's node, when each had ended; some from before the press
@@ -71,7 +71,7 @@ class PressRow:
 
 @dataclass(frozen=True, slots=True)
 class PressReport:
-    """What was measured of presses."""
+    """The measured figures of presses."""
 
     starts: int  # of the set of nodes, with one first press each
     period_ms: float  # from one tick of the arm's node to the next, as a rule
@@ -236,7 +236,7 @@ def _times(recording: PressRecording) -> tuple[float, float, float] | None:
     if target is None or motion is None:
         return None
     ticks = np.asarray(recording.ticks)
-    # What the press may hold up begins at the tick before it.
+    # The delay by the press begins at the tick before it.
     begin, end = np.searchsorted(ticks, [press, press + WATCHED])
     longest = float(np.diff(ticks[max(begin - 1, 0) : end + 1]).max(initial=0.0))
     return longest, target, motion

@@ -49,7 +49,7 @@ def started(nodes: Sequence[NodeProcess]) -> Iterator[dict[str, int]]:
 
 
 def processor_time(pid: int) -> float:
-    """What a process has taken of the processors since it began [s], by Linux's /proc."""
+    """The processor time of a process since it began [s], by Linux's /proc."""
     # The name in parentheses may have blanks in it.
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -1,8 +1,8 @@
 """The hands of an operator who makes the arms go through a work motion, as a headset would send them.
 
-Both hands rest, press the lower button to engage, the right one a little later, and then move so that the relative
-motion asks for the tool poses of the motion. What an operator has stands in the way of these poses as it does at work:
-samples are noisy, uneven and late, and filter, leash and gate are between them and the targets.
+Both hands rest and press the lower button to engage, the right one a little later. Then they move so that the relative
+motion asks for the tool poses of the motion. The same things as at work stand in the way of these poses. Samples are
+noisy, uneven and late, and filter, leash and gate are between them and the targets.
 """
 
 from __future__ import annotations

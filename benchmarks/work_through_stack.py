@@ -2,8 +2,8 @@
 
 Everything is as in ``q2r2 run``, but that time is simulated and that the cell has no loose objects, of which no motion
 knows. An error is from where the operator's hand asks the tool to be in that very instant to where the tool is measured
-to be, so that it has all delays in it: of the samples, the filter, the loop and the arm. Beside each motion stands the
-same one with the same samples in free air, where nothing is watched: what is worse than that, the pairs cost.
+to be. All delays are in it: of the samples, the filter, the loop and the arm. Beside each motion stands the same one
+with the same samples in free air, where nothing is watched: what is worse than that, the pairs cost.
 """
 
 from __future__ import annotations
@@ -188,8 +188,8 @@ class _Log:
 
 
 def _errors(log: _Log, hands: WorkHands, delay: float, end: float) -> tuple[Array, Array, Array]:
-    """Distances (n, arms) [m] of the measured tools: from where the hands ask them to be at each tick, from where they
-    asked them to be ``delay`` [s] before, and from where they ask them to be at the ``end`` [s].
+    """Distances (n, arms) [m] of the measured tools. They are from where the hands ask them to be at each tick, from
+    where they asked them to be ``delay`` [s] before, and from where they ask them to be at the ``end`` [s].
     """
     tools = np.array(log.tools)
     asked = (

@@ -46,7 +46,7 @@ def _row(name: str, field: dict[str, Any], required: bool, models: dict[str, Any
 
 
 def _choices(field: dict[str, Any], models: dict[str, Any]) -> list[dict[str, Any]]:
-    """What a field may be, each resolved."""
+    """The types that a field may have, each resolved."""
     found = []
     for choice in field.get("anyOf") or field.get("allOf") or [field]:
         reference = choice.get("$ref")

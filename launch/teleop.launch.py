@@ -1,4 +1,5 @@
-"""What q2r2 ros up starts, for ROS: ``ros2 launch q2r2_control teleop.launch.py config:=... input:=... robot:=...``.
+"""Start the nodes of q2r2 ros up, for ROS: ``ros2 launch q2r2_control teleop.launch.py config:=... input:=...
+robot:=...``.
 
 With ``record:=FOLDER`` it is recorded.
 """

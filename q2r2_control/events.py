@@ -1,4 +1,4 @@
-"""What happens to the arms, as data: a kind and its payload. Code decides by these; :mod:`wording` makes sentences."""
+"""Events of the arms, as data: a kind and its payload. Code decides by these; :mod:`wording` makes sentences."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class ReasonKind(StrEnum):
     SEVERAL_PUBLISHERS = "several_publishers", "{text}"
     CONTROLLER_REFUSES = "controller_refuses", "{text}"
     BAD_JOINT_STATES = "bad_joint_states", "{text}"
-    # What supervision finds.
+    # Findings of supervision.
     NO_STATES_YET = "no_states_yet", "no joint states yet{source}"
     STATES_SILENT = "states_silent", "no joint states{source} for {age:.3f} s; allowed: {timeout:g}"
     STATE_NOT_FINITE = (

@@ -27,12 +27,12 @@ def _text(value: Any) -> Any:
 
 
 def event_line(event: Event) -> str:
-    """What an arm does now, and why."""
+    """The activity of an arm, and the reason."""
     return f"{event.destination}: {sentence(event.reason)}"
 
 
 def limit_name(limit: ActiveLimit) -> str:
-    """What held a step back: ``left_A2 velocity``, ``left_link_5|table``."""
+    """The limit that held a step back: ``left_A2 velocity``, ``left_link_5|table``."""
     if limit.kind is LimitKind.SEPARATION:
         return "|".join(limit.names)
     return f"{limit.names[0]} {_LIMITS[limit.kind]}"

@@ -32,9 +32,9 @@ Disabled = tuple[str, str, str]  # two links, and why they need no watching
 def model_srdfs(config: Config, samples: int) -> dict[str, str]:
     """Text of every such file by file name, for all models of ``config``'s arms.
 
-    The present files are not used. Listed are neighbours, pairs that overlap at every posture, and pairs that
-    stay more than :data:`CLEARANCE` apart, as far as ``samples`` postures and the way downhill from them show.
-    Raises :class:`ConfigError` for arms of one ``robot``, and for a flange without a model.
+    The present files are not used. Neighbours and pairs that overlap at every posture are listed, and also pairs that
+    stay more than :data:`CLEARANCE` apart, as far as ``samples`` postures and the way downhill from them show. Raises
+    :class:`ConfigError` for arms of one ``robot``, and for a flange without a model.
     """
     files: dict[str, str] = {}
     if config.robot is not None:

@@ -1,4 +1,4 @@
-"""Whatever order tests run in and however busy the machine is, what they draw at random is the same."""
+"""Tests draw the same random numbers in any order and on a machine of any load."""
 
 from __future__ import annotations
 

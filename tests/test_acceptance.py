@@ -1,6 +1,6 @@
 """An operator over TCP, in real time: tracking, re-anchoring, grippers, and connections that end in mid-motion.
 
-What is asserted about time allows for the machine's own delays, as measured; what is asserted about safety does not.
+Assertions about time allow for the machine's own delays, as measured; those about safety do not.
 """
 
 from __future__ import annotations

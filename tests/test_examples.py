@@ -1,4 +1,4 @@
-"""What a reader sees runs as it stands: each script in examples/, and the code and commands of the README."""
+"""Examples run as they stand: each script in examples/, and the code and commands of the README."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROS = "external_controller.py"  # tests/ros runs it
 
 
 def run(*arguments: object) -> str:
-    """What a script prints."""
+    """The output of a script."""
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
         cwd=ROOT,

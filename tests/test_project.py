@@ -34,12 +34,12 @@ IMPORTS = {
 WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core"}  # come with pin, mujoco, lerobot and pydantic
 NODES = set(ROS.rglob("*.py"))
 OTHERS = set((ROOT / PACKAGE).rglob("*.py")) - NODES
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("q2r2_control/**/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("[qb]*/**/*.md")])
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def modules(*extras: str) -> set[str]:
-    """What the dependencies, or these extras, bring."""
+    """The packages that the dependencies, or these extras, bring."""
     optional = PROJECT["optional-dependencies"]
     entries = [entry for extra in extras for entry in optional[extra]] if extras else PROJECT["dependencies"]
     names = [re.split(r"[<>=]", entry)[0].removeprefix("ros-jazzy-") for entry in entries]
@@ -138,7 +138,38 @@ def test_the_configuration_reference_is_made_from_the_settings_of_now() -> None:
     assert made.FILE.read_text(encoding="utf-8") == made.reference(), "python docs/make_reference.py"
 
 
+@cache
+def anchors(page: Path) -> set[str]:
+    """Those of its headings."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
-def test_every_file_that_a_page_links_to_exists(page: Path) -> None:
-    for link in re.findall(r"\]\((?!https?:|#|mailto:)([^)#\s]+)", page.read_text(encoding="utf-8")):
-        assert (page.parent / link).exists(), link
+def test_every_link_of_a_page_leads_to_a_file_and_a_heading(page: Path) -> None:
+    for link in re.findall(r"\]\((?!https?:|mailto:)([^)\s]+)", page.read_text(encoding="utf-8")):
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def prose(file: Path) -> Iterator[str]:
+    """A page, or the docstrings and comments of a Python file."""
+    text = file.read_text(encoding="utf-8")
+    if file.suffix == ".md":
+        yield text
+        return
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    yield from (ast.get_docstring(node) or "" for node in ast.walk(ast.parse(text)) if isinstance(node, documented))
+    yield from re.findall(r"(?:^|\s)# (.*)", text)
+
+
+def test_sentences_open_with_their_subject() -> None:
+    files = [
+        file for name in (PACKAGE, "tests", "benchmarks", "examples", "robots") for file in (ROOT / name).rglob("*.py")
+    ]
+    opening = re.compile(r"\b(?:What|Whatever|Whoever) .*|^So .*|[.!?]\sSo .*")
+    found = {file.name: hit[0] for file in [*PAGES, *files] for text in prose(file) if (hit := opening.search(text))}
+    assert found == {}

@@ -5,8 +5,8 @@ controller can be asked for the same. Each motion begins with an approach from h
 still for :data:`REST`. Tools keep their rotation, in which they point straight down, unless the motion says otherwise.
 
 How near is near: with both tools pointing down at one height, wrists keep 20 mm from each other down to 0.18 m between
-the tools. Pointing down, a tool gets 0.73 m away from its arm's mount (0.38 m above it), so that no arm reaches the
-place where the other one's tool has its home.
+the tools. Pointing down, a tool gets 0.73 m away from its arm's mount (0.38 m above it). No arm then reaches the place
+where the other one's tool has its home.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ REST = 2.0  # with still targets at the end, unless a motion says otherwise [s]
 _LEG = 2.0  # of an approach, from place to place [s]
 _SETTLE = 0.5  # between the approach and the motion [s]
 
-# Positions of both tools in the world, (2, 3) [m], the left one's first: those of a motion by the time since it began
-# [s] and by where the tools are at home.
+# Positions of both tools in the world, (2, 3) [m], the left one's first. They are those of a motion by the time since
+# it began [s] and by where the tools are at home.
 Path = Callable[[float, Array], Array]
 Stop = Array | Callable[[Array], Array]  # places (2, 3) [m], or such by where the tools are at home
 

@@ -200,9 +200,9 @@ def up(
 ) -> None:
     """Start what a cell needs as ROS nodes, until Ctrl-C: robot, controller, the arms' teleop and an input.
 
-    With controller: external the robot and its controllers are yours; what runs here are the arms' teleop and an input,
-    and in mode filtered the built-in controller between both.
-    A node that ends by itself is reported, and all others are stopped: exit 1.
+    With controller: external the robot and its controllers are yours. The arms' teleop and an input run here, and in
+    mode filtered the built-in controller between both. A node that ends by itself is reported, and all others are
+    stopped: exit 1.
     """
     notes = notes_of(task, operator, record)
     recording = None if record is None else {"folder": record, **notes}

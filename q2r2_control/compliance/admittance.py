@@ -4,8 +4,8 @@ The QP keeps every limit and distance whatever is asked of it, so the displaceme
 operator's sake. Only the QP sees the displaced target: recordings and the teleop layer go on with the operator's own.
 
 The tool shows the admittance in series with the servos below it. Against a stiff body the loop closes through QP and
-servos with their delay: with the defaults a simulated arm leans quietly on 10 kN/m, and on 30 kN/m with twice the
-damping ratio or four times the mass. A load that the model does not know counts as a push downwards.
+servos with their delay. With the defaults a simulated arm leans quietly on 10 kN/m. On 30 kN/m it does so with twice
+the damping ratio or four times the mass. A load that the model does not know counts as a push downwards.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class ArmCompliance:
 
 @dataclass(frozen=True, slots=True)
 class AdmittanceReport:
-    """What the admittance did in one tick."""
+    """The admittance's result of one tick."""
 
     arms: dict[str, ArmCompliance]
     rejected: bool  # the measurement or dt was not finite: the last good wrench is held

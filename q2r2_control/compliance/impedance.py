@@ -5,9 +5,9 @@
 e is the way from the measured tool to that of the reference, e' the difference of their twists, D and D_n the damping
 of :func:`inertia_and_damping`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
 
-**Feed-forward M a_r.** Seen from the tool an arm weighs what its rotors weigh geared up, 20 to 140 kg for a robot of
-22 kg. Without feed-forward the spring would have to yield for every acceleration, 30 mm at 1 m/s^2; with it the spring
-bears only what the model does not know, and may be soft. A push at rest feels none of it.
+**Feed-forward M a_r.** Seen from the tool an arm weighs what its rotors weigh geared up, 20 to 140 kg for a robot of 22
+kg. Without feed-forward the spring would have to yield for every acceleration, 30 mm at 1 m/s^2. With it the spring
+bears only the errors of the model, and may be soft. A push at rest feels none of it.
 
 **Torque rate.** A full stop at 10 rad/s^2 takes 70 Nm more in a joint that moves the whole arm. As long as the torque
 rises to that the tool leaves the reference, and with it the distances that the reference keeps.
@@ -15,8 +15,8 @@ rises to that the tool leaves the reference, and with it the distances that the 
 **Payload.** A held object is part of M, C and g. Its mass comes and goes on a straight line over 0.3 s, so that no
 torque jumps.
 
-**Time.** A reference is due at the end of its tick, the state is measured at its start. So the spring is about the
-reference of the tick before, which is due now, while the acceleration is the one that leads to the newest.
+**Time.** A reference is due at the end of its tick, the state is measured at its start. The spring is therefore about
+the reference of the tick before, which is due now. The acceleration is the one that leads to the newest.
 """
 
 from __future__ import annotations
@@ -166,15 +166,15 @@ class ImpedanceController:
         self._ramping = True
 
     def in_force(self, arm: str) -> dict[str, float]:
-        """What of ``LIVE_IMPEDANCE`` an arm goes by now."""
+        """The part of ``LIVE_IMPEDANCE`` an arm goes by now."""
         return dict(zip(LIVE_IMPEDANCE, self._springs[self._arms.index(arm)].tolist(), strict=True))
 
     def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:
         """Torques for a tick of ``dt`` [s] that begins at ``state`` and ends when ``reference`` is due.
 
         ``extra`` (nv,) [Nm] is added before saturation. A reference that is not finite is not used: the last one is
-        held. Where the state, or what comes of it, is not finite, the last gravity torque is held, since a spring
-        about an unknown posture could push anywhere. A dt that is not in (0, 0.1] s counts as 0 or as 0.1 s.
+        held. The last gravity torque is held where the state, or a result of it, is not finite. A spring about an
+        unknown posture could push anywhere. A dt that is not in (0, 0.1] s counts as 0 or as 0.1 s.
         """
         time = min(float(dt), LONGEST_DT) if dt > 0.0 else 0.0
         if self._ramping:

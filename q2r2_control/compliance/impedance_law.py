@@ -84,7 +84,7 @@ def consistent_force(inertia: Array, J: Array, M_inverse: Array, torque: Array) 
 
 
 class ImpedanceModel(NamedTuple):
-    """What does not change between ticks."""
+    """Data that do not change between ticks."""
 
     chain: Chain
     tools: Tools  # of k arms
@@ -212,9 +212,9 @@ def _update_tools(model: ImpedanceModel, data: ImpedanceData, q: Array) -> None:
 def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array) -> Array:
     """Torque (nv,) [Nm] away from position limits, of a spring that begins some way before each.
 
-    Where ``wanted`` (nv,), the reference, lies nearer to the limit, the spring begins there: the reference keeps the
-    limits by itself, and what holds a joint off its reference would hold the tool off its target. The damping grows
-    from 0 over that way, so that the torque does not jump, and it only brakes, it never pulls.
+    Where ``wanted`` (nv,), the reference, lies nearer to the limit, the spring begins there. The reference keeps the
+    limits by itself, and a spring that holds a joint off its reference would hold the tool off its target. The damping
+    grows from 0 over that way, so that the torque does not jump, and it only brakes, it never pulls.
     """
     reach, share = limits.distance, limits.damping / limits.distance
     below = np.maximum(np.minimum(limits.lower + reach, wanted) - q, 0.0)

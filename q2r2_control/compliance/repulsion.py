@@ -8,28 +8,28 @@ that is pushed away from it meets this wall.
 
     F = min(k x, F_max) - c(x) d',    clipped to [0, F_max],    tau += (dd/dq)' F,
 
-d' the rate of distance, c the damping of ratio xi at the pair's effective mass m = 1 / (g' M^-1 g), g = dd/dq
-(Khatib, IJRR 1987), rising from 0 to its value in the first two millimetres. So the torque is continuous in q and v,
-never pulls two bodies together, and its elastic part is the gradient of  U = sum k x^2 / 2:  the wall gives back at
-most what was put in. Distances are those of pair_distance.py, so that bodies that lie along each other do not make
-the torque switch from end to end.
+d' the rate of distance, c the damping of ratio xi at the pair's effective mass m = 1 / (g' M^-1 g), g = dd/dq (Khatib,
+IJRR 1987), rising from 0 to its value in the first two millimetres. The torque is continuous in q and v and never pulls
+two bodies together. Its elastic part is the gradient of  U = sum k x^2 / 2:  the wall gives back at most what was put
+in. Distances are those of pair_distance.py, so that bodies that lie along each other do not make the torque switch from
+end to end.
 
 **Why many pairs do not add up to an unstable stiffness.** All pairs act through the same joints. With K = sum k g g'
 and D = sum c g g' the fastest mode of M^-1 K is no faster than the trace, sum k / m, and that of M^-1 D no faster than
-sum c / m. Held over a period h, a mode with stiffness w^2 and damping 2 z is stable exactly when
-h w^2 / 2 < 2 z < 2 / h  (Colgate and Schenkel, 1997, for the lower bound). With T = 2 ms, the longest period, the
-stiffness of all pairs is scaled down together where sum k / m would exceed 0.25 / T^2, and the damping where
-sum c / m would exceed 0.5 / T, a quarter of what is stable: enough for one period of delay and for masses wrong by a
-factor of two. Then c > h k / 2 for every pair while no more than 16 are scaled down together, but for the first
-hundredths of a millimetre, where c is still rising. A pair's share in the sums fades in over two millimetres outside
-the shell, so that the scale does not jump. It only makes the wall softer; where it acts (never for two iiwa 7 with the
-default stiffness) the torque is the gradient of U but for the scale's own slope.
+sum c / m. Held over a period h, a mode with stiffness w^2 and damping 2 z is stable exactly when h w^2 / 2 < 2 z < 2 /
+h  (Colgate and Schenkel, 1997, for the lower bound). With T = 2 ms, the longest period, the stiffness of all pairs is
+scaled down together where sum k / m would exceed 0.25 / T^2. The damping is too where sum c / m would exceed 0.5 / T.
+These are a quarter of the stable bounds, enough for one period of delay and for masses wrong by a factor of two. Then c
+> h k / 2 for every pair while no more than 16 are scaled down together, but for the first hundredths of a millimetre,
+where c is still rising. A pair's share in the sums fades in over two millimetres outside the shell, so that the scale
+does not jump. It only makes the wall softer. Where it acts (never for two iiwa 7 with the default stiffness) the torque
+is the gradient of U but for the scale's own slope.
 
-**What it can take.** d_min is the distance that a pair keeps. At rest a force of k d_min or F_max, whichever is less.
-In motion it takes up at most the energy F_max d_min for each pair, beside what the joints take; bodies that meet with
-more than that are slowed down, but touch. So fingers that may come within a millimetre touch at a push of 10 N.
+**The greatest load.** d_min is the distance that a pair keeps. At rest a force of k d_min or F_max, whichever is less.
+In motion it takes up at most the energy F_max d_min for each pair, beside the joints' share. Bodies that meet with more
+than that are slowed down, but touch. Fingers that may come within a millimetre therefore touch at a push of 10 N.
 
-**Fingers** are the same bodies as in the controller, at the openings that it has accepted: a wall around all of their
+**Fingers** are the same bodies as in the controller, at the openings that it has accepted. A wall around all of their
 way would push the arms out of postures that the reference may take. A body that has grown meets no pair at the
 reference; elsewhere its push comes at the rate of torques that the impedance allows.
 """
@@ -70,7 +70,7 @@ _SOFT = 0.5
 
 
 class RepulsionModel(NamedTuple):
-    """What does not change between ticks."""
+    """Data that do not change between ticks."""
 
     collision: CollisionModel
     smoothing: Array  # (p,) [m^2]

@@ -1,4 +1,4 @@
-"""What the YAML says of robots and arms: models, mounts, tools, grippers, home postures."""
+"""Settings of robots and arms: models, mounts, tools, grippers, home postures."""
 
 from __future__ import annotations
 

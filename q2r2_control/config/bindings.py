@@ -1,4 +1,4 @@
-"""What each control of a hand does: one thing for each gesture, or nothing."""
+"""Actions of a hand's controls: one for each gesture, or nothing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from q2r2_control.types import QUEST_CONTROLS, DeviceControls
 
 
 class Action(StrEnum):
-    """What a hand can do with its controls: see ``MEANINGS``."""
+    """Actions of a hand's controls: see ``MEANINGS``."""
 
     NONE = "none"
     # Once, when a control was tapped, or held for a while.
@@ -49,7 +49,7 @@ class Gesture(StrEnum):
     HOLD = "hold"
 
 
-# What an operator reads of each action.
+# Texts of each action for the operator.
 MEANINGS: dict[str, str] = {
     Action.PAUSE_TOGGLE: "engages the arm where it is, or pauses it",
     Action.GRIPPER_TOGGLE: "closes the gripper, or opens it",
@@ -201,7 +201,7 @@ class BindingSettings(StrictModel):
         return words | {"lower and upper together": "the headset's alignment: stops both arms until they are let go"}
 
     def action_of(self, control: str, gesture: Gesture) -> Action:
-        """What a gesture of a control does; its beginning does nothing by itself."""
+        """The action of a control's gesture; its beginning does nothing by itself."""
         if gesture is Gesture.DOWN:
             return Action.NONE
         key = control + _SUFFIXES[gesture]

@@ -82,7 +82,7 @@ class HeadsetConfig(StrictModel):
 
     @property
     def networks(self) -> tuple[Network, ...] | None:
-        """What ``allow`` names."""
+        """The networks that ``allow`` names."""
         return None if self.allow is None else tuple(map(network_of, self.allow))
 
 

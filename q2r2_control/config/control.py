@@ -23,9 +23,9 @@ LinkPattern = Annotated[str, Field(min_length=1)]
 class DistanceSettings(StrictModel):
     """How far pairs of bodies stay apart, by what they are; left out: ``min_distance``.
 
-    A finger is what a gripper's joints move, a tool what carries it (the hand), an obstacle what stands in the cell,
-    its floor included, an object what ``gripper.object`` describes, while it is held. ``arm_self`` is all of one arm
-    against itself and against the robot that it is a part of, its own object included; the other classes without
+    A gripper's joints move a finger, and a tool (the hand) carries it. An obstacle stands in the cell, and the floor is
+    one. An object is the body that ``gripper.object`` describes, while it is held. ``arm_self`` is all of one arm
+    against itself and against the robot that it is a part of, its own object included. The other classes without
     obstacles are about different arms.
     """
 

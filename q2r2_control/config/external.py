@@ -42,7 +42,7 @@ class ControllerKind(StrEnum):
 
 
 class GripperType(StrEnum):
-    """What a gripper is driven by."""
+    """The drive of a gripper."""
 
     GRIPPER_COMMAND = "GripperCommand"
     PARALLEL_GRIPPER_COMMAND = "ParallelGripperCommand"
@@ -179,7 +179,7 @@ def check_external(kind: ControllerKind, external: ExternalConfig | None, arms: 
 
 
 def describe(external: ExternalConfig) -> dict[str, str]:
-    """What is driven and how, one line an arm."""
+    """The driven arms and their drives, one line an arm."""
     preset = external.terms
     source = "what the built-in controller makes of the hand's target" if external.filtered else "the hand's target"
     lines: dict[str, str] = {}

@@ -15,7 +15,7 @@ POSE = "geometry_msgs/msg/PoseStamped"
 
 
 class Hold(StrEnum):
-    """What goes to a controller while its arm is paused and its target stands still."""
+    """Messages to a controller while its arm is paused and its target stands still."""
 
     REPEAT = "repeat"  # the last target, stamped anew
     SILENCE = "silence"  # nothing: it holds by itself, and a stale target is its own reason to stop
@@ -112,7 +112,7 @@ PRESETS = {preset.name: preset for preset in _ALL}
 
 
 class Mode(StrEnum):
-    """What an external controller follows."""
+    """The kind of target that an external controller follows."""
 
     RAW = "raw"  # the hand's target itself
     FILTERED = "filtered"  # what the built-in controller makes of it: within limits and free of collisions

@@ -17,8 +17,8 @@ Radians = Annotated[float, Field(ge=0, le=3.15)]
 class JudgeSettings(StrictModel):
     """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. None: that number is not judged.
 
-    Shares are of the time for which an arm is engaged, unless said otherwise, so that no threshold is a matter of how
-    long an episode is. The numbers are those of ``q2r2_control.judging``.
+    Shares are of the time for which an arm is engaged, unless said otherwise. No threshold then depends on an episode's
+    length. The numbers are those of ``q2r2_control.judging``.
     """
 
     min_pose_rate: Annotated[float, Field(ge=0, le=1000)] | None = Field(

@@ -1,4 +1,4 @@
-"""What all settings have in common."""
+"""The base of all settings."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def network_of(text: str) -> Network:
     raise ValueError(f"{text!r} is an address within a network: write {meant}, or {text.split('/')[0]} alone")
 
 
-# Eleven periods of a 75 Hz headset, so that a few lost or late messages on a wireless link do not stop the arms; short
-# enough that a tool at the default 0.5 m/s moves no more than 75 mm before it begins to brake. It holds for hand data,
-# tool poses, targets and acknowledgements of commands.
+# Eleven periods of a 75 Hz headset, so that a few lost or late messages on a wireless link do not stop the arms. It is
+# short enough that a tool at the default 0.5 m/s moves no more than 75 mm before it begins to brake. It holds for hand
+# data, tool poses, targets and acknowledgements of commands.
 STREAM_TIMEOUT = 0.15  # [s]

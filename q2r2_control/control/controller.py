@@ -33,15 +33,15 @@ _NUMBER = (float, int, np.floating)
 class CartesianController:
     """QP differential inverse kinematics for all arms of a cell at once, with a certified stop at every tick.
 
-    The contract, for every sequence of targets and every dt in (0, 0.1] s: finite numbers, no exception; joint
-    position, velocity and acceleration limits; every monitored pair at the distance that it keeps (``min_distance``,
-    or what ``distances`` and ``pairs`` say), also between ticks and during a stop; rest under a constant target. The
-    reference is the controller's own state: it follows the targets, not the plant's measurement, so that noise never
-    enters it.
+    The contract, for every sequence of targets and every dt in (0, 0.1] s, is this. Numbers are finite, and no
+    exception is raised. Joints keep their position, velocity and acceleration limits. Every monitored pair keeps its
+    distance (``min_distance``, or that of ``distances`` and ``pairs``), also between ticks and during a stop. A
+    constant target ends in rest. The reference is the controller's own state: it follows the targets, not the plant's
+    measurement, so that noise never enters it.
 
-    One tick is three calls: :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost, a
-    solver solves it where that is not the solution, :func:`move_reference` takes of the solution what can be certified
-    and moves the reference. A ``solver`` that is given in place of DAQP is asked at every tick.
+    One tick is three calls. :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost. A
+    solver solves it where that is not the solution. :func:`move_reference` takes the part of the solution that can be
+    certified, and moves the reference. A ``solver`` that is given in place of DAQP is asked at every tick.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class CartesianController:
 
     @property
     def settings(self) -> ControllerSettings:
-        """What was asked for, by :meth:`change` or at first."""
+        """The settings that were asked for, by :meth:`change` or at first."""
         return self._live.settings
 
     def change(self, values: Mapping[str, Any]) -> str | None:
@@ -97,7 +97,9 @@ class CartesianController:
 
     @property
     def kept_distances(self) -> Array:
-        """What every monitored pair keeps now (p,) [m]; another array, not a changed one, when that changes."""
+        """The distance that every monitored pair keeps now (p,) [m]; another array, not a changed one, when that
+        changes.
+        """
         return self._live.kept
 
     @property
@@ -196,7 +198,7 @@ class CartesianController:
 
         Its fingers count as what they sweep between these, from the next step on; at first, and after :meth:`reset`,
         they are all of their way. Bodies within what they were are always accepted. Others are if every pair keeps its
-        distance with them, at the reference and on a certified stop from there; else nothing changes, and the pair in
+        distance with them, at the reference and on a certified stop from there. Else nothing changes, and the pair in
         the way is returned. A gripper may be commanded to what was accepted only.
 
         Raises :class:`RobotError` for a name that is no arm's and for numbers that are no interval.
@@ -220,8 +222,8 @@ class CartesianController:
         """Say that the gripper of ``arm`` holds its object from the next step on, or, as after :meth:`reset`, does not.
 
         The object then is part of the tool. Each of its pairs begins with the distance that there is and keeps more as
-        it gets more, until it keeps its own (:attr:`object_distances`): so it is always accepted, and nothing moves for
-        it. Raises :class:`RobotError` for an arm that has no object.
+        it gets more, until it keeps its own (:attr:`object_distances`). The object is therefore always accepted, and
+        nothing moves for it. Raises :class:`RobotError` for an arm that has no object.
         """
         if not self._objects.set_holding(arm, holds):
             return
@@ -237,7 +239,9 @@ class CartesianController:
 
     @property
     def object_distances(self) -> Array:
-        """What every pair of ``Robot.objects`` keeps now (pairs,) [m]; minus infinity while it does not count."""
+        """The distance that every pair of ``Robot.objects`` keeps now (pairs,) [m]; minus infinity while it does not
+        count.
+        """
         return self._objects.kept.copy()
 
     def _observe_again(self, grown: IntArray) -> int:

@@ -1,8 +1,8 @@
 """Compile the hot path with Numba and keep the machine code between runs.
 
-Numba's own cache looks only at the file of the compiled function, so a kernel that calls another module's kernel
-would go on running that module's old code after an edit. So the cache folder is named by a hash of every source file
-of this package that machine code is made from, and any edit of one compiles afresh.
+Numba's own cache looks only at the file of the compiled function. A kernel that calls another module's kernel would go
+on running that module's old code after an edit. The cache folder is therefore named by a hash of every source file of
+this package that machine code is made from. Any edit of one compiles afresh.
 """
 
 from __future__ import annotations

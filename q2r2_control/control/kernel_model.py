@@ -1,4 +1,4 @@
-"""What the compiled kernels need to know of a robot and its settings, gathered once."""
+"""The data of a robot and its settings for the compiled kernels, gathered once."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DEEPEST = 0.8
 
 
 class KernelModel(NamedTuple):
-    """What does not change in a tick, by the rooms that read it."""
+    """Data that do not change in a tick, by the rooms that read it."""
 
     safety: SafetyModel
     tasks: TaskModel
@@ -92,7 +92,7 @@ def stop_buffer(min_distance: Array, settings: ControllerSettings) -> Array:
 
 
 class KernelData(NamedTuple):
-    """What changes from tick to tick, by the rooms that write it."""
+    """Data that change from tick to tick, by the rooms that write it."""
 
     safety: SafetyData
     tasks: TaskData

@@ -1,21 +1,21 @@
-"""What counts while a controller runs: distances that pairs keep, objects that are held, and gains.
+"""Settings in force while a controller runs: distances that pairs keep, objects that are held, and gains.
 
-**Distances.** A greater one makes a state uncertified that was certified. So a pair keeps more only as far as the stop
-at hand is proven with it: never more than  d - S - buffer,  with the pair's distance d at the reference and the bound S
-of how much closer the stop brings it (stop_certificate.py). What a pair keeps
+**Distances.** A greater one makes a state uncertified that was certified. A pair therefore keeps more only as far as
+the stop at hand is proven with it. That is never more than  d - S - buffer,  with the pair's distance d at the
+reference and the bound S of how much closer the stop brings it (stop_certificate.py). The kept distance of a pair
 
 - falls at once, when less is asked for: what was proven stays proven;
-- grows at ``GROWTH`` towards what is asked for, and no farther than that bound, before a step is decided on. So the
-  step is proven with the greater distance, and the invariant of safety/README.md holds at every tick;
+- grows at ``GROWTH`` towards what is asked for, and no farther than that bound, before a step is decided on. The step
+  is then proven with the greater distance, and the invariant of safety/README.md holds at every tick;
 - never falls while it grows. A pair that is nearer than asked for is not pushed apart.
 
-After a reset pairs keep at once what the posture leaves them, and what the controller was made with in any case: out of
-a start nearer than that it recovers.
+After a reset pairs keep at once what the posture leaves them, and the controller's first settings in any case. Out of a
+start nearer than that it recovers.
 
 **Held objects.** A pair that does not count keeps minus infinity. One that appears keeps d - S - buffer, or its own
-distance where that is less: so the stop at hand is proven with the object too, and it never has to be refused. It grows
-to the same value for the d and S of later, and never falls. Two objects that overlap when the second one is gripped are
-one that both hands hold, and not watched against each other until one lets go.
+distance where that is less. The stop at hand is then proven with the object too, and it never has to be refused. It
+grows to the same value for the d and S of later, and never falls. Two objects that overlap when the second one is
+gripped are one that both hands hold, and not watched against each other until one lets go.
 
 **Gains** and weights go to their new values on a straight line: all arrays in the tasks' models that other settings
 make different. The certificate reads none of them.
@@ -119,7 +119,7 @@ class ObjectPairs:
 
 
 class LiveSettings:
-    """What of one controller's settings is in force, on its way to what was asked for."""
+    """The settings of one controller that are in force, on their way to the ones that were asked for."""
 
     def __init__(
         self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData, objects: ObjectPairs

@@ -4,7 +4,7 @@
     subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
 
 The box is never empty (joint_limits.py) and the rows are soft, so a solution always exists. Rows have unit norm, so
-that a slack is a joint speed. H^-1 along a row is what the cost yields to it: a row alone gives way by the part
+that a slack is a joint speed. H^-1 along a row is the cost's compliance to it. A row alone gives way by the part
 SOFTNESS of what it corrects, however strong the cost. Where the cost's own minimum keeps box and rows it is the
 solution, and no solver has to be asked.
 """
@@ -46,7 +46,7 @@ class QpProblem:
 
 @dataclass(slots=True)
 class QpSolution:
-    """What a solver found."""
+    """The answer of a solver."""
 
     v: Array | None  # (nv,) [rad/s]; None: no solution
     solve_time: float  # the solver's own measure, 0 where none was asked [s]

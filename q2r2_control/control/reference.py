@@ -14,8 +14,8 @@ from q2r2_control.control.safety.speed_bound import update_body_velocities
 from q2r2_control.control.tasks.frame import tool_pose
 from q2r2_control.types import Array
 
-# The closest pair and its distance, and the pair with the least margin and that, which is its distance less what it
-# keeps [m]; both infinite if there is no pair.
+# The closest pair and its distance, and the pair with the least margin and that margin, its distance less the kept one
+# [m]. Both are infinite if there is no pair.
 Observed = tuple[int, float, int, float]
 
 

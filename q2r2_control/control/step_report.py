@@ -1,4 +1,4 @@
-"""What a step says of itself: what became of it, and the names of what held it back."""
+"""The report of a step: its outcome, and the names of the limits that held it back."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class LimitNames:
 
 @dataclass(slots=True)
 class StepSummary:
-    """What the substeps of one tick add up to."""
+    """The sum of the substeps of one tick."""
 
     fallback: bool = False
     targets_usable: bool = True  # all of them

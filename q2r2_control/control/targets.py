@@ -1,4 +1,4 @@
-"""What each arm is asked to do: checked targets, their own velocity, and what a held arm holds."""
+"""The task of each arm: checked targets, their own velocity, and the pose of a held arm."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class TargetTracker:
 def update_targets(targets: TaskTargets, q: Array, v: Array, dt: float) -> bool:
     """Make what was offered each arm's target, or hold it where there is nothing usable; False if something was not.
 
-    What is no pose is marked so in ``targets.offered``.
+    A target that is no pose is marked so in ``targets.offered``.
     """
     all_usable = True
     for i in range(targets.offered.shape[0]):

@@ -48,10 +48,10 @@ class Drive(ABC):
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
     ) -> Command:
-        """What goes to the plant in a tick of ``dt`` [s]; never raises because of a number.
+        """The command to the plant in a tick of ``dt`` [s]; never raises because of a number.
 
         ``trusted`` is False where ``state`` is out of date or not to be believed, and for the last command before there
-        are no more: what pushes according to the state must not push then.
+        are no more. Terms that push according to the state must not push then.
         """
 
     def set_openings(self, openings: Mapping[str, Interval]) -> None:  # noqa: B027
@@ -72,12 +72,12 @@ class Drive(ABC):
         return True
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        """What holds the arms when no more commands come; None: the last one does."""
+        """The command that holds the arms when no more commands come; None: the last one does."""
         return None
 
 
 def permitted(settings: ControllerSettings, drive: Drive) -> ControllerSettings:
-    """What of the controller's settings a drive permits: only where arms yield may bodies touch."""
+    """The controller's settings as far as a drive permits them: only where arms yield may bodies touch."""
     return settings if drive.yields else settings.without_contact()
 
 

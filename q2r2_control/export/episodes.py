@@ -30,7 +30,7 @@ _FORMAT = 5  # of kept episodes; those of another one are made again
 
 @dataclass(frozen=True)
 class FrameSampling:
-    """What becomes frames, and how many."""
+    """Which ticks become frames, and how many."""
 
     fps: int = 30
     trim: bool = False  # to the time in which arms are engaged or moving
@@ -146,7 +146,7 @@ def keep_episodes(
 
 
 def _results(jobs: Sequence[_Job], workers: int) -> Generator[str | None]:
-    """What :func:`_keep` returns of each job, in their order."""
+    """The results that :func:`_keep` returns of each job, in their order."""
     if workers <= 1:
         yield from map(_keep, jobs)
         return

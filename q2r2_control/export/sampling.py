@@ -1,8 +1,8 @@
 """Frames at a fixed rate out of the ticks of a recording, and the features that a dataset has of them.
 
 Frame k is at t_k = t_0 + k / fps, to the nanosecond, where t_0 is the time of the first tick. Observations are of the
-newest tick at or before t_k, commands of the first tick at or after it: an observation never knows the future, and a
-command was decided on no earlier than what was observed.
+newest tick at or before t_k, commands of the first tick at or after it. An observation never knows the future, and a
+command was decided on no earlier than the observation.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ _OLDEST = 2  # periods of the camera: one picture may be lost
 
 
 def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan = WHOLE) -> dict[str, Array]:
-    """What is observed and commanded at each of n frames of the ``span``, whose first tick gives t_0.
+    """The observations and commands at each of n frames of the ``span``, whose first tick gives t_0.
 
     Measured are ``position``, ``velocity``, ``effort`` (n, joints) [rad, rad/s, Nm] and ``opening`` (n, arms), 0 closed
-    .. 1 open, -inf: not measured. Commanded are ``reference`` (n, joints), ``gripper`` (n, arms), and as poses x y z qx
-    qy qz qw in the world (n, arms, 7) ``reference_tool`` and the operator's ``target``, or else that tool. ``time``
+    .. 1 open, -inf: not measured. Commanded are ``reference`` (n, joints) and ``gripper`` (n, arms). ``reference_tool``
+    and the operator's ``target``, or else that tool, are poses x y z qx qy qz qw in the world (n, arms, 7). ``time``
     (n,) [s] is since t_0, ``stamp`` (n,) the time of day [ns]. ``trim``: from the first to the last tick at which an
     arm is engaged or the reference moves. Raises :class:`RecordingError` for a damaged file, one without a tick to
     take, and one in which ticks were lost for longer than a frame.

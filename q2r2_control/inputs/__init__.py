@@ -1,7 +1,7 @@
 """Where hand samples come from. To add an input, implement ``Input`` of ``base``.
 
 ``scripted`` plays hand motions, those that pick things up from ``assembly``; ``played`` makes samples of them.
-``headset`` is the TCP server for the Quest2ROS app: ``messages`` and ``session`` are its protocol without sockets,
-``listener`` takes connections in and says who may drive, ``connections`` serves them, ``moved_frame`` and ``samples``
-find poses that must not be followed and queue the others, ``headset_check`` tells people what comes.
+``headset`` is the TCP server for the Quest2ROS app. ``messages`` and ``session`` are its protocol without sockets.
+``listener`` takes connections in and says who may drive, and ``connections`` serves them. ``moved_frame`` and
+``samples`` find poses that must not be followed and queue the others. ``headset_check`` tells people which data come.
 """

@@ -53,7 +53,7 @@ _LEFT_HOME, _RIGHT_HOME = (*HOME["left"], 0.0, 0.0), (*HOME["right"], 0.0, 0.0)
 
 @dataclass(frozen=True)
 class HandWork:
-    """What both hands do, from and to home."""
+    """The motion of both hands, from and to home."""
 
     duration: float  # [s]
     tools: Mapping[str, tuple[WayPoint, ...]]  # after home, at rising times since the start; a hand without any rests
@@ -131,7 +131,7 @@ STACK = HandWork(
 )
 
 # The hands hold the bar, which lies along y, from both sides, tilted so that their wrists are farther apart than the
-# fingers; straight down, wrists would keep 60 mm more between the tools than the bar leaves.
+# fingers. Straight down, wrists would keep 60 mm more between the tools than the bar leaves.
 _TILT, _TURN = 0.4, 0.5 * math.pi
 _BAR_LOW = 0.2193  # the lower corners of the tilted tips 3 mm above the table
 _OFF = 0.045  # of each tool from the bar's middle, along it

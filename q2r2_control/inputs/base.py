@@ -32,7 +32,7 @@ class Input(Protocol):
         """Samples that came in since the last poll, oldest first; empty when there are none.
 
         ``now`` [s] is on the clock of the samples' stamps. Never waits, and never raises because of what was received.
-        What it has returned stays as it is: others keep it for some ticks.
+        The returned samples stay as they are: others keep it for some ticks.
         """
 
     def send_haptic(self, feedback: HapticFeedback) -> None:

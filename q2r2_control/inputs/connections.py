@@ -63,7 +63,7 @@ class Client(Peer):
 
 @dataclass(frozen=True, slots=True)
 class Handlers:
-    """What is called in the server's thread."""
+    """Methods that the server's thread calls."""
 
     admitted: Callable[[Client], None]  # a client drives from now on
     lost: Callable[[str], None]  # the driver is gone, for a reason
@@ -97,8 +97,8 @@ class Connections:
 
     def serve(self) -> None:
         """Wait for the network once, ``TURN`` at most, and handle what there is."""
-        # What was sent before this time is read before anybody is judged by it, so that no client is taken for silent
-        # because this thread, or the whole process, stood still.
+        # Data sent before this time are read before anybody is judged by it. No client is then taken for silent because
+        # this thread, or the whole process, stood still.
         asked = self._clock()
         self._watch_door(asked)
         # A connection ends in its own event or behind this loop, so that none of these events is of one that has ended.

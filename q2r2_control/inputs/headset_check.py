@@ -1,4 +1,4 @@
-"""What a headset sends, and advice when no data comes."""
+"""A check of the headset's data, and advice when no data comes."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def watch_headset(
 
 
 def needed_topics(config: Config) -> tuple[str, ...]:
-    """What a run needs: poses and inputs, which have the button that engages, of each hand that leads an arm."""
+    """The needs of a run: poses and inputs, which have the button that engages, of each hand that leads an arm."""
     same_side = config.teleop.stance is Stance.SIDE_BY_SIDE
     hands = {hand for hand in SIDES for arm in config.arms if (hand == arm) is same_side}
     needed = (MessageType.POSE, MessageType.INPUTS)
@@ -129,7 +129,7 @@ def needed_topics(config: Config) -> tuple[str, ...]:
 
 
 def advice_on_some(silent: tuple[str, ...]) -> tuple[str, ...]:
-    """What is missing where other topics come, a line a hand."""
+    """Missing topics where others come, a line a hand."""
     lines = []
     for hand in SIDES:
         kinds = {HAND_TOPICS[name].kind: name for name in silent if HAND_TOPICS[name].hand == hand}
@@ -143,7 +143,7 @@ def advice_on_some(silent: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def advice(statistics: HeadsetStatistics) -> tuple[str, ...]:
-    """What to check when no data comes, the most likely cause first."""
+    """Things to check when no data comes, the most likely cause first."""
     host, port = statistics.address
     lines = [f"nothing arrives for {SILENCE:g} s on {written(host, port)}"]
     if statistics.peer is not None:

@@ -88,8 +88,8 @@ class HostLog:
         self._logger.log(level, "%s", text)  # the text is no format: it may quote what a client sent
 
 
-# Taking a connection costs the interpreter, and so the control loop, some 0.1 ms. Who waits in the kernel's queue of
-# 128 is taken within 0.35 s; when that is full, the kernel drops what comes, and the client tries again after 1 s.
+# Taking a connection costs the interpreter, and so the control loop, some 0.1 ms. A client in the kernel's queue of 128
+# is taken within 0.35 s. When that is full, the kernel drops new ones, and the client tries again after 1 s.
 ACCEPTS, ACCEPTS_PERIOD = 20, 0.05  # [s]
 ANSWERS_PER_SECOND = 10  # to one host; the app connects once a second
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with a reset, which leaves nothing behind in the kernel
@@ -148,12 +148,12 @@ def written(host: str, port: int) -> str:
 
 
 def app_settings(host: str, port: int) -> str:
-    """What to enter in the app, for a server that listens on ``host``."""
+    """The app's settings, for a server that listens on ``host``."""
     return f"address {_reachable(host)}, port {port}, protocol ROS2"
 
 
 def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple[str, ...]:
-    """What to enter in the app, and who can drive now, for a server that listens on ``host``."""
+    """The app's settings, and who can drive now, for a server that listens on ``host``."""
     if host in ONLY_THIS_MACHINE:
         return (f"{host} can be reached from this machine only; --host 0.0.0.0 admits the network",)
     if allow is None:
@@ -183,7 +183,8 @@ def _reachable(host: str) -> str:
 
 
 # Rules 1 to 4 are those of docs/headset.md, "Who drives". A quiet driver gives way only to its own peer, after 37
-# periods of the app's poses, three times as long as what pauses the arms: a silently lost link looks alive for seconds.
+# periods of the app's poses, three times as long as the time that pauses the arms. A silently lost link looks alive for
+# seconds.
 QUIET_ALLOWED = 0.5  # without a frame, against the same peer on a new connection [s]
 POSES_ALLOWED = 5.0  # without a hand pose, against a client that sends them [s]
 WAIT_ALLOWED = 2.0  # for a newcomer to show what gives it the place [s]
@@ -191,7 +192,7 @@ WAIT_ALLOWED = 2.0  # for a newcomer to show what gives it the place [s]
 
 @dataclass
 class Peer:
-    """What is known of a connected client."""
+    """The known facts about a connected client."""
 
     peer: str  # address and port, for people
     host: str  # address
@@ -208,7 +209,7 @@ class Admission(Enum):
 
 
 def decide(driver: Peer | None, newcomer: Peer, now: float) -> tuple[Admission, str]:
-    """What becomes of ``newcomer`` at ``now`` [s] by rules 2 to 4, and why it, or the ``driver``, gets no place."""
+    """The admission of ``newcomer`` at ``now`` [s] by rules 2 to 4, and why it, or the ``driver``, gets no place."""
     if driver is None:
         return Admission.ADMIT, ""
     if now - driver.last_pose > POSES_ALLOWED:

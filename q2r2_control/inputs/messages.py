@@ -1,8 +1,9 @@
-"""What the Quest2ROS app sends and is sent: frames of ROS-TCP-Connector 0.7, and the messages in them. No sockets.
+"""The data of the Quest2ROS app in both directions: frames of ROS-TCP-Connector 0.7, and the messages in them. No
+sockets.
 
 A frame is ``u32 n | n bytes destination | u32 m | m bytes payload``, little-endian, in both directions (public source
 of Unity ROS-TCP-Connector 0.7.0). Messages are (de)serialised by rosbags and checked more strictly than it does, which
-distinguishes the dialects: read with the wrong one, a pose is noise and a button stays pressed.
+distinguishes the dialects. Read with the wrong one, a pose is noise and a button stays pressed.
 """
 
 from __future__ import annotations
@@ -201,8 +202,8 @@ class FrameDecoder:
     def next_frame(self) -> WireFrame | None:
         """The next whole frame, or None until more bytes come.
 
-        Raises :class:`ProtocolError` for a frame above ``MAX_FRAME_BYTES``, as soon as its length fields say so, for a
-        destination that is not UTF-8, and for payload without a destination.
+        Raises :class:`ProtocolError` for a frame above ``MAX_FRAME_BYTES``, as soon as its length fields say so. Raises
+        it too for a destination that is not UTF-8, and for payload without a destination.
         """
         name_size = self._length_at(0)
         if name_size is None:

@@ -167,7 +167,7 @@ class MovedFrame:
 
 
 class _Way:
-    """What one hand did of late."""
+    """The recent motion of one hand."""
 
     place: Place  # after the first one was added
 

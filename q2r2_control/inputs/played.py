@@ -28,7 +28,7 @@ class SampleTiming(ABC):
         """Times [s] of all samples, from 0 on without end."""
 
     def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
-        """What is measured of a hand that is at ``pose`` at ``t`` [s]."""
+        """The measurement of a hand that is at ``pose`` at ``t`` [s]."""
         return pose
 
     def lateness(self) -> float:
@@ -53,7 +53,7 @@ class HeadsetSampling(SampleTiming):
     """A headset's samples, all from ``seed``: uneven at 72-76 Hz, received late, with sensor noise.
 
     ``position_noise`` is the noise's standard deviation along each axis [m]. ``tremor`` adds that of a human hand, 8-12
-    Hz with about 1 mm and 0.3 degrees; ``dropout_probability`` is that of every sample to be lost, with up to 4 more.
+    Hz with about 1 mm and 0.3 degrees. ``dropout_probability`` is that of every sample to be lost, with up to 4 more.
     """
 
     def __init__(

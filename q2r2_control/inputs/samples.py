@@ -40,7 +40,7 @@ class SampleQueue:
     """Bounded queue between two threads that keeps the newest samples, and shows a cut.
 
     After :meth:`cut` the next two takes are empty, and :attr:`is_cut` is true until the second. A loop that checks once
-    a tick, before or after it takes, cannot miss a connection that was lost and made again: it never reads two clients'
+    a tick, before or after it takes, cannot miss a connection that was lost and made again. It never reads two clients'
     poses as one motion.
     """
 
@@ -106,7 +106,7 @@ class HandsWatch:
         self._waiting: list[Watched] = []
 
     def receive(self, reception: Reception, now: float) -> list[Watched]:
-        """What to hand on after ``reception`` came at ``now`` [s], in this order."""
+        """The samples to hand on after ``reception`` came at ``now`` [s], in this order."""
         hand, message = reception.hand, reception.message
         if isinstance(message, HandInputs) and self._frame is not None:
             self._frame.take_inputs(hand, message, now)

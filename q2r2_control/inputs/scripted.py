@@ -31,7 +31,7 @@ Path = Callable[[float, float], tuple[Array, Array]]
 
 @dataclass(frozen=True)
 class HandTrajectory:
-    """What both hands do over time."""
+    """The motion of both hands over time."""
 
     left: Path
     right: Path | None = None  # None: the left hand's, mirrored

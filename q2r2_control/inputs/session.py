@@ -77,12 +77,12 @@ class HeadsetSession:
 
     The server sends first, in ROS2, before the client's dialect is known; an app that is set to ROS1 logs an error and
     goes on. The dialect is read from the NUL that only ROS2 clients put behind every destination, then each payload has
-    to fit it: no message is read by guessing.
+    to fit it. No message is read by guessing.
 
-    Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration with an empty topic or type, a field
-    that the app's user has left empty, is answered with an error for the app's console, as by Unity's own endpoint. An
-    unknown command, a name that no topic can have, or a payload that its topic cannot have is a
-    :class:`ProtocolError`: the two sides do not speak the same protocol.
+    Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration with an empty topic or type, which the
+    app's user left empty, gets an error for the app's console, as from Unity's own endpoint. An unknown command, a name
+    that no topic can have, or a payload that its topic cannot have is a :class:`ProtocolError`: the two sides do not
+    speak the same protocol.
     """
 
     def __init__(self) -> None:

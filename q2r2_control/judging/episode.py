@@ -56,7 +56,7 @@ class Frames:
 
 @dataclass(frozen=True)
 class Hand:
-    """What came of one hand: k samples, whose poses need not be numbers."""
+    """The received samples of one hand: k samples, whose poses need not be numbers."""
 
     arm: str  # that it leads
     received: Array  # (k,) receipt of the pose [s]

@@ -40,7 +40,7 @@ def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:
         moving += _pieces(t[begin:end], position[begin:end])
     if len(moving) < _FEWEST:
         return None
-    # A tick that comes a millisecond late measures a tool at 0.3 m/s 0.3 mm off, and in real time there are many: three
+    # A tick that comes a millisecond late measures a tool at 0.3 m/s 0.3 mm off, and in real time there are many. Three
     # derivatives of that would be more than those of the motion. The ends, which the smoothing changes, are cut off.
     cut = round(2.0 * _SMOOTHING / FRAME)
     smoothed = [gaussian_filter1d(piece, _SMOOTHING / FRAME, axis=0)[cut:-cut] for piece in moving]
@@ -69,9 +69,9 @@ def ldlj(position: Array, dt: float) -> float:
     """Log dimensionless jerk along positions (k, 3) [m] that are ``dt`` [s] apart.
 
     LDLJ = -ln(T^3 / v_peak^2 * integral of |d^3 x / dt^3|^2 dt) over the duration T (Balasubramanian,
-    Melendez-Calderon, Roby-Brami, Burdet, On the analysis of movement smoothness, JNER 2015, of the dimensionless jerk
-    of Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009). About -5.3 for one reach of
-    minimum jerk.
+    Melendez-Calderon, Roby-Brami, Burdet, On the analysis of movement smoothness, JNER 2015). The dimensionless jerk is
+    that of Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009. About -5.3 for one reach
+    of minimum jerk.
     """
     velocity = np.diff(position, axis=0) / dt
     jerk = np.diff(velocity, n=2, axis=0) / dt**2
@@ -98,9 +98,9 @@ def delays(episode: Episode, hand: str) -> list[float | None]:
     """Delays [s] of the target, and of the measured tool, behind a hand's poses as they were received.
 
     A delay is the tau that maximises the squared correlation of v(t) with M v_hand(t - tau) over all times t at which
-    the arm is engaged: v is the velocity of target or tool, M (3, 3) how the teleoperation maps the hand's axes to the
-    world. Neither anchors nor the scale matter, nor for how long the hand rests. None: the hand moves less than
-    10 mm/s RMS, only turns, or explains less than half of that motion; or no maximum is within (0, 0.5) s.
+    the arm is engaged. Here v is the velocity of target or tool, M (3, 3) how the teleoperation maps the hand's axes to
+    the world. Neither anchors nor the scale matter, nor for how long the hand rests. None: the hand moves less than 10
+    mm/s RMS, only turns, or explains less than half of that motion; or no maximum is within (0, 0.5) s.
     """
     samples = episode.hands[hand]
     arm = episode.arms.index(samples.arm)
@@ -203,8 +203,8 @@ def tracking_errors(episode: Episode, arm: int) -> tuple[Array, Array]:
 def idle_share(episode: Episode) -> float | None:
     """Share of the run, until it begins to end, in which no arm is engaged or none of those moves.
 
-    An arm moves where its tool, at the controller's reference, is more than 2 mm or 0.02 rad from where it was half a
-    second earlier or is half a second later, or its gripper is told to open or close in that time. A hand that trembles
+    An arm moves where its tool, at the controller's reference, is more than 2 mm or 0.02 rad from its place half a
+    second earlier or later. It also moves where its gripper is told to open or close in that time. A hand that trembles
     does not move, a stop between two motions is not idle. None: no tick is in the file.
     """
     t, at = episode.frame_t, episode.frames.at

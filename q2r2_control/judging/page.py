@@ -186,7 +186,7 @@ def _draw_margin(axes: Axes, judged: Judged) -> None:
 
 
 def _draw_leash(axes: Axes, judged: Judged) -> None:
-    """What the leash dragged, and the ticks at which the controller did not do as it was asked."""
+    """The way that the leash dragged, and the ticks at which the controller did not do as it was asked."""
     ticks = judged.episode.ticks
     for index, arm in enumerate(judged.episode.arms):
         _draw(axes, arm, ticks.t, 1e3 * ticks.slip[:, index])

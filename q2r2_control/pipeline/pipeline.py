@@ -181,7 +181,7 @@ class Pipeline:
                     fault = self.supervisor.fault
                     raise PlantError("the arms were stopped" if fault is None else sentence(fault))
         except BaseException:
-            # The arms come first, whatever failed. What failed may fail again; the first fault tells more.
+            # The arms come first, whatever failed. A part that failed may fail again; the first fault tells more.
             with suppress(Exception):
                 self._bring_to_rest()
             raise

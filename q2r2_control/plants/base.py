@@ -1,4 +1,4 @@
-"""What every plant offers, and the checks that keep a bad command from reaching one."""
+"""The interface of every plant, and the checks that keep a bad command from reaching one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_ADVANCE = 1.0
 
 @runtime_checkable
 class Plant(Protocol):
-    """What moves. Joint arrays are (nv,) in the order of ``Robot.joint_names``.
+    """A robot that moves, simulated or real. Joint arrays are (nv,) in the order of ``Robot.joint_names``.
 
     One tick: ``apply`` says where the plant has to be at the end of the tick, ``advance`` lets that time pass,
     ``state`` says where it got. On hardware, where time passes by itself, ``advance`` is where a plant waits for the

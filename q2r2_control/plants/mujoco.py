@@ -153,7 +153,8 @@ class MujocoPlant:
         index, data = self._v_index, self.data
         self.observed_qpos = self._qpos.copy()
         tau = data.qfrc_actuator.take(index)
-        # What MuJoCo adds up before contacts, less what is not external, leaves pushes from here and from its window.
+        # MuJoCo's sum before contacts, less the terms that are not external, leaves pushes from here and from its
+        # window.
         external = (data.qfrc_constraint + data.qfrc_smooth - data.qfrc_passive + self._bias).take(index) - tau
         q, v = self._qpos.take(self._q_index), self._qvel.take(index)
         return RobotState(q, v, tau, external, self._steps * self._timestep)

@@ -41,8 +41,8 @@ _NEGLIGIBLE_INERTIA = 1e-6
 # Rubber on a box.
 _PAD_FRICTION = (1.0, TORSION, ROLLING)
 
-# Time constant [s] and damping ratio of a finger's contacts: MuJoCo scales their stiffness with the inertia behind
-# them, which is small in a finger, and with its usual 0.02 s the grip would sink millimetres into what it holds.
+# Time constant [s] and damping ratio of a finger's contacts. MuJoCo scales their stiffness with the inertia behind
+# them, which is small in a finger. With its usual 0.02 s the grip would sink millimetres into the held part.
 _PAD_STIFFNESS = (0.004, 1.0)
 
 # Of meshes that MuJoCo reads by itself.
@@ -126,7 +126,8 @@ def _set_solver(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
 def _correct_inertias(spec: mujoco.MjSpec) -> None:
     """Raise eigenvalues of inertias that no body can have, as files have them of antennas of a milligram.
 
-    MuJoCo refuses such a file as a whole. What is added is far below what a joint feels, or it is refused after all.
+    MuJoCo refuses such a file as a whole. The added terms are far below anything that a joint feels, or it is refused
+    after all.
     """
     for body in spec.bodies:
         if not body.explicitinertial or np.isnan(body.fullinertia).any():

@@ -91,7 +91,7 @@ PAD_PRIORITY, _OBSTACLE_PRIORITY = 1, 2
 # Torsion [m] and rolling [m] of a contact of about a square centimetre.
 TORSION, ROLLING = 0.02, 0.001
 
-# T_n [s], MuJoCo's usual one, and damping ratio: the pads' would make a table of millions of N/m of it, with the
+# T_n [s], MuJoCo's usual one, and damping ratio. The pads' would make a table of millions of N/m of it, with the
 # inertia of a whole arm behind them.
 _STIFFNESS = (0.02, 1.0)
 

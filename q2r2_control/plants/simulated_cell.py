@@ -12,8 +12,8 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# How long a joint goes on at the commanded velocity when the next command is late: three intervals between commands,
-# since a busy machine delivers them unevenly, but within these bounds [s].
+# How long a joint goes on at the commanded velocity when the next command is late [s]. It is three intervals between
+# commands, within these bounds, since a busy machine delivers them unevenly.
 _COAST_INTERVALS, _SHORTEST_COAST, _LONGEST_COAST = 3.0, 0.01, 0.1
 # Share of the newest interval in its running mean.
 _INTERVAL_SHARE = 0.1
@@ -112,7 +112,7 @@ class SimulatedCell:
         self._openings = dict.fromkeys(self.plant.gripper_openings(), 1.0)
 
     def mode(self, now: float) -> str:
-        """What drives the arms: position or torque commands, or nobody."""
+        """The kind of commands that drive the arms: positions, torques or none."""
         if now - self._last_command > self._hold_after:
             return "holding"
         return "position" if self._tau is None else "torque"
@@ -165,7 +165,7 @@ class SimulatedCell:
         self._openings[arm] = opening
 
     def gripper_force(self, arm: str) -> float:
-        """What an arm's gripper presses with [N]."""
+        """The force of an arm's gripper [N]."""
         forces = [self.plant.data.actuator(joint).force[0] for joint in self.robot.arms[arm].finger_joints]
         return float(np.abs(forces).max(initial=0.0))
 
@@ -212,7 +212,7 @@ class SimulatedCell:
         self._tau = None
 
     def _unusable(self, names: Sequence[str], q: Array, v: Array | None, delay: float) -> str | None:
-        """What is wrong with commanded positions, or None."""
+        """The fault of commanded positions, or None."""
         if len(q) != len(names) or (v is not None and len(v) != len(names)):
             return f"{len(q)} positions for {len(names)} joints"
         if not (np.isfinite(q).all() and (v is None or np.isfinite(v).all())):

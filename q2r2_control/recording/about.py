@@ -117,7 +117,7 @@ def program() -> dict[str, str]:
 
 
 def changes(about: About, config: Config, robot: Robot) -> list[str]:
-    """What is not as it was when a run was recorded: program, libraries, cell, robot; a line each."""
+    """The changes since a run was recorded: program, libraries, cell, robot; a line each."""
     now = program()
     found = [
         f"{name}: {about.notes[name]} when recorded, now {now.get(name, 'unknown')}"

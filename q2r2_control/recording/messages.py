@@ -108,7 +108,7 @@ def filtered_hand(arm: str) -> str:
 
 
 def target(arm: str) -> str:
-    """What the operator asks of an arm."""
+    """The target that the operator asks of an arm."""
     return f"/q2r2/{arm}/target_frame"
 
 

@@ -60,7 +60,7 @@ def replay(
 
     Without a ``plant``, what was measured is measured again, whatever is commanded; with one, it moves and is measured.
     Only one of the recorded kind can do the same to the bit, so ``compare`` is for no other. ``prepare`` gets the
-    pipeline. Raises :class:`RecordingError` for a file that is none or is damaged, and :class:`Q2R2Error` for a cell
+    pipeline. Raises :class:`RecordingError` for a file that is none or is damaged. Raises :class:`Q2R2Error` for a cell
     that cannot be built or has other arms or joints, and for a plant without the recorded mode.
     """
     recording = Recording(path)

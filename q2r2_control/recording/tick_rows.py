@@ -137,7 +137,7 @@ class TickPacker:
         )
 
     def _state_text(self, tick: Tick, samples: Sequence[HandSample]) -> str:
-        """What has names, as JSON; empty where it is what it was."""
+        """Fields with names, as JSON; empty where nothing changed."""
         report = tick.reference.report
         state: dict[str, Any] = {
             "states": tick.states,

@@ -35,7 +35,7 @@ _HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (
 
 @dataclass(frozen=True)
 class RecordedRobot:
-    """What messages need of a robot; unlike the robot itself it can be sent to another process."""
+    """The robot's data for messages; unlike the robot itself it can be sent to another process."""
 
     model: pin.Model
     joints: tuple[str, ...]

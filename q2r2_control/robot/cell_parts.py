@@ -51,7 +51,7 @@ class Model:
         return f"robot_{name}" if not self.prefix and name == WORLD else self.prefix + name
 
     def urdf(self, mount: PoseConfig) -> list[ET.Element]:
-        """What goes into the cell."""
+        """The parts of the cell."""
         joint = fixed_joint(f"{self.prefix or 'robot_'}mount", WORLD, self.name_in_cell(self.tree.root), mount)
         return [joint, *(renamed(part, self.name_in_cell) for part in self.parts)]
 
@@ -139,7 +139,7 @@ class ArmAssembly:
                 raise ConfigError(f"{self.key}: {shared}; name another tip")
 
     def mounted_urdf(self) -> list[ET.Element]:
-        """What flange and tool add to the cell."""
+        """The parts that flange and tool add to the cell."""
         return [renamed(part, self.name_in_cell) for item in self.mounted for part in [item.joint, *item.model.parts]]
 
     def mounted_exclusions(self) -> list[ET.Element]:

@@ -1,7 +1,7 @@
 """Joins arms, mounts, tools, obstacles and the floor into one URDF and one SRDF under the root link ``world``.
 
-Names of an arm's own model and of its tool get the prefix ``left_`` or ``right_``; those of a ``robot`` that the arms
-are parts of and of obstacles stay. Joints that neither an arm nor a gripper moves are fixed.
+Names of an arm's own model and of its tool get the prefix ``left_`` or ``right_``. Names of a ``robot`` that the arms
+are parts of, and of obstacles, stay. Joints that neither an arm nor a gripper moves are fixed.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class ComposedCell:
 def compose(config: Config) -> ComposedCell:
     """Build the cell of ``config``.
 
-    Raises :class:`ConfigError` that names key, value and what is allowed: a model or link that does not exist, a home
-    posture of the wrong length or outside the limits, clashing or reserved names.
+    Raises :class:`ConfigError` that names key, value and the allowed values. Faults are a model or link that does not
+    exist, a home posture of the wrong length or outside the limits, and clashing or reserved names.
     """
     if not config.name.isprintable():
         raise ConfigError(f"name = {config.name!r:.60}: allowed: printable characters")

@@ -25,7 +25,7 @@ CONTINUOUS_RANGE = 4 * math.pi
 _JOINT_TYPES = ("fixed", "revolute", "prismatic", "continuous", "planar", "floating")
 _SHAPES = ("box", "cylinder", "sphere", "mesh")
 
-# What urdfdom and Python both read as the same number; urdfdom skips what it cannot read without saying so.
+# Text that urdfdom and Python both read as the same number; urdfdom skips what it cannot read without saying so.
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
 _LARGEST = 1e20  # squares of it are still finite
 _SHORTEST_AXIS = 1e-6

@@ -22,7 +22,7 @@ from scipy.spatial import ConvexHull, QhullError
 from q2r2_control.errors import RobotError
 from q2r2_control.types import Array
 
-# What rounding may take away is given back: 1 micrometre on every enclosing radius.
+# Rounding may take something away, which is given back: 1 micrometre on every enclosing radius.
 _ROUNDING = 1e-6
 
 

@@ -1,7 +1,7 @@
 """The bodies of fingers: each is what it sweeps from one end of its joints' travel to the other.
 
 Distances know arm joints only, so a finger's body is all of its way. While the gripper's opening is known, less of it
-counts: of fingers that slide a part of the segment, of those that turn a capsule of turning_fingers.py.
+counts. Of fingers that slide it is a part of the segment, of those that turn a capsule of turning_fingers.py.
 """
 
 from __future__ import annotations
@@ -89,10 +89,10 @@ def sweep_fingers(
 ) -> tuple[FingerBody | TurningBody, ...]:
     """Replace in place the capsules and spheres of fingers, locked at ``home``, by what they sweep.
 
-    Capsules of two fingers of one gripper that slide on one line and are equally thick become one, which keeps the
-    first one's name: what is between the fingers is theirs. Returns the bodies of which less counts where the gripper's
-    opening is known: those along whose line the fingers slide, and those that turn. A finger that slides across its
-    body is all of its way always; one that is moved by a joint of more than one axis stays as it is.
+    Capsules of two fingers of one gripper that slide on one line and are equally thick become one. It keeps the first
+    one's name, and the space between the fingers is part of it. Returns the bodies of which less counts where the
+    gripper's opening is known: those along whose line the fingers slide, and those that turn. A finger that slides
+    across its body is all of its way always. One that is moved by a joint of more than one axis stays as it is.
     """
     bodies: list[FingerBody | TurningBody] = []
     for arm, joints in parts.finger_joints.items():

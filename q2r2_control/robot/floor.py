@@ -1,7 +1,7 @@
 """The floor of a cell: what stands for it in the URDF, and which links need no watching against it.
 
 It is a box whose top is at the floor's height, since URDF has no plane. No arm reaches beyond its edges, since no mount
-is farther than 20 m from the origin, and bodies inside are pushed out through the top, since it is thick.
+is farther than 20 m from the origin. Bodies inside are pushed out through the top, since it is thick.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[E
 def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
     """Let fixed upright boxes that stand on the floor reach deep into it, so that nothing is pushed out downwards.
 
-    What is inside a box is pushed out through the nearest face. The underside of a box on the floor is no way out: a
+    A body inside a box is pushed out through the nearest face. The underside of a box on the floor is no way out. A
     hand deep in it and the wrist above would be pushed apart and stay for ever. Above the floor nothing changes.
     """
     floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)
@@ -68,7 +68,7 @@ def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel
     """Remove pairs of the floor with bodies that cannot come nearer to it than now.
 
     Two kinds, both proven: bodies that turn about vertical axes only, as an arm's first link does, and stay as high as
-    they are; and bodies too near to the first joint that can tip them to come within :data:`CLEARANCE`.
+    they are. The other kind are bodies too near to the first joint that can tip them to come within :data:`CLEARANCE`.
     """
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
@@ -96,8 +96,8 @@ def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float
     """Height that no point of a capsule or sphere is ever below [m]; None where no joint raises or lowers it.
 
     Joints that turn about vertical axes or slide along level ones leave all heights as they are at zero, for which
-    ``data`` has frames and Jacobians. So the first other joint's origin keeps its height, and what hangs on that joint
-    lies in a ball around it.
+    ``data`` has frames and Jacobians. The first other joint's origin then keeps its height, and the bodies that hang on
+    that joint lie in a ball around it.
     """
     height, world_axes = None, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     reach = float(np.linalg.norm(item.placement.translation)) + item.geometry.radius

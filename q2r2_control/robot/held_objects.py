@@ -1,12 +1,13 @@
-"""What grippers hold: bodies that are fixed to the tools, and what they are watched against.
+"""Held objects: bodies that are fixed to the tools, and the pairs that are watched with them.
 
-They stand in a copy of ``Robot.collision_model`` that ends with them and their pairs. An object is watched against what
-the bodies on its link are, but for its own hand and the fingers of other hands, which have to be able to take it over.
+They stand in a copy of ``Robot.collision_model`` that ends with them and their pairs. An object is watched against the
+same bodies as its link. Its own hand is left out, and so are the fingers of other hands, which have to be able to take
+it over.
 
 **Boxes against boxes** have no short closed form. Where two convex polyhedra are closest, one of the two points can be
-taken on an edge: if both lie inside of faces, these are parallel, and both points may be moved along them until one
-meets an edge. And two of them cannot begin to overlap but by an edge of one in the other. So the distance of two boxes
-is the least one of the twelve edges of each from the other box, each a capsule without a radius.
+taken on an edge. If both lie inside of faces, these are parallel, and both points may be moved along them until one
+meets an edge. And two of them cannot begin to overlap but by an edge of one in the other. The distance of two boxes is
+therefore the least one of the twelve edges of each from the other box. Each edge is a capsule without a radius.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ class LinkClass(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class KnownParts:
-    """What a URDF alone does not say of its links. By arm; names as in the URDF."""
+    """Facts about links that a URDF alone does not tell. By arm; names as in the URDF."""
 
     finger_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     tool_links: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -38,7 +38,9 @@ class KnownParts:
 
     @classmethod
     def carried_by(cls, tree: LinkTree, chains: Mapping[str, Sequence[str]]) -> KnownParts:
-        """What the tree alone shows, ``chains`` being each arm's joints: those that it carries move its fingers."""
+        """The facts that the tree alone shows, ``chains`` being each arm's joints: those that it carries move its
+        fingers.
+        """
         of_arms = {joint for chain in chains.values() for joint in chain}
         last = {arm: joint_end(tree.movable()[chain[-1]], "child") for arm, chain in chains.items()}
         fingers = {
@@ -113,8 +115,8 @@ def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkT
     """Add every pair whose bodies can move relative to each other and are not neighbours in the chain.
 
     Neighbours: bodies with one joint between them, where fixed parts such as a tool belong to the body that carries
-    them. What stands fixed in the world is one body for Pinocchio, yet a table is no neighbour of an arm's first
-    link: there only the link that carries the joint is.
+    them. Everything fixed in the world is one body for Pinocchio, yet a table is no neighbour of an arm's first link.
+    There only the link that carries the joint is.
     """
     carrier = {joint.get("name", ""): joint_end(joint, "parent") for joint in tree.joint_to.values()}
     geometry.removeAllCollisionPairs()

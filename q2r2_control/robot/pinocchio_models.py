@@ -25,8 +25,8 @@ def joint_origin(joint: ET.Element) -> pin.SE3:
 def lock_joints(robot: ET.Element, movable: Collection[str], positions: Mapping[str, float]) -> None:
     """Fix every joint of the URDF ``robot`` but the ``movable`` ones, in place, so that every reader locks them alike.
 
-    A joint with one axis is fixed at its value in ``positions`` [rad or m], at 0 without one; a planar or floating
-    joint where it stands.
+    A joint with one axis is fixed at its value in ``positions`` [rad or m], at 0 without one. A planar or floating
+    joint is fixed where it stands.
     """
     for joint in robot.findall("joint"):
         name, kind = joint.get("name", ""), joint.get("type")

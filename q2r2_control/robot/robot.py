@@ -67,7 +67,7 @@ class Robot:
     :meth:`capped_acceleration`.
 
     ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, its own links that
-    can meet, and what stands in the cell. Every monitored shape is a capsule, a sphere, or a box fixed in the world; a
+    can meet, and what stands in the cell. Every monitored shape is a capsule, a sphere, or a box fixed in the world. A
     finger is all that it sweeps, and ``finger_bodies`` says what counts at a known opening. ``objects`` are what
     grippers hold, beside the collision model. ``ignored_pairs`` of one arm's shapes overlap by construction.
     """
@@ -138,7 +138,7 @@ class Robot:
     ) -> Robot:
         """A robot from any URDF, given as file or text.
 
-        ``arms`` maps an arm's name to its tool frame, a link of the URDF; other joints that an arm carries move its
+        ``arms`` maps an arm's name to its tool frame, a link of the URDF. Other joints that an arm carries move its
         fingers, and the links that these hang on are its tool. No link is known as an obstacle. Home is 0 for each
         joint, or the middle of its range where 0 is outside. ``srdf`` (file or text) says which pairs need no watching;
         without one, links of one arm that overlap at home are taken to overlap by construction. Raises

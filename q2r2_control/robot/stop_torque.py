@@ -1,4 +1,4 @@
-"""What torque a commanded stop asks of the joints, against what they have.
+"""The torque that a commanded stop asks of the joints, against their limits.
 
 The controller promises stops in which every joint j decelerates at its limit a_j, whatever the torque. Joints that come
 from a low speed may do so with any signs, so joint i is asked for at most

@@ -1,22 +1,23 @@
-"""What a finger that turns sweeps while its gripper's opening is in an interval: one capsule for each shape as drawn.
+"""The space that a turning finger sweeps while its gripper's opening is in an interval: one capsule for each shape as
+drawn.
 
 **Claim.** The capsule of an interval encloses the shape at every opening in that interval, not only at samples.
 
 *Proof.* A shape is the hull of two balls, so it is enough to hold the balls' centres with the balls' radius. Where a
-driven joint goes from one position to another in m equal steps, and joints that mimic it with it, a centre x is a
-function of that one parameter. In a step in which these joints move by w_i, linear interpolation between both ends of
-the step is off by at most an eighth of the greatest second derivative,
+driven joint goes from one position to another in m equal steps, with the joints that mimic it, a centre x is a function
+of that one parameter. In a step in which these joints move by w_i, linear interpolation between both ends of the step
+is off by at most an eighth of the greatest second derivative,
 
     1/8 sum_ik w_i w_k r_(the outer one of i and k),
 
 since the second derivative by two turning joints is a product of rotations about both axes with the lever of the outer
 one. r bounds how far x is from a joint's axis. A slide has r = 1, as the outer one of two, and 0 as the inner one or
-twice. With several driven joints in one chain, interpolation is by each of them in turn; each time it takes means of
-what was there, so the errors add up and derivatives by two different driven joints do not count. What is interpolated
-lies in the hull of the samples. A capsule is convex: one that holds each sample with the shape's radius and that
+twice. With several driven joints in one chain, interpolation is by each of them in turn. Each time it takes means of
+the values before. The errors add up, and derivatives by two different driven joints do not count. Interpolated points
+lie in the hull of the samples. A capsule is convex: one that holds each sample with the shape's radius and that
 remainder holds all. For any segment the radius that does this is the farthest sample's distance from it, plus both. []
 
-The choice of the segment decides on size only: of some along the shape and some along its way, the one of the least
+The choice of the segment decides on size only. Of some along the shape and some along its way, the one of the least
 mean width is taken. Capsules of two intervals are not nested even if the intervals are: one for less may stick out of
 one for more. A narrower interval has to be proven as if a body grew (:func:`sticks_out`). The wider interval's capsule
 stays valid as long as the opening is in it, so a narrower one may always be refused.
@@ -144,7 +145,7 @@ class TurningSweeps:
         self.extent: Array = np.linalg.norm(points, axis=2).max(axis=1) + remainder  # (b,) see TurningBody.extent
 
     def capsules(self, interval: Interval) -> Capsules:
-        """What encloses the shapes at every opening in ``interval``."""
+        """The capsules that enclose the shapes at every opening in ``interval``."""
         points, remainder = self._samples(interval)
         half = points.shape[1] // 2
         first, second = points[:, :half], points[:, half:]

@@ -1,8 +1,8 @@
-"""ROS 2: the nodes, and what connects them to the rest of the package, which needs no rclpy.
+"""ROS 2: the nodes, and the code that connects them to the rest of the package, which needs no rclpy.
 
-From the bottom up: ``launch`` starts nodes as processes, ``executor`` spins nodes that tick, ``base_node`` is what
-every node has, ``monitoring`` watches other nodes, ``bridge`` turns messages into data and back, ``nodes`` has the
-executables; ``watching`` looks at a running set from outside. ``interfaces`` holds message packages to build.
+From the bottom up: ``launch`` starts nodes as processes, and ``executor`` spins nodes that tick. ``base_node`` is the
+base of every node, and ``monitoring`` watches other nodes. ``bridge`` turns messages into data and back. ``nodes`` has
+the executables, and ``watching`` looks at a running set from outside. ``interfaces`` holds message packages to build.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What every node has: parameters with ranges, QoS, its own state, diagnostics, and the main function that runs it."""
+"""The base of every node: parameters with ranges, QoS, its own state, diagnostics, and the main function."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ _NEVER_IDLE = 0.5
 # All keep the last messages, and are reliable and volatile where they do not say otherwise.
 # Commands, at the receiver: only the newest counts, and it has to arrive.
 COMMAND_QOS = QoSProfile(depth=1)
-# Commands, at the sender: a reliable sender repeats what has not arrived, also after a link was down for a while, and
-# an old target would be a jump. The lifespan is judged by the sender's clock; the receiver's may differ.
+# Commands, at the sender: a reliable sender repeats messages that have not arrived, also after a link was down for a
+# while. An old target would be a jump. The lifespan is judged by the sender's clock; the receiver's may differ.
 SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
 # Streams of a headset or of joint states: a late message is worth less than the next one.
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-# What is published for recordings only: all of it counts, and nobody waits for it.
+# Messages for recordings only: all of it counts, and nobody waits for it.
 RECORDED_QOS = QoSProfile(depth=200)
-# What subscribers that start later have to get too, such as robot_description.
+# Messages that subscribers that start later have to get too, such as robot_description.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _DIAGNOSTICS_PERIOD = 0.5  # [s]
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # of timers that go on while /clock stands still
@@ -251,7 +251,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
             executor.add_node(node)
         for timer in [timer for node in nodes for timer in node.timers if not timer.is_canceled()]:
             timer.reset()  # from now on: nodes of one rate tick at one moment, for which the process wakes once
-        # What there is now stays: a collection of all of it would take longer than a tick.
+        # Objects that exist now stay: a collection of all of it would take longer than a tick.
         gc.collect()
         gc.freeze()
         _take_priority(nodes)

@@ -1,8 +1,8 @@
 """An executor for nodes that tick: it sleeps until a tick, takes the messages that have arrived, and runs the tick.
 
 Messages and ticks go past rclpy's wait set; all else, such as services, is rclpy's to run. Measured on two busy cores
-with both arms moving: 1.1 cores and 167 joint commands a second, and with ``SingleThreadedExecutor`` 1.7 cores and 53.
-rclpy 7.1's ``EventsExecutor`` fails with a ``SystemError`` where a callback gets a message's times.
+with both arms moving: 1.1 cores and 167 joint commands a second. With ``SingleThreadedExecutor`` it was 1.7 cores and
+53. The ``EventsExecutor`` of rclpy 7.1 fails with a ``SystemError`` where a callback gets a message's times.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a node knows of others: who publishes and subscribes, who still acknowledges, what they say on ``~/state``."""
+"""A node's view of others: who publishes and subscribes, who still acknowledges, what they say on ``~/state``."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS, Bas
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
 _PERIOD = 0.5  # of asking the graph where no other code asks [s]
 _NO_WAIT = Duration(nanoseconds=0)
-# A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. So messages are left out every
-# _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
+# A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. Messages are therefore left out
+# every _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
 _CHECK, _GAP = 0.05, 0.015
 _ASKED = 0.02  # after all was acknowledged, it is asked again [s]
 _LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # [s]
@@ -31,7 +31,7 @@ _DISCOVERY = 2.0  # an arm that is there has said so by then: nodes report twice
 _SILENT, _GONE = 2.0, 5.0  # without a report [s]
 _ARM = {"engaged", "ready", "hand"}  # what an arm's node says
 # By the number of an endpoint, which is unique. A node that the graph has lost, such as one that was frozen or
-# unreachable for longer than its lease, comes back with the same endpoints, and Fast DDS never learns their node again.
+# unreachable for longer than its lease, comes back with the same endpoints. Fast DDS never learns their node again.
 _known: dict[bytes, str] = {}
 
 

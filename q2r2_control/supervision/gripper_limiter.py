@@ -1,10 +1,10 @@
 """How far grippers may be opened and closed, and which of them hold an object.
 
 The controller counts the fingers of an arm as what they sweep between two openings. That interval has to hold where the
-gripper is and where it may go: what was measured and what was commanded a moment ago, with a tolerance. A gripper is
-commanded to openings in the accepted interval only, opening or closing: fingers that turn reach farther forward as they
-close. Others go on in steps that are halved where the certificate fails and doubled where it holds. A smaller interval
-counts as soon as it is proven, and until then the wider one, which holds where the gripper is too.
+gripper is and where it may go. It covers the measured and the commanded openings of a moment ago, with a tolerance. A
+gripper is commanded to openings in the accepted interval only, opening or closing: fingers that turn reach farther
+forward as they close. Others go on in steps that are halved where the certificate fails and doubled where it holds. A
+smaller interval counts as soon as it is proven, and until then the wider one, which holds where the gripper is too.
 """
 
 from __future__ import annotations
@@ -40,11 +40,13 @@ class GripperLimiter:
         self.changed = False  # whether the controller's openings did, in the last tick
 
     def limit(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> dict[str, float]:
-        """What may be commanded at ``now`` [s], 0 closed .. 1 open; as it was where nothing believable is measured."""
+        """The openings that may be commanded at ``now`` [s], 0 closed .. 1 open; as it was where nothing believable is
+        measured.
+        """
         self.changed = False
         granted = dict(wanted)
         for arm, gripper in self._grippers.items():
-            # What is no opening is the plant's to refuse.
+            # A number that is no opening is the plant's to refuse.
             if arm in wanted and 0.0 <= wanted[arm] <= 1.0:
                 if _BELIEVABLE[0] <= measured.get(arm, math.nan) <= _BELIEVABLE[1]:
                     self._go_on(arm, gripper, wanted[arm], measured[arm], now)
@@ -83,7 +85,7 @@ class GripperLimiter:
 
 
 class _Gripper:
-    """What was measured and commanded of one gripper, and how far it may ask to go."""
+    """The measured and commanded openings of one gripper, and how far it may ask to go."""
 
     def __init__(self, way: float, remembered: float) -> None:
         """``way``: of a finger, from closed to open [m]."""
@@ -192,7 +194,7 @@ class GraspWatch:
 
 
 class Grip:
-    """What was seen of one gripper."""
+    """The observations of one gripper."""
 
     def __init__(self, stroke: float, stall: float = STALL) -> None:
         self._stroke, self._stall = stroke, stall

@@ -232,8 +232,8 @@ def preflight_faults(
 ) -> tuple[str, ...]:
     """One line for each reason why ``robot`` should not start at home; empty for a cell that may run.
 
-    Looked at are position limits with their margin, every monitored pair against the distance that it keeps, and
-    whether the ``controller`` knows a certified stop at home, where it is left reset; None: it moves nothing here.
+    Position limits are checked with their margin, and every monitored pair against the distance that it keeps. The
+    ``controller`` has to know a certified stop at home, where it is left reset; None: it moves nothing here.
     """
     lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
     faults = [

@@ -1,4 +1,4 @@
-"""What measured joints say: whether they can be believed, and whether arms that others move keep apart."""
+"""Judge measured joints: whether they can be believed, and whether arms that others move keep apart."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from q2r2_control.types import Array, Reference, RobotState
 
 # Above what the joints may move between two states: noise, and stamps that a busy machine spreads.
 _JUMP_ALLOWANCE, _JUMP_TIME = 0.05, 0.02  # [rad], [s]
-# What counts as rest during the time that states have to be good before they are believed [rad].
+# The motion that counts as rest during the time that states have to be good before they are believed [rad].
 _REST = 0.01
 
 
 @dataclass(slots=True)
 class WatchSettings:
-    """What measured states have to be; may be changed at run time. See :func:`watch_settings`."""
+    """The rules for measured states; may be changed at run time. See :func:`watch_settings`."""
 
     timeout: float  # without a state for this long is a fault [s]
     # States that are not finite are bridged for this long [s]; 0: the first one is a fault.
@@ -39,7 +39,9 @@ class WatchSettings:
 
 
 def watch_settings(settings: SupervisionSettings, yields: bool) -> WatchSettings:
-    """What the cell's settings ask for; ``yields``: whether arms that are pushed leave their reference by design."""
+    """The rules that the cell's settings ask for; ``yields``: whether arms that are pushed leave their reference by
+    design.
+    """
     return WatchSettings(
         timeout=settings.state_timeout,
         unusable_time=settings.unusable_time,
@@ -82,7 +84,8 @@ class JointWatch:
         if last is None or self._still_since == math.inf:
             self._still_since, self._still_at = now, q
             return
-        # If the distance of all joints is below the limit, so is that of every joint. What is not a number is far.
+        # If the distance of all joints is below the limit, so is that of every joint. A value that is not a number is
+        # far.
         far = not math.dist(q, last_q) < _JUMP_ALLOWANCE
         if far and (fault := self._jump(q, last_q, max(now - last.stamp, passed, 0.0))):
             self._fail(fault)
@@ -95,7 +98,7 @@ class JointWatch:
         return fresh and now - self._still_since >= self._settings.settle_time
 
     def check(self, now: float) -> Reason | None:
-        """What is wrong now, or None."""
+        """The fault of now, or None."""
         if self.fault is not None:
             return self.fault
         # A clock that was set back would let lost states look fresh for as long.
@@ -175,7 +178,7 @@ _FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5}
 
 @dataclass(slots=True)
 class ExternalSettings:
-    """What is allowed of arms that another controller moves; may be changed at run time."""
+    """The limits for arms that another controller moves; may be changed at run time."""
 
     tolerance: float = 0.01  # measured pairs may be closer by this than they are kept apart [m]
 
@@ -188,10 +191,10 @@ def settings_for_external_arms(config: Config) -> Config:
 
 
 class ExternalArms:
-    """What the controller is asked for, and what is checked, of arms that another controller moves after its reference.
+    """The targets of the controller, and the checks, for arms that another controller moves after its reference.
 
     The reference keeps the arms apart only as far as the arms are where it is. For that reason its elbows follow the
-    measured ones, held tools keep their pose instead of joint positions, and measured pairs may not be closer than the
+    measured ones, and held tools keep their pose instead of joint positions. Measured pairs may not be closer than the
     reference's may, less a tolerance for the lag of an arm.
     """
 

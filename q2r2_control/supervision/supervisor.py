@@ -30,7 +30,7 @@ _REST = 1e-4  # of the reference [rad/s]
 # A joint that stands still this far from the reference may have nothing that moves it [rad], [rad/s].
 _OFF_REFERENCE, _STILL = 0.02, 0.05
 
-# What the mode of driving makes of the targets, of the measured state and a time [s]: an admittance displaces them.
+# The mode of driving changes targets by the measured state and a time [s]: an admittance displaces them.
 Displace = Callable[[dict[str, pin.SE3 | None], RobotState, float], dict[str, pin.SE3 | None]]
 
 
@@ -87,7 +87,7 @@ class Supervisor:
         return self.phase in (Phase.ACTIVE, Phase.BRAKING) and self._watch.fault is None
 
     def arm_state(self, arm: str) -> str:
-        """What one arm does: following, homing or holding; or why no arm does anything."""
+        """The activity of one arm: following, homing or holding; or why no arm does anything."""
         if self.phase is not Phase.ACTIVE:
             return str(self.phase)
         if self.homing.active:

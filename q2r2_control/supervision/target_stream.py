@@ -3,7 +3,8 @@
 An arm follows a stream whose first target lies within ``engage_distance`` and ``engage_angle`` of the tool, as when an
 operator engages. One that begins elsewhere is of a sender that does not know that the arm was stopped meanwhile. It is
 refused as a whole, even where it later passes the tool. A stream begins with the first target ever, after a silence of
-``timeout``, after a reset, and where refused targets jump to the tool: the operator engages again while targets go on.
+``timeout``, after a reset, and where refused targets jump to the tool. Then the operator engages again while targets go
+on.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _JUMP, _TURN = 0.05, 0.25
 
 @dataclass(slots=True)
 class StreamSettings:
-    """What a stream of targets is; may be changed at run time."""
+    """The rules for a stream of targets; may be changed at run time."""
 
     timeout: float = STREAM_TIMEOUT  # [s]
     engage_distance: float = 0.03  # [m]

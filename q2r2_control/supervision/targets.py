@@ -73,7 +73,7 @@ class SequenceWatch:
 class TargetStreams:
     """One :class:`TargetStream` an arm. Poses are in the world frame, times are receipt times [s].
 
-    Linked arms (:attr:`StreamSettings.linked`) are stopped together: where a stream that is followed ceases, or is
+    Linked arms (:attr:`StreamSettings.linked`) are stopped together. Where a stream that is followed ceases, or is
     dropped because two nodes publish it, every arm needs a stream that begins anew at its tool. A stream that its
     sender ends with :meth:`release` stops its own arm only: its operator paused it.
     """
@@ -87,7 +87,7 @@ class TargetStreams:
         self._newly_ended: list[Reason] = []
 
     def at(self, now: float) -> dict[str, pin.SE3 | None]:
-        """What each arm follows at ``now`` [s], see :class:`TargetExtrapolator`; None: it holds."""
+        """The target that each arm follows at ``now`` [s], see :class:`TargetExtrapolator`; None: it holds."""
         return {arm: self._lines[arm].at(now) if self.follows(arm) else None for arm in self._streams}
 
     def follows(self, arm: str) -> bool:

@@ -2,9 +2,9 @@
 
 A plant takes one command a period: a joint may do what its velocity limit allows in one period, however late the
 command comes. A tick that is late moves the reference by the time t that passed, but no joint by more than its limit V
-allows in a period h:  |v| t + a t^2 / 2 <= V h  for each joint, with the acceleration limit a, or by one period, which
-no joint's limit forbids. Slow motion catches up at once, and fast motion is stretched in time: the same path, later. A
-command that is clipped joint by joint would leave the path that was certified.
+allows in a period h. That is  |v| t + a t^2 / 2 <= V h  for each joint, with the acceleration limit a. Else it moves by
+one period, which no joint's limit forbids. Slow motion catches up at once, and fast motion is stretched in time: the
+same path, later. A command that is clipped joint by joint would leave the path that was certified.
 
 A plant that is told a velocity goes on at it while no command comes (``coasts``). Then the reference goes on too, by
 the time that passed, up to 0.1 s; what is commanded stays within the velocity limit.
@@ -76,9 +76,9 @@ _REST = 1e-9  # slower than this is at rest [m/s, rad/s]
 class PoseRateLimiter:
     """Follows a target within limits of velocity and acceleration, and comes to rest where there is none.
 
-    Within the limits a target that moves steadily is followed without lag: what is limited is the speed relative to
-    it, v = u + e/|e| s(|e|), with u the target's own velocity, e the lag and s the largest speed from which full
-    braking in steps of dt still stops at it,
+    Within the limits a target that moves steadily is followed without lag. The limit is on the speed relative to it, v
+    = u + e/|e| s(|e|), with u the target's own velocity, and e the lag. s is the largest speed from which full braking
+    in steps of dt still stops at it,
 
         s(d) = min(d / dt, a (-dt/2 + sqrt(dt^2/4 + 2 d/a))).
 
@@ -161,7 +161,7 @@ class _Limited:
         return math.hypot(*self.velocity)
 
     def follow(self, lag: Array, way: Array, dt: float) -> tuple[Array, bool]:
-        """What to move in ``dt`` [s], ``lag`` behind a target that goes ``way``; whether it is less than asked for."""
+        """The step in ``dt`` [s], ``lag`` behind a target that goes ``way``; whether it is less than asked for."""
         own, (fastest, a) = way / dt, self.limits
         if math.hypot(*own) > fastest:
             lag, own = lag + way, np.zeros(3)
@@ -173,7 +173,7 @@ class _Limited:
         return shift, limited or distance > fastest * dt
 
     def towards(self, wanted: Array, dt: float) -> tuple[Array, bool]:
-        """What to move in ``dt`` [s] on the way to a ``wanted`` velocity, and whether that is not reached."""
+        """The step in ``dt`` [s] on the way to a ``wanted`` velocity, and whether that is not reached."""
         fastest, acceleration = self.limits
         change = _at_most(wanted, fastest) - self.velocity
         self.velocity = self.velocity + _at_most(change, acceleration * dt)

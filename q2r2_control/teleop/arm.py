@@ -30,7 +30,7 @@ class AnalogGripper:
     """The opening that a trigger asks for, 0 closed .. 1 fully open.
 
     After a new connection, another stance or a stop, the trigger moves nothing until it has come to where the gripper
-    is, or past it: a gripper that holds something does not open because nobody presses yet.
+    is, or past it. A gripper that holds something does not open because nobody presses yet.
     """
 
     def __init__(self, bindings: BindingSettings, speed: float) -> None:

@@ -23,7 +23,7 @@ class ArmState(StrEnum):
 
 
 class Cause(StrEnum):
-    """What changes an arm's state, in the words of the docs."""
+    """The causes of a change of an arm's state, in the words of the docs."""
 
     PAUSE_BEGINS = "the control that pauses goes down"
     PAUSE = "it was that control's gesture, and no chord"

@@ -60,7 +60,7 @@ _Poses = Mapping[str, pin.SE3]
 
 
 class CarryMode:
-    """One hand moves both tools. What ends it ends it for both arms, or the one would pull at what both hold."""
+    """One hand moves both tools. It ends for both arms at once, or the one would pull at the object that both hold."""
 
     def __init__(self, leader: ArmTeleop, follower: ArmTeleop, tools: _Poses, now: float) -> None:
         """``tools``: see :class:`CarriedTools`."""

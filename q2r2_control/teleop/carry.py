@@ -1,8 +1,8 @@
 """Two tools that one hand moves as one body, about the point between them: two arms that carry one box.
 
 The hand is anchored to a frame in the middle between both tools, turned as the world, and both tools keep their poses
-in it. So nothing jumps when it begins, and the targets' relation is exact while it lasts. Where an arm is held up, the
-frame waits for it on a leash that is shorter than that of one arm, so that the load is neither torn nor crushed.
+in it. Nothing jumps when it begins, and the targets' relation is exact while it lasts. Where an arm is held up, the
+frame waits for it on a leash that is shorter than that of one arm. The load is then neither torn nor crushed.
 """
 
 from __future__ import annotations

@@ -70,8 +70,8 @@ class OneEuro:
 
     The cutoff rises with speed: f = min_cutoff + beta |v|. The original lags by tau = 1 / (2 pi f), thus by an amount
     that changes along the path and bends it. Here the input is led by (tau - delay) v, v being the velocity estimate
-    that the filter has anyway, so at any constant velocity the output lags by exactly ``delay``. Since
-    tau v <= 1 / (2 pi beta), the lead is bounded, and so is what it adds when the hand stops suddenly.
+    that the filter has anyway. At any constant velocity the output lags by exactly ``delay``. Since tau v <= 1 / (2 pi
+    beta), the lead is bounded, and so is what it adds when the hand stops suddenly.
     """
 
     def __init__(self, min_cutoff: float, beta: float, derivative_cutoff: float, delay: float) -> None:
@@ -144,8 +144,8 @@ class PoseFilter:
         return self._out
 
 
-# A hand rests while the mean of its newest samples is this near to that of all since it came to rest, and no sample is
-# farther from it than a headset's noise makes one in thousands [m], [rad].
+# A hand rests while the mean of its newest samples is this near to that of all since it came to rest. In addition no
+# sample is farther from it than a headset's noise makes one in thousands [m], [rad].
 _NEWEST, _DRIFTED, _FAR = 8, (0.35e-3, 2e-3), (1.0e-3, 5e-3)
 _LONGEST = 150  # samples of the mean: two seconds of a 75 Hz headset
 _TRUSTED = 10, 50  # the mean begins to count from so many samples on, and is all that counts from so many

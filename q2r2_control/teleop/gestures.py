@@ -68,10 +68,11 @@ class HeldControls:
 class GestureRecognizer:
     """Turns the levels of buttons, triggers and stick into gestures, each reported once.
 
-    The two buttons of a chord never go down in the same sample, so a tap of a button is delayed by ``chord_window`` [s]
-    (or until release, if that is earlier): when the other button follows, it was a chord and neither tap is reported.
-    Where a control is bound to a hold too, a tap is over at release, and a hold after ``hold_time``. Only stopping must
-    not wait: ``DOWN`` reports a control at once, and may only be used to stop motion, which a chord does as well.
+    The two buttons of a chord never go down in the same sample. A tap of a button is therefore delayed by
+    ``chord_window`` [s] (or until release, if that is earlier). When the other button follows, it was a chord and
+    neither tap is reported. Where a control is bound to a hold too, a tap is over at release, and a hold after
+    ``hold_time``. Only stopping must not wait: ``DOWN`` reports a control at once, and may only be used to stop motion,
+    which a chord does as well.
 
     A button that goes down while the other one is held makes a chord at any time. After a chord both buttons have to be
     released before either counts again; a control that is held from the first reading on, likewise.

@@ -1,17 +1,17 @@
 """The leash between a tool and its target: it bounds how far a target gets from a tool that cannot follow.
 
 An arm that is stretched out or blocked cannot follow its hand. Without a leash the hand would have to come all the way
-back before the arm moves again. Where a target would go beyond the leash, the anchor of the relative motion shifts, so
-that the target stays where the leash ends and the hand moves it from there. Position and rotation have a leash each.
+back before the arm moves again. Where a target would go beyond the leash, the anchor of the relative motion shifts. The
+target stays where the leash ends and the hand moves it from there. Position and rotation have a leash each.
 
-**Slack.** When a leash is taut, the tool is blocked in its direction, and the hand comes back by more than tremor, the
+**Slack.** A leash is taut, the tool is blocked in its direction, and the hand comes back by more than tremor. Then the
 target is put at the tool, which follows the hand from there. Whether the hand comes back is read from its unfiltered
-poses: when a hand stops, the filtered ones swing back by millimetres. Position and rotation are put there together: a
+poses: when a hand stops, the filtered ones swing back by millimetres. Position and rotation are put there together. A
 blocked tool rests where the pulls of both balance, and would follow the one that is left, up to 50 mm.
 
 **Why the arm does not jump.** The only state of the controller is its reference, which is at rest while the tool is
-blocked; a target at the tool therefore asks for no motion. The controller also follows its target's own velocity, but
-not that of a step faster than three times the tool's limit, 9 m/s or 30 rad/s at most; slack is dropped in a tick that
+blocked. A target at the tool therefore asks for no motion. The controller also follows its target's own velocity, but
+not that of a step faster than three times the tool's limit, 9 m/s or 30 rad/s at most. Slack is dropped in a tick that
 is short enough to make such a step.
 """
 
@@ -24,8 +24,8 @@ from q2r2_control.quaternions import Vector, turn_between, turned_by
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Interval, Pose
 
-# The way back that drops the slack: more than tremor, 0.2 mm and 0.2 degrees to either side, and a headset's noise, of
-# which seven times 0.2 mm and 0.03 degrees lie between the farthest samples of a hand that rests.
+# The way back that drops the slack: more than tremor, 0.2 mm and 0.2 degrees to either side, and a headset's noise. Of
+# the noise seven times 0.2 mm and 0.03 degrees lie between the farthest samples of a hand that rests.
 _WAY_BACK = 1.5e-3, 12e-3  # [m, rad]
 _HELD_UP = 0.05, 0.2  # a slower tool counts as blocked; it stops within a fraction of a millimetre [m/s, rad/s]
 _NO_MOTION = 10.0, 35.0  # a faster step is no motion of a target, whatever the controller's settings [m/s, rad/s]

@@ -43,8 +43,8 @@ class RelativeMotion:
 
     as in Quest2ROS2 (HRI 2026) for scales of 1 in the base frame. Which hand drives which arm is not decided here.
 
-    Every rotation has a second, longer rotation vector; the one that continues the previous call's is used, so that
-    with a scale other than 1 the tool does not flip when the hand passes half a turn.
+    Every rotation has a second, longer rotation vector. The one that continues the previous call's is used. With a
+    scale other than 1 the tool then does not flip when the hand passes half a turn.
 
     Raises :class:`ConfigError` for a value that is not allowed in :class:`TeleopSettings`.
     """
@@ -133,7 +133,7 @@ class RelativeMotion:
 
     def _turned_tool(self, hand: Quaternion) -> Quaternion:
         # Not scaled, M R R0' M' Rtool0 = (M R M') (M R0' M' Rtool0), or Rtool0 M R0' R M' = (Rtool0 M R0' M') (M R M')
-        # in the tool's frame; what does not depend on R is known since the anchor.
+        # in the tool's frame. All that does not depend on R is known since the anchor.
         if self._rotation_scale == 1.0:
             turn, tool = hand, self._turned_back
         else:

@@ -21,12 +21,13 @@ _LED = FOLLOWING - {ArmState.CARRIED}  # by their own hand, which does not move 
 
 
 class Teleop:
-    """Hands drive arms relative to anchors; faults stop them. What leads where is the table of :mod:`arm_states`.
+    """Hands drive arms relative to anchors; faults stop them. The table of transitions is that of :mod:`arm_states`.
 
-    An engaged arm is stopped by: no pose or no button data for ``gate.timeout`` of receipt time, a pose that is not
-    finite or not a rotation, a jump or a speed past the gate, a fault that the input found, a lost connection, a loop
-    that stalled or a clock that went back by more than ``gate.timeout``; with ``linked`` the other arm too. Only a new
-    press engages again. The alignment chord of either hand stops both arms, since it moves the frame of both hands.
+    Faults of the data stop an engaged arm: no pose or no button data for ``gate.timeout`` of receipt time, a pose that
+    is not finite or not a rotation, a jump or a speed past the gate. Faults around it do so too: one that the input
+    found, a lost connection, a stalled loop, or a clock that went back by more than ``gate.timeout``. With ``linked``
+    they stop the other arm too. Only a new press engages again. The alignment chord of either hand stops both arms,
+    since it moves the frame of both hands.
 
     Of presses at once, a stop comes first, then the alignment chord, then a pause, then the rest. Either hand may ask
     for actions of both arms. The way home is the caller's to go while :attr:`homing`.
@@ -162,7 +163,7 @@ class Teleop:
         self._pair.change(Cause.HOMED if arrived else Cause.FAULT, now, outcome)
 
     def record_event(self, now: float, reason: Reason) -> None:
-        """What the operator should know of both arms."""
+        """The things that the operator should know of both arms."""
         for arm in self._arms.values():
             arm.record_event(now, reason)
 

@@ -66,7 +66,7 @@ class Margin:
         self.worst = -math.inf if self.sense == "<=" else math.inf
 
     def note(self, value: float, tick: int) -> bool:
-        """Keep the worst; False where the promise is broken. What is not a number breaks it."""
+        """Keep the worst; False where the promise is broken. A value that is not a number breaks it."""
         self.checked += 1
         sign = 1.0 if self.sense == "<=" else -1.0
         kept = sign * value <= sign * self.allowed

@@ -114,7 +114,8 @@ class LiveTable:
     def shown(self, console: Console) -> Iterator[None]:
         """Show the table on ``console`` for as long as the context lasts, if it is a terminal.
 
-        What is printed meanwhile comes above the table. The loop must print nothing: it would wait for the terminal.
+        Lines that are printed meanwhile come above the table. The loop must print nothing: it would wait for the
+        terminal.
         """
         if not console.is_terminal:
             yield

@@ -49,7 +49,7 @@ def test_a_peer_stays_at_its_targets_and_goes_to_others_within_the_limits(peer: 
         np.testing.assert_allclose(q - before, v * DT, atol=1e-12)
     for arm, pose in goals.items():
         error = ROBOT.tool_pose(q, arm).actInv(pose)
-        # What is left is the posture's pull, which weighs a thousandth of the tool's.
+        # The rest is the posture's pull, which weighs a thousandth of the tool's.
         assert np.linalg.norm(error.translation) < 0.001
         assert np.linalg.norm(pin.log3(error.rotation)) < 0.002
 

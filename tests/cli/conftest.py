@@ -1,4 +1,4 @@
-"""What commands print does not depend on how busy the machine is."""
+"""The output of commands does not depend on how busy the machine is."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def bound_port(running: subprocess.Popen[str]) -> int:
-    """What the documented line on stderr says."""
+    """The text of the documented line on stderr."""
     assert running.stderr is not None
     for line in running.stderr:
         if line.startswith("headset: listening on "):

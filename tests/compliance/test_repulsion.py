@@ -213,7 +213,7 @@ def _pushed(
 ) -> Iterator[tuple[WallReport, float, float, float]]:
     """The left hand, 60 mm from the right one, is pushed at it for 1.5 s and released for 1.5 s.
 
-    Yields the report, the energy of motion, of the wall and of what holds the right arm, the push's work [J], and the
+    Yields the report, the energy of motion, of the wall and of the right arm's hold, the push's work [J], and the
     distance of the closest pair by Coal [m].
     """
     q = ROBOT.home.copy()

@@ -17,7 +17,7 @@ CELL = SHIPPED / "dual_iiwa7.yaml"
 
 
 def shipped() -> dict[str, Any]:
-    """What the shipped cell of two iiwa 7 says."""
+    """The text of the shipped cell of two iiwa 7."""
     data: dict[str, Any] = yaml.safe_load(CELL.read_text(encoding="utf-8"))
     return data
 
@@ -30,7 +30,7 @@ def loaded(tmp_path: Path, text: str | bytes) -> Config:
 
 
 def fault(tmp_path: Path, text: str | bytes) -> str:
-    """What the one line says after the file's name."""
+    """The text of the one line after the file's name."""
     with pytest.raises(ConfigError) as caught:
         loaded(tmp_path, text)
     message = str(caught.value)

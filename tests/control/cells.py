@@ -55,7 +55,7 @@ def arrays_of(robot: Robot) -> CellArrays:
 
 @cache
 def kernel_model(name: str) -> KernelModel:
-    """What the controller's kernels know of one of ``NAMES``, with the default settings."""
+    """The data of the controller's kernels about one of ``NAMES``, with the default settings."""
     return kernel_model_of(cell(name).robot, ControllerSettings())
 
 

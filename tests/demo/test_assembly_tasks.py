@@ -1,4 +1,4 @@
-"""What the demo shows: two arms that do small assembly work, from samples of hands alone."""
+"""The demo: two arms that do small assembly work, from samples of hands alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.support.processes import Watch, assert_torque_bounds
 
 pytestmark = pytest.mark.slow
 
-# What is shown, by mode, and in which ticks: nothing here needs 1 kHz, and the tests have to be fast.
+# The tasks that are shown, by mode, and in which ticks: nothing here needs 1 kHz, and the tests have to be fast.
 SHOWN = {CommandMode.POSITION: "meet+grasp+handover+stack", CommandMode.TORQUE: "handover+stack"}
 PERIODS = {CommandMode.POSITION: 0.01, CommandMode.TORQUE: 0.005}  # [s]
 

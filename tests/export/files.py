@@ -54,9 +54,9 @@ def write_recording(
 ) -> Path:
     """A recording with ticks at ``times`` [ns] since its start.
 
-    Measured joints are at minus the tick's place, the reference is at its place, and so are the x of tools at it;
-    while engaged (places of ticks) the target of the left arm is at 1000 plus its place. ``openings``: by name,
-    (arms,). ``pictures``: of ``cameras``, when they were taken [ns], each brighter than the last.
+    Measured joints are at minus the tick's place, the reference is at its place, and so are the x of tools at it. While
+    engaged (places of ticks) the target of the left arm is at 1000 plus its place. ``openings``: by name, (arms,).
+    ``pictures``: of ``cameras``, when they were taken [ns], each brighter than the last.
     """
     config = cell().model_copy(update={"cameras": dict(cameras or {})})
     how, cameras_of, notes = ("position", ("position",), EPOCH, False), tuple(config.cameras), {"task": "to count"}

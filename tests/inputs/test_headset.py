@@ -206,7 +206,7 @@ def cut_off(headset: FakeHeadset, clock: HandClock) -> None:
     headset.close()
 
 
-# What framing and sessions refuse is tested there; these are one of each kind.
+# Refusals of framing and sessions are tested there; these are one of each kind.
 FAULTS: dict[str, tuple[Callable[[FakeHeadset, HandClock], object], str]] = {
     "silence": (lambda _, clock: clock.advance(2.1 - A_LINE_LATER), "no frame for 2 s"),
     "oversized frame": (lambda one, _: one.send(struct.pack("<I1sI", 1, b"a", 1 << 20)), "at most 1048576"),

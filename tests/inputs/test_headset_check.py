@@ -1,4 +1,4 @@
-"""What headset-check says: which way a hand moves, and what to look at when nothing comes."""
+"""The report of headset-check: which way a hand moves, and the advice when nothing comes."""
 
 from __future__ import annotations
 

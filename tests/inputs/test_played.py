@@ -1,4 +1,6 @@
-"""What a headset adds to exact poses: noise of the size asked for, uneven times, and nothing else unless asked."""
+"""The errors that a headset adds to exact poses: noise of the size asked for, uneven times, and nothing else unless
+asked.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a client may say and what it is answered, byte for byte, without sockets."""
+"""A client's messages and the answers to them, byte for byte, without sockets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the hands' controls do in the whole loop: the contract at every tick, and the arms do what was asked for."""
+"""The hands' controls in the whole loop: the contract at every tick, and the arms do what was asked for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ends a run, asked for or failed: the arms are at rest before it does, and nothing is left open."""
+"""Ends of a run, asked for or by a failure: the arms are at rest before it does, and nothing is left open."""
 
 from __future__ import annotations
 

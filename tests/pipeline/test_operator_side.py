@@ -1,4 +1,4 @@
-"""What an operator's hands feel of a run."""
+"""The vibrations that an operator's hands feel of a run."""
 
 from __future__ import annotations
 

@@ -156,7 +156,7 @@ def test_it_meets_the_table_at_0_1_m_s_and_bounces_at_most_twice(bare: MujocoPla
     assert not touching[0]
     assert all(touching[-1000:])
     assert np.abs(loop.state.v).max() < 2e-3
-    # What the table bears is what the spring is pressed together by.
+    # The table bears the force that presses the spring together.
     depth = robot.tool_pose(loop.state.q, "left").translation - robot.tool_pose(way[-1].q, "left").translation
     assert 0.03 < depth[2] < 0.1
     external = loop.state.tau_external

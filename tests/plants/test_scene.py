@@ -1,4 +1,4 @@
-"""What obstacles feel like in MuJoCo: which contacts are named, and how deep a finger is that slides."""
+"""The feel of obstacles in MuJoCo: which contacts are named, and how deep a finger is that slides."""
 
 from __future__ import annotations
 

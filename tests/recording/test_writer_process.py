@@ -1,4 +1,4 @@
-"""Whatever becomes of run, writer and disk: the others go on, and the file has what was written before."""
+"""Faults of run, writer and disk: the others go on, and the file has what was written before."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from tests.robot.conftest import one_arm
 
 @dataclass(frozen=True)
 class DataSheet:
-    """What KUKA and the public lbr_description say of one robot."""
+    """Figures of KUKA and of the public lbr_description for one robot."""
 
     lengths: tuple[float, ...]  # base-shoulder, shoulder-elbow, elbow-wrist, wrist-flange [m]
     masses: tuple[float, ...]  # of link 0..7 [kg]

@@ -189,7 +189,7 @@ def drained(queue: Queue[Any]) -> list[Any]:
 
 
 def subscribed(node: Any, kind: type, topic: str, qos: Any = 100) -> Queue[Any]:
-    """What comes on a topic from now on."""
+    """Messages that come on a topic from now on."""
     messages: Queue[Any] = Queue()
     node.create_subscription(kind, topic, messages.put, qos)
     return messages

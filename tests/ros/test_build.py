@@ -121,7 +121,8 @@ def test_the_names_that_subclasses_need_come_from_the_package() -> None:
         from q2r2_control.ros import no_such_name  # noqa: F401
 
 
-# What docs.ros.org/en/jazzy/p/control_msgs lists, in its order; a type hash depends on names and types of fields alone.
+# The list of docs.ros.org/en/jazzy/p/control_msgs, in its order; a type hash depends on names and types of fields
+# alone.
 GRIPPER_STATE = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal"
 PUBLISHED_FIELDS = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
@@ -163,7 +164,7 @@ FOLDERS = ("config", "launch", "q2r2_control", "resource", "robots", "views")
 
 
 def printed(folder: Path, *command: str, **environment: str) -> str:
-    """What a command prints that runs in ``folder``, without the PYTHONPATH of these tests."""
+    """The output of a command that runs in ``folder``, without the PYTHONPATH of these tests."""
     inherited = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     given = {"cwd": folder, "env": inherited | environment, "capture_output": True, "text": True, "timeout": 120}
     run: subprocess.CompletedProcess[str] = subprocess.run(command, **given)  # type: ignore[call-overload]

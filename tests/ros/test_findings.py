@@ -1,4 +1,4 @@
-"""What is wrong with a set of nodes or its environment, and what helps."""
+"""Faults of a set of nodes or its environment, and their cures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What nodes take of messages that the middleware tells of: late ones, joint states in parts, torques, refusals."""
+"""Messages that the middleware tells nodes of: late ones, joint states in parts, torques, refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all nodes tell of themselves, how they tick and end, and how they find each other, as the user has set it."""
+"""Reports of all nodes, how they tick and end, and how they find each other, as the user has set it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What outputs send, and when they give their receiver up; what the controller says of arms for hands to feel."""
+"""Messages of outputs, and when they give their receiver up; reports of the controller for hands to feel."""
 
 from __future__ import annotations
 

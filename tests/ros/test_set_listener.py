@@ -1,4 +1,4 @@
-"""What listens to a set: it hears what nodes say and how often, and takes no part in what they do."""
+"""The listener of a set: it hears what nodes say and how often, and takes no part in what they do."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def test_the_script_waits_until_both_hands_are_listened_to(node: Any, processes:
 
 
 def speaking_arm(node: Any, ready: bool, message: str) -> dict[str, Any]:
-    """What an arm of the left hand says ten times a second, from this node; tests change it."""
+    """The report of an arm of the left hand, ten times a second, from this node; tests change it."""
     arm = {"level": "ok", "hand": "left", "engaged": False, "ready": ready, "message": message, "last_event": ""}
     said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
     node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))

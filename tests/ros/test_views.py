@@ -1,4 +1,4 @@
-"""What the views, the README and the docs show is there, and works as it stands there."""
+"""The topics and code of the views, the README and the docs exist and work as they stand there."""
 
 from __future__ import annotations
 

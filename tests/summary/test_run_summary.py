@@ -22,7 +22,7 @@ from q2r2_control.types import SIDES, ArmTarget, StepReport, StepStatus
 from tests.support.processes import cell
 from tests.viewer.conftest import tick_at
 
-# What scripts and dashboards rely on.
+# Scripts and dashboards rely on these.
 KEYS = (
     "ticks duration_s loop_rate_hz tick_us lateness_us input_to_command_ms arms min_distance_mm closest_pair "
     "max_velocity_ratio max_acceleration_ratio min_position_margin_rad fallback_ticks uncertified_ticks "

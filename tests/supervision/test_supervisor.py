@@ -30,7 +30,7 @@ class World:
 
     @property
     def states(self) -> list[str]:
-        """What the left arm and the right one do."""
+        """The activities of the left arm and the right one."""
         return [self.supervisor.arm_state(arm) for arm in ("left", "right")]
 
     def engage(self, by: float = 0.0, seconds: float = 0.3) -> pin.SE3:

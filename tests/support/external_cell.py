@@ -29,6 +29,6 @@ def _uncommented(key: str, text: str) -> str:
 
 
 def external() -> dict[str, Any]:
-    """What it says."""
+    """Its text."""
     data: dict[str, Any] = yaml.safe_load(external_text())
     return data

@@ -70,7 +70,7 @@ class FakeHeadset:
         return f"{self._slash}q2r_{hand}_hand_{suffix}"
 
     def registrations(self) -> bytes:
-        """What the app says right after connecting: a keepalive, its topics, and a question for the server's."""
+        """The app's first messages after connecting: a keepalive, its topics, and a question for the server's."""
         parts = [KEEPALIVE]
         for hand in HANDS:
             for suffix, kind in TOPICS.items():

@@ -1,6 +1,6 @@
 """An operator whose headset sends over TCP in simulated time: what was sent by a tick has arrived when it polls.
 
-So outcomes do not depend on how fast the machine is. A script is a generator that changes the operator and yields the
+Outcomes then do not depend on how fast the machine is. A script is a generator that changes the operator and yields the
 times to wait [s]; the run ends with it.
 """
 
@@ -37,7 +37,7 @@ Sender = Callable[[str, Array, Array], bytes | None]  # of hand, position and qu
 
 
 class Operator:
-    """What the script changes. Hands are where ``hands`` says, in a frame that is at ``frame``."""
+    """The changes of the script. Hands are where ``hands`` says, in a frame that is at ``frame``."""
 
     def __init__(self, server: HeadsetServer, plant: MujocoPlant) -> None:
         self.plant = plant

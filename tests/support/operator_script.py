@@ -20,7 +20,7 @@ START: dict[str, Vector] = {"left": (0.3, 0.2, 1.1), "right": (0.3, -0.2, 1.1)}
 
 @dataclass(frozen=True)
 class Reading:
-    """What one hand sends at one time."""
+    """The data that one hand sends at one time."""
 
     hand: str
     position: Vector

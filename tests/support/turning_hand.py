@@ -1,6 +1,6 @@
 """A hand whose fingers turn, as those of a Robotiq 2F-85 do, on both arms of the shipped cell; and where it really is.
 
-Each finger hangs on a knuckle that the gripper turns by 0.8 rad; its tip turns back by as much, so that it stays
+Each finger hangs on a knuckle that the gripper turns by 0.8 rad. Its tip turns back by as much, so that it stays
 parallel, and a second knuckle follows. The tips are 14 mm farther out when the hand is closed. Axes are where the
 published drawings of that gripper have them; shapes are simple ones of about its size.
 """

@@ -41,7 +41,7 @@ class TwoHands:
         self._phases = {hand: random.uniform(0.0, 2.0 * math.pi, (6, 3)) for hand in SIDES}
 
     def pose(self, hand: str, t: float) -> pin.SE3:
-        """What is measured of a hand at ``t`` [s]."""
+        """The measurement of a hand at ``t`` [s]."""
         tones = np.sin(2.0 * math.pi * self._frequencies[hand] * t + self._phases[hand]).sum(axis=1) / math.sqrt(1.5)
         held = self._motion(t)
         position = held.act(START[hand]) + self._sway[0] * tones[:3]

@@ -66,7 +66,7 @@ class Operator:
         self._next_sample = self.now
 
     def samples(self) -> list[HandSample]:
-        """What both hands send now."""
+        """The data that both hands send now."""
         found = [
             sample(hand, self.hands[hand], self.now, lower=hand in self.lower, upper=hand in self.upper)
             for hand in SIDES

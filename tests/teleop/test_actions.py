@@ -1,4 +1,4 @@
-"""What is for both arms: stop, the way home, and a gripper that follows a trigger."""
+"""Actions for both arms: stop, the way home, and a gripper that follows a trigger."""
 
 from __future__ import annotations
 

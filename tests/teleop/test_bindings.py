@@ -1,4 +1,4 @@
-"""What triggers, sticks and buttons may be bound to, and that nothing they do makes a target jump."""
+"""The actions of triggers, sticks and buttons, none of which makes a target jump."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a hand feels, and that every vibration ends."""
+"""The vibrations of a hand, each of which ends."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """mink: differential inverse kinematics as one QP, on MuJoCo.
 
 Has position and velocity limits and collision avoidance for chosen pairs of geometries, but no acceleration limit. Its
-collision bound divides a distance by dt and is compared with a displacement of one tick: the gain that lets a pair
+collision bound divides a distance by dt and is compared with a displacement of one tick. The gain that lets a pair
 close in at our rate is therefore our gain times dt squared. It drops pairs of a body and its parent. It is given the
 simulation's MuJoCo model, with every monitored capsule; the fingers, joints there, are frozen by equalities.
 """
@@ -32,7 +32,7 @@ class Mink:
         control, robot = setup.config.control, setup.robot
         bare = setup.config.model_copy(update={"mujoco": setup.config.mujoco.model_copy(update={"objects": {}})})
         self._model = build_model(robot, bare)
-        # What the simulation lets pass through each other is to be avoided all the same.
+        # Pairs that the simulation lets pass through each other are to be avoided all the same.
         self._model.geom_contype[:] = self._model.geom_conaffinity[:] = 1
         joints = [self._model.joint(name) for name in robot.joint_names]
         self._q_index = np.array([joint.qposadr[0] for joint in joints])

@@ -2,7 +2,7 @@
 
 Has position, velocity and acceleration limits and a barrier on the nearest pairs, all hard, so that they can contradict
 each other: it raises then. The barrier knows nothing of braking distances. It is given the same Pinocchio model, the
-same capsules and pairs as ours, and rows for the ten nearest: for all pairs it takes six times as long. Its damping
+same capsules and pairs as ours, and rows for the ten nearest. For all pairs it takes six times as long. Its damping
 towards a safe displacement, gain 1 by itself, is off, since it slows the tools down at ticks of 1 ms.
 """
 

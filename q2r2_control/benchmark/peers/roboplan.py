@@ -1,10 +1,10 @@
 """roboplan: OInK, differential inverse kinematics as one QP in C++, on Pinocchio, Coal and ProxQP.
 
 Has position, velocity and acceleration limits and a barrier on the nearest pairs. All are hard, so that they can
-contradict each other; it raises then. By itself its solver would look for the nearest feasible problem instead, which
-follows some targets more closely and took up to a minute in one tick: that is off, and its iterations are a tenth of
-the usual, since even so single ticks took minutes. The barrier knows nothing of braking distances. It is given the
-same URDF with our margins in its position limits, our bodies in place of its collision shapes, the same pairs, the
+contradict each other; it raises then. By itself its solver would look for the nearest feasible problem instead. That
+follows some targets more closely, but took up to a minute in one tick, and is off. Its iterations are a tenth of the
+usual, since single ticks still took minutes. The barrier knows nothing of braking distances. It is given the same URDF
+with our margins in its position limits, and our bodies in place of its collision shapes. It has the same pairs, the
 smallest distance that we keep, and rows for every pair or for the ten nearest. Its solver's tolerance is left as it is
 (1e-6 rad a tick): tighter ones cost it up to two minutes in one tick. Its damping towards a safe displacement, gain 1
 by itself, is off: with it the tools hardly follow at ticks of 1 ms.

@@ -1,8 +1,8 @@
 """Closest points of segments and boxes, signed, compiled.
 
-A capsule is the set of points within ``radius`` of a segment, so the distance of two capsules is that of their
-segments less both radii; a sphere is a capsule whose segment is a point. Because the radius only shifts the distance,
-the distance stays exact and its gradient smooth well into penetration, until the segments themselves meet.
+A capsule is the set of points within ``radius`` of a segment, so the distance of two capsules is that of their segments
+less both radii. A sphere is a capsule whose segment is a point. Because the radius only shifts the distance, the
+distance stays exact and its gradient smooth well into penetration, until the segments themselves meet.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def clamp(value: float, lower: float, upper: float) -> float:
 def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_b: Array) -> float:
     """Distance [m] of segments a0-a1 and b0-b1, each (3,); writes the closest points into ``on_a`` and ``on_b``.
 
-    Minimises the convex quadratic |a(s) - b(t)|^2 over the unit square: the free minimum of s, then t for it, then s
-    again for the clamped t (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
+    Minimises the convex quadratic |a(s) - b(t)|^2 over the unit square. It takes the free minimum of s, then t for it,
+    then s again for the clamped t (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
     """
     aa, bb, ab, ar, br = products(a0, a1, b0, b1)
     s, t = 0.0, 0.0
@@ -104,8 +104,8 @@ def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
 def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
     """Signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
 
-    Writes the closest points and the unit normal from the segment to the box. The squared distance along the segment
-    is convex and piecewise quadratic, so the zero of its slope is found exactly between two of the at most six
+    Writes the closest points and the unit normal from the segment to the box. The squared distance along the segment is
+    convex and piecewise quadratic. The zero of its slope is therefore found exactly between two of the at most six
     parameters where the segment crosses a face plane. A segment that enters the box is pushed out the least way.
     """
     s = _minimum_along(a0, a1, half)
@@ -136,7 +136,7 @@ def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
     """Parameter of the minimum; where many share it (a segment along a face) the middle of them.
 
     The slope never falls, so the largest break with a negative and the smallest with a positive slope enclose all
-    minima; no break lies between them but those where the slope is zero.
+    minima. No break lies between them but those where the slope is zero.
     """
     low, low_slope = 0.0, _slope_along(a0, a1, half, 0.0)
     high, high_slope = 1.0, _slope_along(a0, a1, half, 1.0)
@@ -178,7 +178,7 @@ def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, nor
     """Least way out of the box for a segment that enters it.
 
     That is to the nearest face of their Minkowski difference (Cameron, ICRA 1997). The faces belong to the box's faces,
-    and to each of its edges with the segment; without these the depth would jump where a segment begins to cut an edge.
+    and to each of its edges with the segment. Without these the depth would jump where a segment begins to cut an edge.
     """
     best, axis, sign, edge = np.inf, 0, 1.0, -1
     least = 1e-6 * way_between(a0, a1)

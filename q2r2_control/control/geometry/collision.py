@@ -49,7 +49,7 @@ class Pairs(NamedTuple):
 
 
 class CollisionModel(NamedTuple):
-    """What does not change with the posture."""
+    """Data that do not change with the posture."""
 
     chain: Chain
     bodies: CollisionBodies

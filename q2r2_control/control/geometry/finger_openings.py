@@ -2,8 +2,8 @@
 
 They are changed in place, where the kernels read them. A part of a sliding finger's way is nowhere farther from a
 joint's axis than all of it (``Pairs.reach``, ``leverage``) and fits into a ball of that size about its own middle
-(``CollisionBodies.size``), so that every bound made of these holds as it is. A finger that turns has another capsule,
-radius and size for each interval; ``reach`` and ``leverage`` are made of the farthest of them (``collision_model_of``).
+(``CollisionBodies.size``), so every bound made of these holds as it is. A finger that turns has another capsule, radius
+and size for each interval; ``reach`` and ``leverage`` are made of the farthest of them (``collision_model_of``).
 """
 
 from __future__ import annotations

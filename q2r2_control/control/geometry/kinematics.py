@@ -1,7 +1,7 @@
 """Forward kinematics of a tree of one-axis joints, compiled; equal to Pinocchio's, without its call overhead.
 
-The stop roll-out needs the links' placements at many configurations per tick, so this part of Pinocchio is written
-out here; a test holds it to Pinocchio for every robot.
+The stop roll-out needs the links' placements at many configurations per tick, so this part of Pinocchio is written out
+here. A test holds it to Pinocchio for every robot.
 """
 
 from __future__ import annotations

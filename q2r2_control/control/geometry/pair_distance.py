@@ -1,7 +1,7 @@
 """Signed distances of monitored pairs, exact and smooth, and the rows that are their gradients, compiled.
 
-For the closest points p1, p2 and the unit normal n from the first body to the second, the distance changes with
-d' = n' (J_p2 - J_p1) v: only joints that move one body relative to the other appear in it.
+For the closest points p1, p2 and the unit normal n from the first body to the second, the distance changes with d' = n'
+(J_p2 - J_p1) v. Only joints that move one body relative to the other appear in it.
 
 **Smooth distances** have a gradient that never jumps, for forces that follow it. The closest points of two parallel
 segments, or of a segment along a box's face, jump from end to end as the bodies tilt. Here their parameters s, t in
@@ -10,8 +10,8 @@ segments, or of a segment along a box's face, jump from end to end as the bodies
     D^2 = min |a(s) - b(t)|^2 + e ((s - 1/2)^2 + (t - 1/2)^2),
 
 which makes them unique and continuous in the posture. By the envelope theorem dD = (b - a)' d(b - a) / D at the points
-found, so the pair's row with the normal (b - a) / D, slightly shorter than one, is exactly the gradient of D. D is
-larger than the distance d of the cores, by e / (4 d) at most.
+found. The pair's row with the normal (b - a) / D, slightly shorter than one, is exactly the gradient of D. D is larger
+than the distance d of the cores, by e / (4 d) at most.
 """
 
 from __future__ import annotations

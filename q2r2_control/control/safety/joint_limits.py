@@ -40,7 +40,7 @@ NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3  # what may hold a joint
 
 
 class JointLimits(NamedTuple):
-    """What every joint keeps."""
+    """The limits that every joint keeps."""
 
     lower: Array  # (nv,) positions, the margin taken off [rad]
     upper: Array  # (nv,)

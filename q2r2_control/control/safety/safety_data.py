@@ -27,7 +27,7 @@ class Approach(NamedTuple):
 
 
 class SafetyModel(NamedTuple):
-    """What does not change in a tick; between ticks bodies of fingers, kept distances and the rows' gain may."""
+    """Data that do not change in a tick; between ticks bodies of fingers, kept distances and the rows' gain may."""
 
     collision: CollisionModel
     limits: JointLimits
@@ -117,7 +117,7 @@ class Rollout(NamedTuple):
 
 
 class ActiveBounds(NamedTuple):
-    """What held the last step back; the first ``used[0]`` are valid."""
+    """The limits that held the last step back; the first ``used[0]`` are valid."""
 
     kind: IntArray  # (k,) POSITION, VELOCITY or ACCELERATION of a joint, or SEPARATION of a pair
     subject: IntArray  # (k,) index of the joint or the pair
@@ -173,7 +173,7 @@ class SafetyData(NamedTuple):
 def provable_distances(model: SafetyModel, data: SafetyData) -> Array:
     """d - S of every pair (p,) [m]: the stop that is at hand brings it no closer than that (stop_certificate.py).
 
-    Needs the distances at the reference as it is. A pair may be asked to keep as much from now on: then the stop at
+    Needs the distances at the reference as it is. A pair may be asked to keep as much from now on. Then the stop at
     hand is proven with that, as if it had always been so.
     """
     pairs, travel = model.collision.pairs, 0.5 * data.state.v**2 / data.certified

@@ -77,9 +77,10 @@ def certify_start(model: SafetyModel, data: SafetyData) -> bool:
 def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int:
     """The pair in the way of bodies that have ``grown`` (g,) since the reference was certified and measured; -1: none.
 
-    They may be as they are where each of their pairs keeps its distance at the reference, and the stop that is at hand,
-    or else one of some other shape, which becomes the one at hand, keeps all apart. Then the invariant holds with the
-    grown bodies as if they had always been so. A pair that is too close already must not be made closer by growing.
+    They may be as they are where each of their pairs keeps its distance at the reference, and a stop keeps all apart.
+    It is the stop at hand, or else one of some other shape, which becomes the one at hand. Then the invariant holds
+    with the grown bodies as if they had always been so. A pair that is too close already must not be made closer by
+    growing.
     """
     pairs, any_grown = model.collision.pairs, False
     for p in range(pairs.first.shape[0]):
@@ -218,7 +219,7 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
             continue
         distance[p] = at_least(collision, data.collision, p)
         # The fastest that the pair can close in after this step. Farther than twice what the gain needs for that, and
-        # the way of the stop, a row would bind at very low leverage: it would add comfort, and safety needs none.
+        # the way of the stop, a row would bind at very low leverage. It would add comfort, and safety needs none.
         always = approach.stop_distance[p] + approach.contact_zone[p] + horizon * pairs.leverage[p] * surge
         far = distance[p] >= least
         if far and distance[p] > always + horizon * fastest:

@@ -3,23 +3,23 @@
 The bound by reach (stop_certificate.py) counts every way a joint travels as if it led straight to the other body. A
 pair that rests at min_distance to the micrometre could then never be shown to part again. Here the direction counts.
 
-**Claim.** Let n be the unit normal of two convex cores that do not meet, e_1 and e_2 their corners (the ends of a
-segment, the corners of a box), J_e the Jacobian of a corner at the start, r the joints' reach. If the joints move by
-D(t) with |D_j(t)| <= w_j, then at every t the distance is at least
+**Claim.** Let n be the unit normal of two convex cores that do not meet, and e_1 and e_2 their corners (the ends of a
+segment, the corners of a box). Let J_e be the Jacobian of a corner at the start, and r the joints' reach. If the joints
+move by D(t) with |D_j(t)| <= w_j, then at every t the distance is at least
 
     min over corners of  n'(e_2 - e_1) + n'(J_e2 - J_e1) D(t)   -   K_1 - K_2   -   radii,
 
     K = 1/2 sum_k r_k w_k (w_k + 2 sum_(i before k) w_i)   over the joints that move one body relative to the other.
 
 *Proof.* The distance of convex sets is the largest gap between them over all directions, hence at least the gap along
-n, which is the least over their corners. Joints that carry both bodies change no distance and count as fixed; each of
-the others moves one corner. A corner moves by J_e D and a remainder: its second derivative with respect to joint i and
-a later joint k of the same chain is a product of rotations about both axes with the lever of the outer one, at most
-r_k, so that Taylor's remainder is at most 1/2 sum_ik r_(the outer one) w_i w_k = K. (A slide has reach 1, and turns
+n. That gap is the least over their corners. Joints that carry both bodies change no distance and count as fixed; each
+of the others moves one corner. A corner moves by J_e D and a remainder. Its second derivative with respect to joint i
+and a later joint k of the same chain is a product of rotations about both axes with the lever of the outer one, at most
+r_k. Taylor's remainder is then at most 1/2 sum_ik r_(the outer one) w_i w_k = K. (A slide has reach 1, and turns
 nothing: its second derivative with an inner joint is at most that, with an outer one nothing.) []
 
-In a step, and between two instants of a stop, D_j(t) is a parabola; a joint that comes to rest meanwhile counts as
-anywhere between its ends. So what is to be bounded is a parabola for each two corners.
+In a step, and between two instants of a stop, D_j(t) is a parabola. A joint that comes to rest meanwhile counts as
+anywhere between its ends. The bound is therefore on a parabola for each two corners.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from q2r2_control.types import Array
 
 
 class Gap(NamedTuple):
-    """What a corner adds to the gap between the bodies along the normal: now, in a piece, in another one after it."""
+    """A corner's share in the gap between the bodies along the normal: now, in a piece, in another one after it."""
 
     now: float  # [m]
     rate: float  # [m/s]
@@ -124,7 +124,7 @@ def _gap(
     piece: QuadraticPiece,
     then: QuadraticPiece,
 ) -> Gap:
-    """What a ``corner`` (3,) of one side of a pair, -1 the first's or 1 the second's, adds to the gap."""
+    """The share of a  ``corner`` (3,) of one side of a pair, -1 the first's or 1 the second's, in the gap."""
     chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal
     nx, ny, nz = side * normal[0], side * normal[1], side * normal[2]
     x, y, z = corner[0], corner[1], corner[2]

@@ -4,8 +4,8 @@ The rows tell the QP what the stop can do. Let B be the least free distance of a
 
     B = min over the stop of  d - min_distance - buffer.
 
-It may be used up no faster than at a rate, B(q+, v+) >= (1 - gain h) B(q, v): a control barrier function made of a
-backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its distance uses up nothing and is not
+It may be used up no faster than at a rate, B(q+, v+) >= (1 - gain h) B(q, v). This is a control barrier function made
+of a backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its distance uses up nothing and is not
 slowed; motion that closes in is slowed in time for the stop. B is linearised at the instants of the stop where it is
 least, or may soon be, so that no row comes and goes from tick to tick. The rest beyond B may be used up at 50 /s. At t
 of a stop that takes T joints that stop together have travelled v s, s = t - t^2 / 2T. With the same T after the step,
@@ -17,11 +17,12 @@ in every shape of stop, so that the row is along the pair's own normal. With a l
 change from tick to tick as the shape does.
 
 Closer than the buffer the row asks for opening, as fast as a part of the acceleration limits gives. Pairs that may
-touch have a distance below zero, and a zone before and in contact where B is used up no faster than a speed of their
-own. The rows give comfort only: they are soft, so that the QP always has a solution; safety is the certificate's.
+touch have a distance below zero. Before and in contact they have a zone where B is used up no faster than a speed of
+their own. The rows give comfort only: they are soft, so that the QP always has a solution; safety is the certificate's.
 
-**The gain may change between any two ticks.** The certificate reads no row and no gain; it reads distances, and where
-one is a lower bound that proves less, never more. So what is taken of a solution is proven whatever the gain is.
+**The gain may change between any two ticks.** The certificate reads no row and no gain. It reads distances, and a
+distance that is only a lower bound proves less, never more. The part that is taken of a solution is therefore proven
+whatever the gain is.
 """
 
 from __future__ import annotations
@@ -154,8 +155,8 @@ def _append_row(
     if slow < np.inf:
         allowed = max(allowed, -h * max(slow, gain * (free - model.approach.contact_zone[p])))
     if free < 0.0:
-        # Asked for more than the joints can do in this step, rows of several pairs would be weighed against each other,
-        # and the deeper pair would be opened at the cost of closing another one.
+        # Asked for more than the joints can do in this step, rows of several pairs would be weighed against each other.
+        # The deeper pair would be opened at the cost of closing another one.
         allowed = min(allowed, model.approach.recovery_speed * h, max(h * rate, 0.0) + _SHARE * change)
     if h * rate - change >= allowed or change <= 0.0:
         return count

@@ -1,16 +1,16 @@
 """How fast geometries move, and how much closer two of them come in a step and the stop after it at most, compiled.
 
 The bound by reach (stop_certificate.py) takes every joint's way for one that leads straight to the other body. Most
-pairs of two moving arms need no more than to know how fast their bodies are: joints that stop together go on as they
-began, and arms that move alike do not close in at all.
+pairs of two moving arms need no more than the speeds of their bodies. Joints that stop together go on as they began,
+and arms that move alike do not close in at all.
 
 **Speed.** A geometry lies in the ball of radius s around its middle. With the middle moving at u and the link turning
-at w, no point of it is faster than |u| + |w| s, so the distance of two geometries falls no faster than
-|u_2 - u_1| + |w_1| s_1 + |w_2| s_2.
+at w, no point of it is faster than |u| + |w| s. The distance of two geometries therefore falls no faster than |u_2 -
+u_1| + |w_1| s_1 + |w_2| s_2.
 
-**Claim.** Let d be the distance of two bodies at the reference that share no joint, and V the most that they can close
-in by per second there, |u_2 - u_1| + |w_1| s_1 + |w_2| s_2, where the joints have the velocities v. Let a step of h
-lead to v+, and a stop with the decelerations d_j and the duration T = max |v+_j| / d_j follow. Then their distance is
+**Claim.** Let d be the distance of two bodies at the reference that share no joint. Let V be the most that they can
+close in by per second there, |u_2 - u_1| + |w_1| s_1 + |w_2| s_2, where the joints have the velocities v. Let a step of
+h lead to v+, and a stop with the decelerations d_j and the duration T = max |v+_j| / d_j follow. Then their distance is
 always at least
 
     d  -  V (h + T / 2)  -  sum_j reach_j (rho_j + kappa_j),
@@ -23,14 +23,14 @@ where w_j is the way of joint j in the step and the stop.
 *Proof.* Let D_j(t) be how far joint j has moved. Compare it with v_j sigma(t), where sigma = t in the step and sigma =
 h + s - s^2 / 2T at the time s of the stop, so at most h + T / 2. In the step, |D_j - v_j t| = |v+_j - v_j| t^2 / 2h is
 at most |v+_j - v_j| h / 2, and no more is left of it in the stop. There, v+_j takes the place of v_j, which changes v_j
-(s - s^2 / 2T) by at most |v+_j - v_j| T / 2. The joint itself travels B_j(s) from the step's end; since d_j >= |v+_j| /
-T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never falls, and at T it is |v+_j| T / 2 -
-v+_j^2 / 2 d_j. Together |D_j - v_j sigma| <= rho_j. A point of a body moves by J D + R, with |R| <= sum reach_j kappa_j
-over the joints that move it (separating_plane.py has why). So two points, one of each body's core, get closer by at
-most |(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V. The radii cancel. []
+(s - s^2 / 2T) by at most |v+_j - v_j| T / 2. The joint itself travels B_j(s) from the step's end. Since d_j >= |v+_j| /
+T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never falls. At T it is |v+_j| T / 2 - v+_j^2 /
+2 d_j. Together |D_j - v_j sigma| <= rho_j. A point of a body moves by J D + R, with |R| <= sum reach_j kappa_j over the
+joints that move it (separating_plane.py has why). Two points, one of each body's core, therefore get closer by at most
+|(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V. The radii cancel. []
 
-The velocity of a joint that carries both bodies is part of V, but such a joint is not in the sum: V could then be less
-than how fast the bodies close in. So pairs that share a joint are left to the other proofs.
+The velocity of a joint that carries both bodies is part of V, but such a joint is not in the sum. V could then be less
+than the speed at which the bodies close in. Pairs that share a joint are therefore left to the other proofs.
 """
 
 from __future__ import annotations

@@ -1,19 +1,19 @@
 """The certificate that a step and the full stop after it keep every pair apart, compiled.
 
-**Certificate.** A tick moves the reference along a parabola to (q+, v+) and must know that the parabola and a stop
-from (q+, v+), of one of the shapes in stop_rollout.py, keep every pair at its distance. Then by induction the robot is
-always safe: the last tick's certified stop can be executed now, and what is left of it needs no new check.
+**Certificate.** A tick moves the reference along a parabola to (q+, v+). Two motions must keep every pair at its
+distance: the parabola, and a stop from (q+, v+) of one of the shapes in stop_rollout.py. Then by induction the robot is
+always safe. The last tick's certified stop can be executed now, and the rest of it needs no new check.
 
-**Between samples.** A point of a body is never farther than reach_j from joint j's axis, so while the joints travel
-ways w_j (total variation) a pair's distance changes by at most S = sum_j reach_j w_j over the joints that move one body
-relative to the other. One sample with distance d proves d - S. Of pairs that share no joint more is known: how fast
-their bodies are at the reference (speed_bound.py), enough for most. Where it is not, the plane between the bodies
-proves a piece of the motion, with the direction of it (separating_plane.py): the stop is walked through in pieces as
+**Between samples.** A point of a body is never farther than reach_j from joint j's axis. While the joints travel ways
+w_j (total variation) a pair's distance therefore changes by at most S = sum_j reach_j w_j over the joints that move one
+body relative to the other. One sample with distance d proves d - S. Of pairs that share no joint more is known: how
+fast their bodies are at the reference (speed_bound.py), enough for most. Where it is not, the plane between the bodies
+proves a piece of the motion, with the direction of it (separating_plane.py). The stop is walked through in pieces as
 long as can be proven, each from a sample of its own.
 
 **Rounding.** A motion that is proven to end exactly at a pair's distance may end 1e-16 m below it. Within ROUNDING
-below its distance a pair keeps its full proof, with the distance that it has now as the one to keep. So rounding never
-leads into recovery, where a pair is only sampled.
+below its distance a pair keeps its full proof, with the distance that it has now as the one to keep. Rounding therefore
+never leads into recovery, where a pair is only sampled.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, w
 # Distances of a pair that is too close are compared to this.
 _CLOSER = 1e-12  # [m], and relative
 _STILL = 1e-9  # [m/s]
-# The gap along a plane is less than the distance that it is made of by up to this much, since the closest points of a
-# box and a segment are found to so many digits. Without it a pair at its distance could never be proven to part again.
+# The gap along a plane is less than the distance that it is made of by up to this much. The closest points of a box and
+# a segment are found to so many digits. Without it a pair at its distance could never be proven to part again.
 _LAST_DIGITS = 1e-11  # [m]
 
 

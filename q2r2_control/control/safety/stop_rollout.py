@@ -57,7 +57,7 @@ def brake(q: Array, v: Array, deceleration: Array, t: float, q_out: Array, v_out
             v_out[j] = v[j] - sign * deceleration[j] * t
 
 
-# A joint that rests this much before the end of a piece of time counts as moving until then [s]; far more than
+# A joint that rests this much before the end of a piece of time counts as moving until then [s]. That is far more than
 # rounding, and the way that is counted wrong is d t^2 / 2, 1e-17 rad.
 _SAME_TIME = 1e-9
 

@@ -1,4 +1,4 @@
-"""What the arms should do, as costs of the QP: kernels that add to H and g of  1/2 v' H v + g' v.
+"""The tasks of the arms, as costs of the QP: kernels that add to H and g of  1/2 v' H v + g' v.
 
 ``frame`` follows a tool target, ``hold`` holds joints, ``posture`` uses those that no tool needs; which arm gives way
 is a matter of the weights in ``priority``. Each of these modules has its model, data and kernels, and a line in each

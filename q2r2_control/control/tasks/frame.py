@@ -4,12 +4,12 @@ For each following arm:  |J v - u|^2_W + v' M v, u the wanted tool twist, W = di
 length l that makes a radian comparable to a metre.
 
 **Damping M.** Stretched out towards an unreachable target, the gradient of the reach with respect to the elbow angle
-vanishes like L theta. Under a wanted speed s the loop near that posture therefore has the gain L s / mu, which without
-damping mu is unbounded, and with bounded accelerations ends in a limit cycle. In general the wanted velocity s adds the
-geometric stiffness E_ij = s' d2x / dq_i dq_j, and only its negative part, the pull outwards, needs damping: the pull
-inwards drives the arm away from the singular posture, as it should. Joint i gets mu_i = d_i + sum_j min(|E_ij|, d_i)
-over k, with d_i = max(0, -E_ii); where an arm is pulled straight, |E_ij| <= d_i, so that by Gershgorin's theorem the
-gain is at most k. M vanishes at the target.
+vanishes like L theta. Under a wanted speed s the loop near that posture therefore has the gain L s / mu. Without
+damping mu that is unbounded, and with bounded accelerations it ends in a limit cycle. In general the wanted velocity s
+adds the geometric stiffness E_ij = s' d2x / dq_i dq_j, and only its negative part, the pull outwards, needs damping.
+The pull inwards drives the arm away from the singular posture, as it should. Joint i gets mu_i = d_i + sum_j
+min(|E_ij|, d_i) over k, with d_i = max(0, -E_ii). Where an arm is pulled straight, |E_ij| <= d_i, so that by
+Gershgorin's theorem the gain is at most k. M vanishes at the target.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is told of one arm's teleoperation: to its hand as vibrations, to the log, to RViz, to a recording."""
+"""Reports of one arm's teleoperation: to its hand as vibrations, to the log, to RViz, to a recording."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.hand_motion import MAX_OFFSET
 
 _POSE = 2  # of moveit_msgs/srv/ServoCommandType
-# What the built-in controller says of an arm that takes a stream of targets, and what helps where it takes none.
+# Reports of the built-in controller on an arm that takes a stream of targets, and the cure where it takes none.
 _READY = ("holding", "following", "homing")
 _NO_FAULT = ("active", "paused")
 _CURES = {"stopped": "reset", "paused": "pause with data: false"}
@@ -98,7 +98,7 @@ class ArmOutputs:
 
     @property
     def gripper_held(self) -> str | None:
-        """What the built-in controller says keeps the gripper from the opening that was asked for."""
+        """The pair that keeps the gripper, as the built-in controller says, from the opening that was asked for."""
         why = "" if self._follows is None else self._follows.gripper_held
         return f"the gripper goes no farther: {why}" if why else None
 
@@ -155,7 +155,7 @@ class ArmOutputs:
 class FollowWatch:
     """Whether the built-in controller follows the targets of an arm, as it publishes on ``~/following/<arm>``.
 
-    It drops a stream for reasons of its own, such as missing joint states, and then accepts only a new one, for which
+    It drops a stream for reasons of its own, such as missing joint states. It then accepts only a new one, for which
     the arm has to be paused. A controller that publishes nothing here is taken to follow.
     """
 

@@ -1,4 +1,4 @@
-"""What the built-in controller tells, besides joint commands: safe targets, what it follows, openings of grippers.
+"""Outputs of the built-in controller besides joint commands: safe targets, the arms that follow, openings of grippers.
 
 Fingers and what they hold are bodies. A gripper's client tells the opening that is wanted, and the one that was
 commanded last, on the topic of the arm's targets with ``/wanted_opening`` after it. It commands what

@@ -27,8 +27,8 @@ def wanted_topic(target_topic: str) -> str:
 class OpeningGrants:
     """One arm's gripper; openings are 0 closed .. 1 fully open.
 
-    It says what is wanted, and what the gripper was commanded to last: a controller that starts anew then knows where
-    the gripper may be, and does not take an old wish for a new one.
+    It tells the wanted opening, and the one that was commanded last. A controller that starts anew then knows where the
+    gripper may be, and does not take an old wish for a new one.
     """
 
     def __init__(self, node: Node, controller: str, arm: str, target_topic: str) -> None:

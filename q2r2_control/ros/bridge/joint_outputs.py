@@ -182,8 +182,8 @@ class JointOutput:
     def listener_fault(self, off_reference: bool) -> str | None:
         """One line where what took the commands is gone, or is not alone any more; to be asked before each is sent.
 
-        Asked only where the arms are ``off_reference``, since looking costs a message now and then, and not of torques:
-        arms that yield are off their reference by design, and a torque for where they are is no jump.
+        Asked only where the arms are ``off_reference``, since looking costs a message now and then, and not of torques.
+        Arms that yield are off their reference by design, and a torque for where they are is no jump.
         """
         publishers = [channel.publisher for channel in self._channels]
         before, self._listeners = self._listeners, sum(publisher.listeners for publisher in publishers)

@@ -1,4 +1,6 @@
-"""Settings that change while a node runs. What is set together is done as a whole or not at all, with the reason."""
+"""Settings that change while a node runs. Parameters that are set together change as a whole or not at all, with the
+reason.
+"""
 
 from __future__ import annotations
 

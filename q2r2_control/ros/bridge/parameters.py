@@ -110,7 +110,7 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
 
 
 def teleop_defaults(mirror: bool, filter_window_size: int | None) -> TeleopSettings:
-    """What Quest2ROS2's two arguments of an arm's constructor ask for."""
+    """The stance that Quest2ROS2's two arguments of an arm's constructor ask for."""
     teleop = TeleopSettings(stance=Stance.MIRROR if mirror else Stance.SIDE_BY_SIDE)
     if filter_window_size is None:
         return teleop
@@ -165,7 +165,7 @@ def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
 
 
 def stance_of(mirror: bool, reflected: bool) -> Stance:
-    """What ``mirror`` and ``mirror_reflected`` say. Raises :class:`ConfigError`."""
+    """The stance of ``mirror`` and ``mirror_reflected``. Raises :class:`ConfigError`."""
     if reflected and not mirror:
         raise ConfigError("parameter mirror_reflected = True: allowed with mirror = True only")
     return Stance.SIDE_BY_SIDE if not mirror else Stance.MIRROR_REFLECTED if reflected else Stance.MIRROR

@@ -92,7 +92,7 @@ class HomeClient:
 
 
 class RecorderLink:
-    """What the recorder's node says: whether it records, and whether an episode is open, whoever began it."""
+    """The report of the recorder's node: whether it records, and whether an episode is open, whoever began it."""
 
     def __init__(self, node: Node) -> None:
         self._state: dict[str, Any] | None = None  # the newest that has not been used

@@ -1,1 +1,1 @@
-"""What happens before a node runs; nothing here needs rclpy, and no node needs more of it than ``middleware``."""
+"""Steps before a node runs; nothing here needs rclpy, and no node needs more of it than ``middleware``."""

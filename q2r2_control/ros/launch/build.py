@@ -17,7 +17,7 @@ from pathlib import Path
 from q2r2_control.errors import Q2R2Error
 
 INTERFACES = Path(__file__).parents[1] / "interfaces"
-# What the generators and ament import while CMake runs; rclpy is what the result is for.
+# Packages that the generators and ament import while CMake runs; the result is for rclpy.
 _PYTHON_TOOLS = ("rclpy", "rosidl_adapter", "rosidl_generator_py", "catkin_pkg", "em", "lark", "numpy")
 
 
@@ -85,7 +85,7 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
 
 
 def missing_tools(prefix: Path) -> list[str]:
-    """What a build into ``prefix`` needs and does not have, each with where to get it."""
+    """The things that a build into ``prefix`` needs and does not have, each with where to get it."""
     missing = []
     # Debian's own Python looks elsewhere.
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"

@@ -1,8 +1,8 @@
 """Sets up Fast DDS, the middleware of ROS 2 Jazzy, unless the user has done so; each process for itself.
 
-Shared memory is switched off: a process that is killed while it holds a lock there delays all writers to the same
-memory, and all their subscribers, for about a second. And a node that died leaves the graph after 3 s instead of 20,
-so that its successor counts as a second publisher for no longer.
+Shared memory is switched off. A process that is killed while it holds a lock there delays all writers to the same
+memory, and all their subscribers, for about a second. And a node that died leaves the graph after 3 s instead of 20, so
+that its successor counts as a second publisher for no longer.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """``cartesian_controller``: the built-in controller for all arms of a cell, between target poses and joint commands.
 
-Every topic is one of all arms or one an arm, as the robot's layout asks for: targets on ``/q2r2/left/target_frame`` or
-``left.target_topic``, joint states on ``joint_states`` or ``left.joint_states_topic``, commands on ``output_topic`` or
-``left.output_topic``. With output ``none`` another controller moves the arms, for which ``~/safe_target/left`` is
-published. What is done with targets: :mod:`supervisor`.
+Every topic is one of all arms or one an arm, as the robot's layout asks for. Targets are on ``/q2r2/left/target_frame``
+or ``left.target_topic``, joint states on ``joint_states`` or ``left.joint_states_topic``, commands on ``output_topic``
+or ``left.output_topic``. With output ``none`` another controller moves the arms, for which ``~/safe_target/left`` is
+published. The rules for targets: :mod:`supervisor`.
 """
 
 from __future__ import annotations

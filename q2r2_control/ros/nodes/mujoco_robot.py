@@ -1,9 +1,9 @@
 """``mujoco_robot``: the simulated cell as a ROS robot. It takes joint commands; Cartesian targets are a controller's.
 
 Joint positions come in on any one of ``joint_trajectory`` (one point), ``joint_commands`` (JointState) and
-``position_commands`` (Float64MultiArray in the order of the joints in ``joint_states``, all arms), velocities on
-``velocity_commands`` and torques on ``torque_commands`` (the same order); the newest command counts. Without commands
-the arms brake, and after ``hold_after`` they stand on their position servos, whatever drove them before.
+``position_commands`` (Float64MultiArray in the order of the joints in ``joint_states``, all arms). Velocities come in
+on ``velocity_commands`` and torques on ``torque_commands``, in the same order. The newest command counts. Without
+commands the arms brake, and after ``hold_after`` they stand on their position servos, whatever drove them before.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class MujocoRobot(BaseNode):
         if late := delays.take(delay(info), time.monotonic()):
             self._note(topic, f"{late:.2f} s late; its sender or this node stood still")
             return
-        # What came while this process stood still is as new as what came since the last tick.
+        # A message that came while this process stood still is as new as one that came since the last tick.
         self._received = time.monotonic() - min(age(info), self._period)
         self._note(topic, command(message))
 

@@ -1,8 +1,9 @@
 """``recorder``: keeps what the nodes of a cell publish in one MCAP file a run. It only listens.
 
-It listens to no topic that commands, where it would count as a receiver: an arm without a controller could be engaged
-then, and arms that are off their reference would be stopped. What arms ask for, and the reference that joint commands
-are made of, their nodes publish once more for it. Streams reach it by best effort, so no sender waits for it.
+It listens to no topic that commands, where it would count as a receiver. An arm without a controller could be engaged
+then, and arms that are off their reference would be stopped. The nodes of arms publish their targets once more for it,
+and the controller the reference that joint commands are made of. Streams reach it by best effort, so no sender waits
+for it.
 """
 
 from __future__ import annotations

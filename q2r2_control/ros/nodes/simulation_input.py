@@ -34,8 +34,9 @@ class SimulationInput(BaseNode):
     """Plays a scripted trajectory. It presses and releases the lower buttons, early on, to engage the arms.
 
     The script starts when every hand that it plays has a subscriber. The hands rest until the arms' nodes say that they
-    can be engaged. Then the buttons are pressed, and again where an arm is not engaged by the time the hands would
-    move, or stops in the first six seconds. From then on, and after an arm's ``~/pause``, it takes a person.
+    can be engaged. Then the buttons are pressed. They are pressed again where an arm is not engaged by the time the
+    hands would move, or stops in the first six seconds. From then on, and after an arm's ``~/pause``, it takes a
+    person.
     """
 
     ticks = True

@@ -1,4 +1,4 @@
-"""What is wrong with a set of nodes or with the environment, and what helps; found out without importing rclpy here.
+"""Faults of a set of nodes or of the environment, and their cures; found without importing rclpy here.
 
 A middleware that is not installed ends the process that asks for it, so another process tries.
 """
@@ -20,7 +20,7 @@ from q2r2_control.ros.watching.set_view import SILENT, NodeView, SetView
 from q2r2_control.teleop.arm_states import ArmState
 
 _ONE = "end all but one (a killed one counts for some seconds)"
-# What helps, by the kind of what is in the way.
+# The cure, by the kind of the fault.
 _CURES = {
     ReasonKind.NO_SUBSCRIBER: "start the arm's controller, or set preset or ctrl_prefix to the one that runs",
     ReasonKind.NO_TOOL_POSE: (
@@ -127,7 +127,7 @@ def _cure(node: NodeView, line: str) -> str:
     return next((cure for known, cure in _CURES.items() if known == kind), _SEE)
 
 
-# What the nodes import, besides the packages under ``interfaces``.
+# Packages that the nodes import, besides the packages under ``interfaces``.
 PACKAGES = (
     *("rclpy", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "rcl_interfaces"),
     *("sensor_msgs", "std_msgs", "std_srvs", "trajectory_msgs", "visualization_msgs"),
@@ -189,7 +189,7 @@ def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str],
 
 
 def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> list[str] | Finding:
-    """What a node prints that tries ROS and the code of ``packages``, or why there is no node."""
+    """The output of a node that tries ROS and the code of ``packages``, or why there is no node."""
     own = dict(environment)
     set_up_middleware(own)
     try:

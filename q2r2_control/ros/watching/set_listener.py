@@ -1,7 +1,7 @@
 """Listens to what nodes of a set say on ``~/state``, and so takes no part in it.
 
-An arm that has no controller would take a listener of its targets for one and could be engaged, and a controller lets
-arms go whose commands get a new receiver. How much goes over a topic is counted by who sends it, and said there.
+An arm that has no controller would take a listener of its targets for one and could be engaged. A controller lets arms
+go whose commands get a new receiver. How much goes over a topic is counted by who sends it, and said there.
 """
 
 from __future__ import annotations

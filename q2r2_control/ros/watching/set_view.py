@@ -1,4 +1,4 @@
-"""What is known of a set of nodes at one moment: nodes by what they say, topics by the graph, arms in words."""
+"""A set of nodes at one moment: nodes by what they say, topics by the graph, arms in words."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from q2r2_control.teleop.arm_states import AT_REST, ArmState
 
 SILENT = 2.0  # nodes say what they do twice a second [s]
 _SLIPPED = 0.005  # a target that has slipped farther is held up [m]
-# What waits where the arms move already, and where nothing is wrong.
+# Findings that wait where the arms move already, and where nothing is wrong.
 _MOVES = {
     ArmState.CARRIED: "goes with the other arm",
     ArmState.HOMING: "goes home",

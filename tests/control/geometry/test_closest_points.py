@@ -65,7 +65,7 @@ def _least_distance(segments: Segments) -> float:
 def test_segments_are_as_far_apart_as_their_closest_points(kind: str) -> None:
     random = np.random.default_rng(1)
     on_a, on_b = np.zeros(3), np.zeros(3)
-    # What is parallel but for rounding is measured in the middle of the overlap, not at its nearer end.
+    # Segments that are parallel but for rounding are measured in the middle of the overlap, not at its nearer end.
     tolerance = 1e-7 if kind == "nearly parallel" else 1e-9
     for _ in range(SAMPLES):
         segments = _segments(kind, random)

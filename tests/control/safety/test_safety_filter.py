@@ -26,7 +26,7 @@ def started() -> SafetyData:
 
 
 def moved(data: SafetyData, wish: Array, usable: bool = True) -> int:
-    """What the filter did with a wish."""
+    """The filter's answer to a wish."""
     outcome, _ = apply_safety_filter(MODEL, data, wish, usable, H, 1.0)
     return int(outcome)
 

@@ -18,7 +18,7 @@ H = 0.001
 
 
 class Seen:
-    """What is measured, and the rows that are written, in one state whose joints can stop together."""
+    """The measured distances, and the rows that are written, in one state whose joints can stop together."""
 
     def __init__(self, name: str, q: Array, v: Array) -> None:
         model, data = kernel_model(name).safety, kernel_data(name, q, v).safety

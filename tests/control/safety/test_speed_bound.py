@@ -26,7 +26,7 @@ def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
 
 
 def bounds_of(name: str, motion: Motion) -> Array:
-    """What each pair's distance is at least (p,) by its speed [m]."""
+    """The least distance of each pair (p,) by its speed [m]."""
     data, time = prepared(name, motion)
     return np.array([least_distance(kernel_model(name).safety, data, p, time) for p in range(len(data.distance))])
 
