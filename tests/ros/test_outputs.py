@@ -16,6 +16,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ArmConditions
 from q2r2_control.types import SIDES, ActiveLimit, LimitKind, RobotState
 from tests.ros.conftest import need_ros
@@ -57,7 +58,7 @@ class Commands:
         self._node.create_subscription(Float64MultiArray, "/commands", self._take, COMMAND_QOS)
         wait_until(lambda: self._publisher.listeners > known, "the listener is found")
 
-    def send(self, seconds: float, off_reference: bool) -> str | None:
+    def send(self, seconds: float, off_reference: bool) -> Reason | None:
         """Send 200 commands a second; what was found to be wrong, if anything."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -88,7 +89,7 @@ def test_a_new_receiver_is_noticed_while_arms_are_off_their_reference(
     assert commands.send(0.2, off_reference=False) is None
     commands.listen()
     fault = commands.send(0.2, off_reference)
-    assert (fault is not None and "new receiver" in fault) == (positions and off_reference)
+    assert (fault is not None and fault.kind is ReasonKind.NEW_RECEIVER) == (positions and off_reference)
 
 
 def test_arms_with_a_topic_each_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
@@ -177,7 +178,7 @@ class Stream:
         self._publisher, self._period = publisher, 1.0 / rate
         self.published = self.left_out = 0
 
-    def run(self, seconds: float) -> str | None:
+    def run(self, seconds: float) -> Reason | None:
         """Publish for so long; returns the reported silence of the listener, if there was one."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -208,7 +209,8 @@ def test_a_frozen_listener_alone_is_reported(rate: float, acknowledged: bool, no
     os.kill(listener.pid, signal.SIGSTOP)
     silence = stream.run(10.0 * TIMEOUT)
     assert silence is not None
-    assert silence.startswith("messages on /watched are not acknowledged for 0.")
+    assert (silence.kind, silence.detail["topic"]) == (ReasonKind.NOT_ACKNOWLEDGED, "/watched")
+    assert TIMEOUT < silence.detail["age"] < 1.0
     os.kill(listener.pid, signal.SIGCONT)
     wait_until(lambda: publisher.silence() is None, "it is there again")
 

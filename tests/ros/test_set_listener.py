@@ -14,6 +14,7 @@ from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import String
 
 from q2r2_control import load_config
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.watching.set_listener import SetListener
 from q2r2_control.ros.watching.set_view import NodeView, arm_views
 from tests.ros.conftest import need_ros, spun_node
@@ -130,8 +131,10 @@ def arm(message: str = "running", age: float = 0.1, **values: Any) -> NodeView:
 CONTROLLER = node(
     "/controller", phase="active", left_state="following", closest_distance_m=0.0213, closest_pair="a_0|b_1"
 )
-REFUSING = node("/controller", "target of left not used: begins 4 cm off", "warn", phase="active")
-
+REFUSED = Reason.of(ReasonKind.TWO_PUBLISHERS, arm="left", source="").as_json()
+REFUSING = node("/controller", "a target of one not used", "warn", phase="active", left_target_refusal=REFUSED)
+OTHER_REFUSED = node("/controller", "left out of this", "warn", phase="active", right_target_refusal=REFUSED)
+FAULT = node("/controller", "wrong", "error", phase="braking", fault=Reason(ReasonKind.STOP_SERVICE).as_json())
 
 ENGAGED = arm(state="engaged")
 HELD_UP = arm(state="engaged", slip=0.012), CONTROLLER
@@ -146,7 +149,9 @@ WHY: dict[str, tuple[tuple[NodeView, ...], str]] = {
     "engaged": ((ENGAGED, CONTROLLER), "follows the hand"),
     "no hand": ((arm(state="engaged", hand_age=3.4),), "no pose of the left hand for 3 s"),
     "held up": (HELD_UP, "12 mm short of the hand; nearest pair a_0 | b_1, 21 mm"),
-    "refused": ((ENGAGED, REFUSING), "/controller: target of left not used"),
+    "refused": ((ENGAGED, REFUSING), f"/controller: {ReasonKind.TWO_PUBLISHERS.template.format(source='')}"),
+    "another arm's refused": ((ENGAGED, OTHER_REFUSED), "follows the hand"),
+    "stopped": ((ENGAGED, FAULT), f"/controller: {ReasonKind.STOP_SERVICE.template}"),
     "strange values": ((arm(state="engaged", hand_age="old", slip=None),), "follows the hand"),
 }
 
