@@ -6,14 +6,12 @@ import json
 import math
 from collections.abc import Iterator
 from typing import Any
-from unittest.mock import MagicMock
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from q2r2_control import Robot
-from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from tests.ros.conftest import need_ros
@@ -29,9 +27,7 @@ from q2r2_control.ros.base_node import WARN, BaseNode
 from q2r2_control.ros.bridge.arm_outputs import FollowWatch
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.messages import pose_of, robot_state, stamped_pose
-from q2r2_control.ros.bridge.teleop_loop import HomeClient
 from q2r2_control.ros.nodes.mujoco_robot import MujocoRobot
-from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import RobotState
 from q2r2_control.wording import sentence
 from tests.ros.processes import as_arguments
@@ -76,6 +72,20 @@ def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Ro
     assert taken == [True, True, False, True]
     assert intake.rejected["left"] == 1
     assert intake.faults() == {}
+    node.destroy_node()
+
+
+def test_a_target_that_is_not_used_is_reported_once_for_each_reason(context: Any, robot: Robot) -> None:
+    node, reports = BaseNode("intake", context=context), []
+    intake = TargetIntake(node, robot, lambda: reports.append(intake.faults()["left"]))
+    away = Reason.of(ReasonKind.STREAM_AWAY, distance=0.1, angle=0.0, engage_distance=0.03, engage_angle=0.3)
+    intake.subscribe(lambda arm, pose, *_: None if pose is None else away, lambda arm: None)
+    targets = Arrivals(node, "/q2r2/left/target_frame")
+    for frame in ("elsewhere", "world"):
+        for _ in range(5):
+            targets.arrive(stamped_pose(pin.SE3.Identity(), frame, 0.0), USUAL)
+    assert reports == [Reason.of(ReasonKind.TARGET_FRAME, frame="elsewhere", allowed="world"), away]
+    assert intake.rejected["left"] == 10
     node.destroy_node()
 
 
@@ -196,19 +206,6 @@ def test_what_keeps_a_controller_from_following_is_read_from_its_state(
     assert watch.unready is None or watch.unready.root == (fault or watch.unready)
     assert watch.unready is None or sentence(watch.unready)  # whose fields are all there
     node.destroy_node()
-
-
-@pytest.mark.parametrize(
-    ("outcome", "state"), [("homing_arrived", "paused"), ("homing_no_way", "lost"), (None, "lost")]
-)
-def test_a_way_home_has_arrived_only_where_the_controller_says_so(outcome: str | None, state: str) -> None:
-    teleop = Teleop(TeleopSettings(), ["left"])
-    client = HomeClient(MagicMock(), "/c")
-    client.update(teleop, True, None, 0.0)
-    assert teleop.homing
-    client.update(teleop, False, None if outcome is None else Reason(ReasonKind(outcome)), 1.0)
-    assert teleop.states["left"] == state
-    assert teleop.take_events()[-1].reason.root.kind == (outcome or "homing_ended")
 
 
 NAMES = ("a", "b", "c")

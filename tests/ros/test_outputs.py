@@ -26,7 +26,7 @@ need_ros()
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Empty, Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control import load_config
@@ -37,6 +37,8 @@ from q2r2_control.ros.bridge import joint_outputs
 from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers, listen_to_condition
 from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, PositionArray, TorqueArray, make_output
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
+from q2r2_control.ros.nodes.arm_controllers import LeftArmController
+from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import Command, CommandMode
 
@@ -160,6 +162,29 @@ def test_nearness_limits_and_contact_of_each_arm_are_told_as_they_are(node: Any,
     for arm in SIDES:
         assert told[arm].spare == pytest.approx(controller.spare_distance(arm))
     wait_until(lambda: comes(replace(felt, tau_external=None)), "no force is told where none is measured")
+
+
+@pytest.mark.parametrize(("state", "ends"), [(ArmState.PAUSED, 1), (ArmState.LOST, 0)])
+def test_a_stream_says_that_it_ends_only_where_its_operator_paused_the_arm(
+    state: ArmState, ends: int, node: Any, context: Any
+) -> None:
+    arm, at = LeftArmController(context=context), pin.SE3.Identity()
+    output = arm.outputs.first
+    targets, ended = subscribed(node, PoseStamped, output.topic), subscribed(node, Empty, f"{output.topic}/ended")
+    (end,) = (one for one in arm.publishers if one.topic_name == f"{output.topic}/ended")
+
+    def step(target: pin.SE3 | None, state: ArmState) -> None:
+        now = time.monotonic()
+        output.take_fault(now)
+        output.step(target, at, at, now, now, state=state)
+        time.sleep(0.01)
+
+    wait_until(lambda: step(at, ArmState.ENGAGED) or not targets.empty(), "targets come")
+    wait_until(end.get_subscription_count, "its end would be heard")
+    for _ in range(50):
+        step(None, state)
+    assert ended.qsize() == ends
+    arm.destroy_node()
 
 
 _LOST = "_NODE_NAME_UNKNOWN_"  # as rcl says

@@ -27,6 +27,7 @@ need_ros()
 LONG = 4.0 * PATIENCE
 COMMAND = (sys.executable, "-m", "q2r2_control", "ros")
 CELL = load_config(CONFIG)
+NO_TOOL_POSE = ReasonKind.NO_TOOL_POSE.template.format(cause="")
 
 
 def test_rates_are_what_the_senders_say_and_no_topic_but_states_is_listened_to(node: Any, domain: int) -> None:
@@ -59,9 +60,9 @@ def test_rates_are_what_the_senders_say_and_no_topic_but_states_is_listened_to(n
 def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node: Any, processes: Processes) -> None:
     processes.start_node("left_arm_controller")
     processes.start_node("SimulationInput")
-    States(node, "left_q2r2_arm_controller").wait_for("not known")
+    States(node, "left_q2r2_arm_controller").wait_for(kind="no_tool_pose")
     states = States(node, "simulation_input")
-    states.wait_for("waits for a subscriber of the right hand")
+    states.wait_for(without_subscriber=["right"])
     watch = processes.start(*COMMAND, "watch", "--json", "--duration", "8", name="watch")
     name = f"q2r2_watch_{watch.pid}"
     taken: set[str] = set()
@@ -77,12 +78,12 @@ def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node
         look()
         time.sleep(0.05)
     assert {topic.rpartition("/")[2] for topic in taken} == {"state"}
-    states.wait_for("waits for a subscriber of the right hand")  # it does not play for who watches
+    states.wait_for(without_subscriber=["right"])  # it does not play for who watches
     assert watch.wait(LONG) == 0
     found = json.loads(watch.output.splitlines()[-1])
     left, right = found["arms"]
     assert left["node"] == "/left_q2r2_arm_controller"
-    assert "the tool's pose is not known" in left["why"]
+    assert NO_TOOL_POSE in left["why"]
     assert right["why"].startswith("no node teleoperates this arm")
     topics = {topic["name"]: topic for topic in found["topics"]}
     assert topics["/q2r2/left/target_frame"]["subscribers"] == []
@@ -94,9 +95,9 @@ def test_the_doctor_finds_two_inputs_and_an_arm_without_robot_and_their_cures(no
     processes.start_node("left_arm_controller")
     for number in (1, 2):
         processes.start_node("SimulationInput", "side:=left", node=f"input_{number}")
-    States(node, "left_q2r2_arm_controller").wait_for("not known")
-    States(node, "input_1").wait_for("")
-    States(node, "input_2").wait_for("")
+    States(node, "left_q2r2_arm_controller").wait_for(kind="no_tool_pose")
+    States(node, "input_1").wait_for()
+    States(node, "input_2").wait_for()
     doctor = processes.start(*COMMAND, "doctor", "--duration", "6", "--json", name="doctor")
     assert doctor.wait(LONG) == 1
     found = json.loads(doctor.output.splitlines()[-1])
@@ -105,7 +106,7 @@ def test_the_doctor_finds_two_inputs_and_an_arm_without_robot_and_their_cures(no
     assert "/left_q2r2_arm_controller" in found["nodes"]
     cures = {finding["what"]: finding["cure"] for finding in found["findings"] if finding["stops_arms"]}
     assert "end all but one" in cures["2 publishers of /q2r_left_hand_pose: /input_1, /input_2"]
-    (what,) = (what for what in cures if what.startswith("the left arm: the tool's pose is not known"))
+    (what,) = (what for what in cures if what.startswith(f"the left arm: {NO_TOOL_POSE}"))
     assert "start the robot" in cures[what]
     assert "start cartesian_controller" in cures["no built-in controller runs"]
 
