@@ -173,13 +173,15 @@ def test_a_stream_says_that_it_ends_only_where_its_operator_paused_the_arm(
     targets, ended = subscribed(node, PoseStamped, output.topic), subscribed(node, Empty, f"{output.topic}/ended")
     (end,) = (one for one in arm.publishers if one.topic_name == f"{output.topic}/ended")
 
-    def step(target: pin.SE3 | None, state: ArmState) -> None:
+    def step(target: pin.SE3 | None, state: ArmState) -> int:
+        """How many targets have come."""
         now = time.monotonic()
         output.take_fault(now)
         output.step(target, at, at, now, now, state=state)
         time.sleep(0.01)
+        return targets.qsize()
 
-    wait_until(lambda: step(at, ArmState.ENGAGED) or not targets.empty(), "targets come")
+    wait_until(lambda: step(at, ArmState.ENGAGED), "targets come")
     wait_until(end.get_subscription_count, "its end would be heard")
     for _ in range(50):
         step(None, state)
