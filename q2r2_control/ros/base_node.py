@@ -177,7 +177,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         BaseNode.__init__(self, name, **kwargs)
         LifecycleNodeMixin.__init__(self)
         self._starting = False
-        self.lifecycle_state = "unconfigured"  # inactive, active, finalized, or the transition between these two
+        # unconfigured, inactive, active, finalized, or the transition between inactive and active
+        self.lifecycle_state = "unconfigured"
 
     def begin(self) -> str | None:
         return None
@@ -190,19 +191,14 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         self._starting = True
         self.trigger_configure()
         self.trigger_activate()
-        self._starting = False
+        self._starting, self.lifecycle_state = False, "active"
 
     @property
     def is_active(self) -> bool:
         return self.lifecycle_state == "active"
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.lifecycle_state = "inactive"
-        return TransitionCallbackReturn.SUCCESS
-
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         if self._starting:
-            self.lifecycle_state = "active"
             return TransitionCallbackReturn.SUCCESS
         return self._tried("activated", self.begin, "activating", "active")
 

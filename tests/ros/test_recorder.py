@@ -161,7 +161,7 @@ def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: Runnin
 
 def is_closed(folder: Path) -> bool:
     with suppress(RecordingError):  # of a file of which not even the head is written
-        return Recording(folder).closed
+        return Recording(folder).closed and (folder / "metadata.yaml").is_file()
     return False
 
 
