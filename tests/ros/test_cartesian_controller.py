@@ -73,8 +73,11 @@ def test_pause_stop_and_home(cell: Cell, robot: Robot) -> None:
     assert cell.call("/cartesian_controller/pause", SetBool.Request(data=False)).success
     assert cell.call("/cartesian_controller/home").success
     cell.wait_until_there("left", robot.tool_pose(robot.home, "left"), 4e-3)
+    wait_until(lambda: cell.state("homing_outcome") == {"kind": "homing_arrived"}, "the way home has ended")
+    assert cell.state("fault") is None
     assert cell.call("/cartesian_controller/stop").success
     wait_until(lambda: cell.state("phase") == "stopped", "the controller is stopped")
+    assert (cell.state("fault"), cell.state("kind")) == ({"kind": "stop_service"}, "stop_service")
     wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "nothing is commanded")
 
 
