@@ -11,6 +11,7 @@ import pytest
 
 from tests.ros.conftest import need_ros
 from tests.ros.processes import as_arguments
+from tests.support.reasons import kinds
 
 need_ros()
 
@@ -36,16 +37,16 @@ class WayHome:
     def update(self, now: float, goes: bool, outcome: Reason | None = None) -> list[str]:
         """The events of this time [s]: the state that an arm comes to, and why."""
         self._client.update(self.teleop, goes, outcome, now)
-        return [f"{event.destination}: {event.reason.root.kind}" for event in self.teleop.take_events()]
+        return [f"{event.destination}: {kinds(event.reason)}" for event in self.teleop.take_events()]
 
 
 @pytest.mark.parametrize(
     ("outcome", "event"),
     [
         (Reason(ReasonKind.HOMING_ARRIVED), "paused: homing_arrived"),
-        (Reason.of(ReasonKind.HOMING_HELD_UP, by="a | b"), "lost: homing_held_up"),
-        (Reason(ReasonKind.HOMING_NO_WAY), "lost: homing_no_way"),
-        (None, "lost: homing_ended"),
+        (Reason.of(ReasonKind.HOMING_HELD_UP, by="a | b"), "lost: homing_fault: homing_held_up"),
+        (Reason(ReasonKind.HOMING_NO_WAY), "lost: homing_fault: homing_no_way"),
+        (None, "lost: homing_fault: homing_ended"),
     ],
 )
 def test_both_arms_are_at_home_only_where_the_controller_has_arrived(outcome: Reason | None, event: str) -> None:
@@ -58,9 +59,9 @@ def test_both_arms_are_at_home_only_where_the_controller_has_arrived(outcome: Re
 @pytest.mark.parametrize(
     ("answer", "event"),
     [
-        (None, "lost: no_answer"),
-        ((False, "the controller is paused"), "lost: other"),
-        ((True, "done"), "lost: homing_not_begun"),
+        (None, "lost: not_homing: no_answer"),
+        ((False, "the controller is paused"), "lost: not_homing: other"),
+        ((True, "done"), "lost: not_homing: homing_not_begun"),
     ],
 )
 def test_a_way_home_that_the_controller_does_not_begin_ends(answer: tuple[bool, str] | None, event: str) -> None:
