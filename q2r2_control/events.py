@@ -94,14 +94,53 @@ class ReasonKind(StrEnum):
     TOOL_HELD_UP = "tool_held_up", "a tool is held up on the way to its target"
     ARMS_MUST_HOLD = "arms_must_hold", "stance, axes and controls may be changed while both arms hold"
     CONTROL_REFUSED = "control_refused", "{text}"
-    # Obstacles that ROS nodes find; their text is in the detail.
-    NO_SUBSCRIBER = "no_subscriber", "{text}"  # of an arm's targets
-    NO_TOOL_POSE = "no_tool_pose", "the tool's pose is not known: {text}"
+    # Obstacles that ROS nodes find. Those of the first group have a cause.
+    NO_TOOL_POSE = "no_tool_pose", "the tool's pose is not known: {cause}"
+    CONTROLLER_REFUSES = "controller_refuses", "{cause}"
+    CONTROLLER_STOPPED = "controller_stopped", "{controller} is stopped: {cause}; call {controller}/reset"
+    CONTROLLER_FAULT = "controller_fault", "{controller} is {phase}: {cause}"
+    CONTROLLER_SILENT = "controller_silent", "{controller}: {cause}"
+    CONTROLLER_ON_PAUSE = "controller_on_pause", "{controller} is paused; call {controller}/pause with data: false"
+    CONTROLLER_DEACTIVATED = (
+        "controller_deactivated",
+        "{controller} is deactivated: ros2 lifecycle set {controller} activate takes over where the arms are",
+    )
+    CONTROLLER_RESTARTED = "controller_restarted", "{controller} was restarted"
+    CONTROLLER_ENDED = "controller_ended", "{controller} has ended"
+    NODE_BEGINS = "node_begins", "the node has not begun yet"
+    NODE_ENDS = "node_ends", "the node ends"
+    NO_CURRENT_POSE = "no_current_pose", "current_pose() gives none"
     NO_TRANSFORM = "no_transform", "no transform from {frame} to {world} on /tf"
-    HAND_SILENT = "hand_silent", "{text}"
-    SEVERAL_PUBLISHERS = "several_publishers", "{text}"
-    CONTROLLER_REFUSES = "controller_refuses", "{text}"
+    TRANSFORM_OLD = "transform_old", "{frame} on /tf{source} is {age:.2f} s old"
+    FRAME_DISPUTED = "frame_disputed", "two publishers on /tf say different things of {frame}: end one of {publishers}"
+    TOPIC_EMPTY = "topic_empty", "nothing on {topic}"
+    TOPIC_SILENT = "topic_silent", "{topic}{source} is silent for {age:.2f} s"
+    TOPIC_NOT_A_POSE = "topic_not_a_pose", "{topic}: not finite or not a rotation"
+    SAFE_TARGET_AWAY = "safe_target_away", "{topic} is not where the tool is: the arm moves, or tool_frame is wrong"
+    NO_SUBSCRIBER = "no_subscriber", "{topic} has no subscriber"
+    SUBSCRIBER_UNKNOWN = "subscriber_unknown", "{topic} has a subscriber whose node is not known yet"
+    SEVERAL_PUBLISHERS = (
+        "several_publishers",
+        "{count} publishers of {topic}, allowed is one (a killed one counts for some seconds)",
+    )
+    NOT_ACKNOWLEDGED = "not_acknowledged", "messages on {topic} are not acknowledged for {age:.2f} s"
+    NOT_FOLLOWED = "not_followed", "{topic} says that targets are not followed"
+    FOLLOWED_NO_MORE = "followed_no_more", "{topic} says that targets are not followed any more"
+    NO_POSE_COMMANDS = "no_pose_commands", "{service} has not agreed to poses yet"
+    HAND_SILENT = "hand_silent", "no {data} of the {hand} hand{source} for {age:.2f} s"
+    HAND_UNKNOWN = "hand_unknown", "no {data} of the {hand} hand{source} yet"
+    GRIPPER_FAILED = "gripper_failed", "{text}"
+    NO_WAY_HOME = "no_way_home", "this arm's controller has no way home"
+    NO_SERVICE = "no_service", "there is no service {service}"
+    NO_ANSWER = "no_answer", "{service} does not answer"
+    HOMING_NOT_BEGUN = "homing_not_begun", "{controller} did not begin"
+    NO_CLOCK = "no_clock", "use_sim_time is set and nothing comes on /clock"
+    CLOCK_STANDS = "clock_stands", "use_sim_time is set and the time on /clock stands still"
+    NEW_RECEIVER = "new_receiver", "a new receiver takes the commands, and the arms are not where these are"
+    OTHER_COMMANDER = "other_commander", "{nodes} commands the arms on {topic}"
+    ARMS_MOVE = "arms_move", "the arms do not stand still"
     BAD_JOINT_STATES = "bad_joint_states", "{text}"
+    NO_EXTERNAL_TORQUES = "no_external_torques", "no external torques on {topic}"
     # Findings of supervision.
     NO_STATES_YET = "no_states_yet", "no joint states yet{source}"
     STATES_SILENT = "states_silent", "no joint states{source} for {age:.3f} s; allowed: {timeout:g}"
@@ -126,7 +165,7 @@ class ReasonKind(StrEnum):
         "{arm}: the tool is {distance:.3f} m and {angle:.2f} rad from where it was led; begins anew where it is",
     )
     RUN_ENDED = "run_ended", "the run has ended"
-    STOP_SERVICE = "stop_service", "stopped by ~/stop; ~/reset activates again"
+    STOP_SERVICE = "stop_service", "the stop service was called"
     ACTIVATED = "activated", "active: the reference starts at the measured posture"
     HOMING_OUTCOME = "homing_outcome", "homing ended: {cause}"
     CONTROLLER_PHASE = "controller_phase", "the controller is {phase}"  # in which it follows no targets

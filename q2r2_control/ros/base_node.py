@@ -27,9 +27,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.process.scheduling import StopRequest, schedule_process_as_others, schedule_process_first
 from q2r2_control.ros.executor import TickExecutor, TickGroup
 from q2r2_control.ros.launch.middleware import set_up_middleware
+from q2r2_control.wording import sentence
 
 # A process that goes first and never sleeps would leave nothing of its processor to others; Linux counts [s].
 _NEVER_IDLE = 0.5
@@ -138,22 +140,21 @@ class BaseNode(Node):
         """Publish :meth:`health` now. A timer does it twice a second; call it for a change that should not wait."""
         level, line, values = self.health()
         if (problem := self.clock_problem()) is not None:
-            level, line = max(level, WARN), f"{problem}; {line}"
+            level, line = max(level, WARN), f"{sentence(problem)}; {line}"
+            values = {**values, "clock_problem": problem.as_json()}
         status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=line)
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
         state = {"level": {OK: "ok", WARN: "warn", ERROR: "error"}[level], "message": line, **values}
-        if problem is not None:
-            state["clock_problem"] = problem
         self._state.publish(String(data=json.dumps(state, default=str)))
 
     def close(self) -> None:
         """Called at the end, while the node can still publish."""
 
-    def clock_problem(self, timeout: float = _CLOCK_TIMEOUT) -> str | None:
-        """One line if ROS time is simulated and has stood still for ``timeout`` [s], as far as calls of this tell."""
+    def clock_problem(self, timeout: float = _CLOCK_TIMEOUT) -> Reason | None:
+        """A reason if ROS time is simulated and has stood still for ``timeout`` [s], as far as calls of this tell."""
         clock: Any = self.get_clock()
         now, wall = self.now, time.monotonic()
         if now != self._ros_time[0]:
@@ -161,9 +162,8 @@ class BaseNode(Node):
         if not clock.ros_time_is_active:
             return None
         if now == 0.0:
-            return "use_sim_time is set and nothing comes on /clock"
-        stands = wall - self._ros_time[1] >= timeout
-        return "use_sim_time is set and the time on /clock stands still" if stands else None
+            return Reason(ReasonKind.NO_CLOCK)
+        return Reason(ReasonKind.CLOCK_STANDS) if wall - self._ros_time[1] >= timeout else None
 
 
 class ManagedNode(LifecycleNodeMixin, BaseNode):
@@ -177,6 +177,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         BaseNode.__init__(self, name, **kwargs)
         LifecycleNodeMixin.__init__(self)
         self._starting = False
+        # unconfigured, inactive, active, finalized, or the transition between inactive and active
+        self.lifecycle_state = "unconfigured"
 
     def begin(self) -> str | None:
         return None
@@ -189,36 +191,36 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         self._starting = True
         self.trigger_configure()
         self.trigger_activate()
-        self._starting = False
-
-    @property
-    def lifecycle_state(self) -> str:
-        """unconfigured, inactive, active, finalized, or the transition between them."""
-        return str(self._state_machine.current_state[1])
+        self._starting, self.lifecycle_state = False, "active"
 
     @property
     def is_active(self) -> bool:
         return self.lifecycle_state == "active"
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return TransitionCallbackReturn.SUCCESS if self._starting else self._tried("activated", self.begin)
+        if self._starting:
+            return TransitionCallbackReturn.SUCCESS
+        return self._tried("activated", self.begin, "activating", "active")
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._tried("deactivated", self.end)
+        return self._tried("deactivated", self.end, "deactivating", "inactive")
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.get_logger().warning("not cleaned up: parameters are read once, restart the node for others")
         return TransitionCallbackReturn.FAILURE
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.exit_code = 0
+        self.exit_code, self.lifecycle_state = 0, "finalized"
         return TransitionCallbackReturn.SUCCESS
 
-    def _tried(self, what: str, act: Callable[[], str | None]) -> TransitionCallbackReturn:
+    def _tried(self, what: str, act: Callable[[], str | None], meanwhile: str, done: str) -> TransitionCallbackReturn:
+        """Move on to the state ``done`` by ``act``; where that returns a problem, the state is the one of before."""
+        before, self.lifecycle_state = self.lifecycle_state, meanwhile
         try:
             problem = act()
         except Exception as error:  # rclpy would swallow it
             problem = f"{type(error).__name__}: {error}"
+        self.lifecycle_state = done if problem is None else before
         if problem is None:
             self.get_logger().info(what)
             return TransitionCallbackReturn.SUCCESS

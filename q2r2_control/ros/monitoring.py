@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
-from q2r2_control.events import ReasonKind
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS, BaseNode
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
@@ -130,8 +130,8 @@ class WatchedPublisher:
             self._gap_began = now
         return now - self._gap_began < _GAP
 
-    def silence(self) -> str | None:
-        """One line if nothing was acknowledged for longer than the timeout; call it before each message."""
+    def silence(self) -> Reason | None:
+        """A reason if nothing was acknowledged for longer than the timeout; call it before each message."""
         if not self._streaming:
             return None
         now = time.monotonic()
@@ -141,7 +141,7 @@ class WatchedPublisher:
             self._acknowledged = now
         if self._acknowledged is None or now - self._acknowledged <= self._timeout:
             return None
-        return f"messages on {self.topic_name} are not acknowledged for {now - self._acknowledged:.2f} s"
+        return Reason.of(ReasonKind.NOT_ACKNOWLEDGED, topic=self.topic_name, age=now - self._acknowledged)
 
 
 class CommandWatch:
@@ -164,14 +164,15 @@ class CommandWatch:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []
 
-    def commander(self, within: float) -> str | None:
-        """One line if commands came within the last seconds, else None."""
+    def commander(self, within: float) -> Reason | None:
+        """A reason if commands came within the last seconds, else None."""
         now = time.monotonic()
         for topic, heard in self._heard.items():
             if now - heard <= within:
                 own = self._node.get_fully_qualified_name()
                 names = {node_of(info) or "a node" for info in self._node.get_publishers_info_by_topic(topic)} - {own}
-                return f"{', '.join(sorted(names)) or 'another node'} commands the arms on {topic}"
+                said = ", ".join(sorted(names)) or "another node"
+                return Reason.of(ReasonKind.OTHER_COMMANDER, nodes=said, topic=topic)
         return None
 
     def _on_command(self, topic: str, message: Any) -> None:

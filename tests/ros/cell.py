@@ -27,12 +27,10 @@ from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.frames import FrameTree, read_transforms
 from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.types import Array
-from tests.ros.processes import CONFIG, PATIENCE, ROOT, Processes, RosProcess, call, wait_until
+from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess, call, wait_until
 
 RATE = 100.0  # of targets [Hz]
 NODE_RATE = 125.0  # half of the nodes' default, since many processes share a test machine [Hz]
-_BEGINS = 5.0  # how long a stream of targets may take to be followed [s]
-_GAP = 0.7  # without targets, after which another stream begins: longer than PATIENT's target_timeout [s]
 STILL = 2e-3  # how far joints at rest may move [rad]
 # Longer than by default, so that other load on the machine does not look like a fault.
 PATIENT = ("joint_state_timeout:=0.5", "target_timeout:=0.5", "listener_timeout:=1.0")
@@ -101,18 +99,11 @@ class Cell:
         wait_until(lambda: all(self.find_tool(arm) is not None for arm in self.robot.arms), "tools are on /tf")
 
     def engage(self, *arms: str) -> Stream:
-        """Begin streams of targets at the tools, anew where a stall of this machine ended one that had begun."""
-        deadline = time.monotonic() + PATIENCE
-        while True:
-            stream = Stream(self, {arm: self.tool(arm) for arm in arms})
-            patience = time.monotonic() + _BEGINS
-            while time.monotonic() < min(patience, deadline):
-                if all(self.state(f"{arm}_state") == "following" for arm in arms):
-                    return stream
-                time.sleep(0.01)
-            stream.end()  # or it would pull at the arms in the tests after this one
-            assert time.monotonic() < deadline, f"{arms} do not follow: {self.states}"
-            time.sleep(_GAP)
+        """Begin streams of targets at the tools, and wait until they are followed."""
+        stream = Stream(self, {arm: self.tool(arm) for arm in arms})
+        follows = lambda: all(self.state(f"{arm}_state") == "following" for arm in arms)  # noqa: E731
+        wait_until(follows, f"{arms} follow", lambda: self.states)
+        return stream
 
     def stop_and_reset(self, at_home: bool = False) -> None:
         """Of the controller; ``at_home``: the simulation puts the arms there meanwhile."""

@@ -8,8 +8,6 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-
 from q2r2_control import Robot
 from tests.ros.arm_rig import ArmRig, ArmRigs, patient
 from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
@@ -45,11 +43,8 @@ class Cockpit:
         return sent
 
     def restart(self, name: str) -> None:
-        """Start a node that was killed; what it said before does not count any more."""
+        """Start the robot or controller, which was killed; what it said before does not count any more."""
         self.cell.states.pop(name, None)
-        if name == ARMS:
-            for rig in self.rigs.rigs:
-                rig.state = {}
         self.running[name] = self._starts[name]()
 
     def go_home(self) -> None:
@@ -57,15 +52,3 @@ class Cockpit:
         self.cell.stop_and_reset(at_home=True)
         self.wait_until_up()
         self.rigs.wait(lambda rig: not rig.state["engaged"], "no arm is engaged")
-
-    def go_away(self) -> None:
-        """Both arms are moved away from home by their hands."""
-        self.rigs.engage()
-        if self.from_home < 0.1:
-            self.rigs.move((0.1, 0.0, 0.08), 1.0)
-        states = lambda: [rig.state for rig in self.rigs.rigs]  # noqa: E731
-        wait_until(lambda: self.from_home > 0.1, "the arms are away from home", states)
-
-    @property
-    def from_home(self) -> float:
-        return float(np.abs(self.cell.q - self.cell.robot.home).max())

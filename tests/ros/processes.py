@@ -203,12 +203,12 @@ class States:
 
         self._states = subscribed(node, String, f"/{name}/state")
 
-    def wait_for(self, text: str) -> dict[str, Any]:
-        """The first state from now on whose message contains ``text``."""
+    def wait_for(self, **values: Any) -> dict[str, Any]:
+        """The first state from now on that has these values."""
         drained(self._states)
         deadline = time.monotonic() + PATIENCE
         while True:
             state: dict[str, Any] = json.loads(self._states.get(timeout=PATIENCE).data)
-            if text in state["message"]:
+            if values.items() <= state.items():
                 return state
-            assert time.monotonic() < deadline, f"no state with {text!r}, the last was {state}"
+            assert time.monotonic() < deadline, f"no state with {values}, the last was {state}"

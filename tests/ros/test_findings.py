@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 
 from q2r2_control import load_config
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.watching.findings import PACKAGES, Finding, examine_environment, examine_set
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
+from q2r2_control.wording import sentence
 from tests.ros.processes import CONFIG, ROOT
 
 CELL = load_config(CONFIG)
@@ -65,7 +67,7 @@ def test_nothing_is_found_in_a_good_set_nor_where_none_runs() -> None:
 
 OTHER = node("/other", phase="active", left_state="holding")
 STOPPED = "/c is stopped: by hand; call /c/reset"
-NO_CLOCK = "use_sim_time is set and nothing comes on /clock"
+NO_CLOCK = Reason(ReasonKind.NO_CLOCK)
 NO_SUBSCRIBER = "/left/target has no subscriber"
 STOPPING = {
     "two publishers of a target": (
@@ -82,10 +84,18 @@ STOPPING = {
     "no controller": (view(without="/controller"), "no built-in controller", "start cartesian"),
     "no robot": (view(without="/joint_states"), "nothing publishes joint states", "start the"),
     "silent": (view(node("/robot", age=5.0)), "/robot is silent for 5 s", "restart it"),
-    "no clock": (view(arm("left", clock_problem=NO_CLOCK)), f"/left_arm: {NO_CLOCK}", "without use_sim_time"),
+    "no clock": (
+        view(arm("left", clock_problem=NO_CLOCK.as_json())),
+        f"/left_arm: {sentence(NO_CLOCK)}",
+        "without use_sim_time",
+    ),
     "an arm that is not ready": (
         view(arm("left", ready=False, message=NO_SUBSCRIBER, kind="no_subscriber")),
         *(f"the left arm: {NO_SUBSCRIBER}", "start the arm's controller"),
+    ),
+    "a fault of the controller": (
+        view(node("/controller", phase="inactive", level="error", message="silent", kind="states_silent")),
+        *("/controller: silent", "look at the robot's driver"),
     ),
     "stop": (
         view(arm("left", ready=False, message=STOPPED, kind="controller_refuses")),

@@ -19,6 +19,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.serialization import serialize_message
 from tf2_msgs.msg import TFMessage
 
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS
 from q2r2_control.ros.bridge.frames import FrameListener, FrameTree, ReadTransform, read_transforms
 from tests.ros.arm_rig import stamped_transform
@@ -100,13 +101,14 @@ def test_two_publishers_of_a_frame_block_it_if_they_disagree(
 ) -> None:
     node.now = 0.0  # which nodes of the package have
     listener = FrameListener(node)
+    disputed = Reason.of(ReasonKind.FRAME_DISPUTED, frame="mount", publishers="/another and /test")
     timers = [send_from(node, "mount", A, 300), send_from(node, "elsewhere", B, 0)]
     wait_until(lambda: listener.tree.find("mount", "world") is not None, "one publisher is heard")
     assert listener.conflict("mount") is None
     with spun_node(domain, "another") as another:
         send_from(another, "mount", second, 0)
         if disagree:
-            wait_until(lambda: "/another and /test" in str(listener.conflict("mount")), "they disagree")
+            wait_until(lambda: listener.conflict("mount") == disputed, "they disagree")
             assert listener.conflict("elsewhere") is None
         else:
             time.sleep(1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 from q2r2_control import Robot
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import Reason, ReasonKind
 from tests.ros.conftest import need_ros
 
 need_ros()
@@ -65,10 +67,25 @@ def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Ro
     for took in (USUAL, USUAL, LATE, USUAL):
         targets.arrive(stamped_pose(pin.SE3.Identity(), "world", 0.0), took)
         if took == LATE:
-            assert intake.faults() == ["target of left not used: 1.00 s late; its sender or this node stood still"]
+            (refusal,) = intake.faults().values()
+            assert (refusal.kind, refusal.detail["late"]) == (ReasonKind.TARGET_LATE, pytest.approx(1.0, abs=0.01))
     assert taken == [True, True, False, True]
     assert intake.rejected["left"] == 1
-    assert intake.faults() == []
+    assert intake.faults() == {}
+    node.destroy_node()
+
+
+def test_a_target_that_is_not_used_is_reported_once_for_each_reason(context: Any, robot: Robot) -> None:
+    node, reports = BaseNode("intake", context=context), []
+    intake = TargetIntake(node, robot, lambda: reports.append(intake.faults()["left"]))
+    away = Reason.of(ReasonKind.STREAM_AWAY, distance=0.1, angle=0.0, engage_distance=0.03, engage_angle=0.3)
+    intake.subscribe(lambda arm, pose, *_: None if pose is None else away, lambda arm: None)
+    targets = Arrivals(node, "/q2r2/left/target_frame")
+    for frame in ("elsewhere", "world"):
+        for _ in range(5):
+            targets.arrive(stamped_pose(pin.SE3.Identity(), frame, 0.0), USUAL)
+    assert reports == [Reason.of(ReasonKind.TARGET_FRAME, frame="elsewhere", allowed="world"), away]
+    assert intake.rejected["left"] == 10
     node.destroy_node()
 
 
@@ -109,7 +126,7 @@ def test_joint_states_of_an_arm_each_are_merged_and_need_all_joints(context: Any
     assert isinstance(state, RobotState)
     np.testing.assert_allclose(state.q, q)
     part("right", without="right_A3")
-    assert sentence(taken[-1]) == "/right/joint_states: no joint right_A3"
+    assert taken[-1] == Reason.of(ReasonKind.BAD_JOINT_STATES, text="/right/joint_states: no joint right_A3")
     for _ in range(2):
         part("left")
     assert taken[-2].stamp == taken[-1].stamp > state.stamp  # as old as the oldest of its parts, which is the right's
@@ -128,7 +145,7 @@ def test_an_admittance_has_no_good_state_without_external_torques(context: Any, 
     names, torques = list(robot.joint_names), np.arange(len(robot.home), dtype=float)
     states, felt = Arrivals(node, "/joint_states"), Arrivals(node, "/felt")
     states.arrive(JointState(name=names, position=robot.home.tolist()))
-    assert sentence(taken[-1]) == "no external torques on /felt"
+    assert taken[-1] == Reason.of(ReasonKind.NO_EXTERNAL_TORQUES, topic="/felt")
     felt.arrive(JointState(name=names[::-1], effort=torques[::-1].tolist()))
     states.arrive(JointState(name=names, position=robot.home.tolist()))
     assert isinstance(taken[-1], RobotState)
@@ -149,18 +166,45 @@ def test_an_arm_pauses_when_its_controller_does_not_follow_but_not_on_its_way_ho
     following.arrive(Bool(data=False))
     assert watch.refusal(False, 10.0) is None
     assert watch.refusal(True, 10.1) is None
-    assert watch.refusal(True, 10.5) == "/controller/following/left says that targets are not followed"
+    topic = "/controller/following/left"
+    assert watch.refusal(True, 10.5) == Reason.of(ReasonKind.NOT_FOLLOWED, topic=topic)
     following.arrive(Bool(data=True))
     assert watch.refusal(True, 11.0) is None
     assert watch.refusal(True, 11.5) is None
     following.arrive(Bool(data=False))
-    assert watch.refusal(True, 11.6) == "/controller/following/left says that targets are not followed any more"
+    assert watch.refusal(True, 11.6) == Reason.of(ReasonKind.FOLLOWED_NO_MORE, topic=topic)
+    states.arrive(String(data=controller_state("homing", None)))
     for text in ("no JSON", "[]", "{}"):
         states.arrive(String(data=text))
-    states.arrive(String(data='{"left_state": "homing", "message": "active"}'))
     assert (watch.homing, watch.unready, watch.refusal(True, 20.0)) == (True, None, None)
-    states.arrive(String(data='{"left_state": "stopped", "message": "by ~/stop"}'))
-    assert watch.unready == "/controller is stopped: by /controller/stop; call /controller/reset"
+    node.destroy_node()
+
+
+def controller_state(arm: str, fault: Reason | None, outcome: Reason | None = None) -> str:
+    said = {"fault": fault, "homing_outcome": outcome}
+    return json.dumps({"left_state": arm} | {key: why and why.as_json() for key, why in said.items()})
+
+
+@pytest.mark.parametrize(
+    ("arm", "fault", "unready"),
+    [
+        ("following", Reason(ReasonKind.STOP_SERVICE), None),  # the arm's state decides
+        ("paused", None, "controller_on_pause"),
+        ("inactive", None, "controller_phase"),
+        ("inactive", Reason(ReasonKind.CLOCK_NOT_FINITE), "controller_fault"),
+        ("stopped", Reason(ReasonKind.STOP_SERVICE), "controller_stopped"),
+        ("deactivated", Reason.of(ReasonKind.CONTROLLER_DEACTIVATED, controller="/c"), "controller_deactivated"),
+    ],
+)
+def test_what_keeps_a_controller_from_following_is_read_from_its_state(
+    arm: str, fault: Reason | None, unready: str | None, context: Any
+) -> None:
+    node = BaseNode("arm", context=context)
+    watch = FollowWatch(node, "/c", "left", 0.3)
+    Arrivals(node, "/c/state").arrive(String(data=controller_state(arm, fault)))
+    assert (watch.unready and str(watch.unready.kind)) == unready
+    assert watch.unready is None or watch.unready.root == (fault or watch.unready)
+    assert watch.unready is None or sentence(watch.unready)  # whose fields are all there
     node.destroy_node()
 
 

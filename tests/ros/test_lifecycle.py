@@ -21,7 +21,9 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import STREAM_QOS
+from q2r2_control.wording import sentence
 from tests.ros.cell import PATIENT, SOFT, Cell, changed_cell, shifted, start_controller, start_robot
 from tests.ros.processes import wait_until
 
@@ -104,7 +106,8 @@ def test_it_takes_over_where_another_node_that_is_silent_has_left_the_arms(cell:
     assert np.abs(cell.q - goal).max() < 0.02
     assert not cell.ask(Transition.TRANSITION_ACTIVATE)
     assert cell.lifecycle() == "inactive"
-    wait_until(lambda: "commands the arms on /joint_trajectory" in cell.processes[1].output, "the log says why")
+    why = sentence(Reason.of(ReasonKind.OTHER_COMMANDER, nodes="/test", topic="/joint_trajectory"))
+    wait_until(lambda: why in cell.processes[1].output, "the log says why")
     cell.node.destroy_timer(timer)
     time.sleep(0.5)
     cell.commands.clear()

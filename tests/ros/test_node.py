@@ -35,7 +35,7 @@ def test_all_threads_of_a_node_have_its_real_time_priority_where_permitted(node:
         pytest.skip("only Linux has SCHED_FIFO")
     states = States(node, "simulation_input")
     process = processes.start_node("SimulationInput", "realtime_priority:=7")
-    states.wait_for("waits for a subscriber")
+    states.wait_for(without_subscriber=["left", "right"])
     refused = "no SCHED_FIFO" in process.output
     expected = (0, 0) if refused else (os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 7)
     # The thread that ticks, and those of the middleware that were there before: others may have begun since.

@@ -16,6 +16,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ArmConditions
 from q2r2_control.types import SIDES, ActiveLimit, LimitKind, RobotState
 from tests.ros.conftest import need_ros
@@ -27,7 +28,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Empty, Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control import load_config
@@ -39,6 +40,8 @@ from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers, listen_to_
 from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, PositionArray, TorqueArray, make_output
 from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
+from q2r2_control.ros.nodes.arm_controllers import LeftArmController
+from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import Command, CommandMode
 
@@ -60,7 +63,7 @@ class Commands:
         self._node.create_subscription(Float64MultiArray, "/commands", self._take, COMMAND_QOS)
         wait_until(lambda: self._publisher.listeners > known, "the listener is found")
 
-    def send(self, seconds: float, off_reference: bool) -> str | None:
+    def send(self, seconds: float, off_reference: bool) -> Reason | None:
         """Send 200 commands a second; what was found to be wrong, if anything."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -91,7 +94,7 @@ def test_a_new_receiver_is_noticed_while_arms_are_off_their_reference(
     assert commands.send(0.2, off_reference=False) is None
     commands.listen()
     fault = commands.send(0.2, off_reference)
-    assert (fault is not None and "new receiver" in fault) == (positions and off_reference)
+    assert (fault is not None and fault.kind is ReasonKind.NEW_RECEIVER) == (positions and off_reference)
 
 
 def test_arms_with_a_topic_each_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
@@ -164,6 +167,31 @@ def test_nearness_limits_and_contact_of_each_arm_are_told_as_they_are(node: Any,
     wait_until(lambda: comes(replace(felt, tau_external=None)), "no force is told where none is measured")
 
 
+@pytest.mark.parametrize(("state", "ends"), [(ArmState.PAUSED, 1), (ArmState.LOST, 0)])
+def test_a_stream_says_that_it_ends_only_where_its_operator_paused_the_arm(
+    state: ArmState, ends: int, node: Any, context: Any
+) -> None:
+    arm, at = LeftArmController(context=context), pin.SE3.Identity()
+    output = arm.outputs.first
+    targets, ended = subscribed(node, PoseStamped, output.topic), subscribed(node, Empty, f"{output.topic}/ended")
+    (end,) = (one for one in arm.publishers if one.topic_name == f"{output.topic}/ended")
+
+    def step(target: pin.SE3 | None, state: ArmState) -> int:
+        """How many targets have come."""
+        now = time.monotonic()
+        output.take_fault(now)
+        output.step(target, at, at, now, now, state=state)
+        time.sleep(0.01)
+        return targets.qsize()
+
+    wait_until(lambda: step(at, ArmState.ENGAGED), "targets come")
+    wait_until(end.get_subscription_count, "its end would be heard")
+    for _ in range(50):
+        step(None, state)
+    assert ended.qsize() == ends
+    arm.destroy_node()
+
+
 _LOST = "_NODE_NAME_UNKNOWN_"  # as rcl says
 LISTENER = """
 import rclpy
@@ -180,7 +208,7 @@ class Stream:
         self._publisher, self._period = publisher, 1.0 / rate
         self.published = self.left_out = 0
 
-    def run(self, seconds: float) -> str | None:
+    def run(self, seconds: float) -> Reason | None:
         """Publish for so long; returns the reported silence of the listener, if there was one."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -211,7 +239,8 @@ def test_a_frozen_listener_alone_is_reported(rate: float, acknowledged: bool, no
     os.kill(listener.pid, signal.SIGSTOP)
     silence = stream.run(10.0 * TIMEOUT)
     assert silence is not None
-    assert silence.startswith("messages on /watched are not acknowledged for 0.")
+    assert (silence.kind, silence.detail["topic"]) == (ReasonKind.NOT_ACKNOWLEDGED, "/watched")
+    assert TIMEOUT < silence.detail["age"] < 1.0
     os.kill(listener.pid, signal.SIGCONT)
     wait_until(lambda: publisher.silence() is None, "it is there again")
 

@@ -14,6 +14,7 @@ from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import String
 
 from q2r2_control import load_config
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.watching.set_listener import SetListener
 from q2r2_control.ros.watching.set_view import NodeView, arm_views
 from tests.ros.conftest import need_ros, spun_node
@@ -26,6 +27,7 @@ need_ros()
 LONG = 4.0 * PATIENCE
 COMMAND = (sys.executable, "-m", "q2r2_control", "ros")
 CELL = load_config(CONFIG)
+NO_TOOL_POSE = ReasonKind.NO_TOOL_POSE.template.format(cause="")
 
 
 def test_rates_are_what_the_senders_say_and_no_topic_but_states_is_listened_to(node: Any, domain: int) -> None:
@@ -58,9 +60,9 @@ def test_rates_are_what_the_senders_say_and_no_topic_but_states_is_listened_to(n
 def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node: Any, processes: Processes) -> None:
     processes.start_node("left_arm_controller")
     processes.start_node("SimulationInput")
-    States(node, "left_q2r2_arm_controller").wait_for("not known")
+    States(node, "left_q2r2_arm_controller").wait_for(kind="no_tool_pose")
     states = States(node, "simulation_input")
-    states.wait_for("waits for a subscriber of the right hand")
+    states.wait_for(without_subscriber=["right"])
     watch = processes.start(*COMMAND, "watch", "--json", "--duration", "8", name="watch")
     name = f"q2r2_watch_{watch.pid}"
     taken: set[str] = set()
@@ -76,12 +78,12 @@ def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node
         look()
         time.sleep(0.05)
     assert {topic.rpartition("/")[2] for topic in taken} == {"state"}
-    states.wait_for("waits for a subscriber of the right hand")  # it does not play for who watches
+    states.wait_for(without_subscriber=["right"])  # it does not play for who watches
     assert watch.wait(LONG) == 0
     found = json.loads(watch.output.splitlines()[-1])
     left, right = found["arms"]
     assert left["node"] == "/left_q2r2_arm_controller"
-    assert "the tool's pose is not known" in left["why"]
+    assert NO_TOOL_POSE in left["why"]
     assert right["why"].startswith("no node teleoperates this arm")
     topics = {topic["name"]: topic for topic in found["topics"]}
     assert topics["/q2r2/left/target_frame"]["subscribers"] == []
@@ -93,9 +95,9 @@ def test_the_doctor_finds_two_inputs_and_an_arm_without_robot_and_their_cures(no
     processes.start_node("left_arm_controller")
     for number in (1, 2):
         processes.start_node("SimulationInput", "side:=left", node=f"input_{number}")
-    States(node, "left_q2r2_arm_controller").wait_for("not known")
-    States(node, "input_1").wait_for("")
-    States(node, "input_2").wait_for("")
+    States(node, "left_q2r2_arm_controller").wait_for(kind="no_tool_pose")
+    States(node, "input_1").wait_for()
+    States(node, "input_2").wait_for()
     doctor = processes.start(*COMMAND, "doctor", "--duration", "6", "--json", name="doctor")
     assert doctor.wait(LONG) == 1
     found = json.loads(doctor.output.splitlines()[-1])
@@ -104,7 +106,7 @@ def test_the_doctor_finds_two_inputs_and_an_arm_without_robot_and_their_cures(no
     assert "/left_q2r2_arm_controller" in found["nodes"]
     cures = {finding["what"]: finding["cure"] for finding in found["findings"] if finding["stops_arms"]}
     assert "end all but one" in cures["2 publishers of /q2r_left_hand_pose: /input_1, /input_2"]
-    (what,) = (what for what in cures if what.startswith("the left arm: the tool's pose is not known"))
+    (what,) = (what for what in cures if what.startswith(f"the left arm: {NO_TOOL_POSE}"))
     assert "start the robot" in cures[what]
     assert "start cartesian_controller" in cures["no built-in controller runs"]
 
@@ -130,8 +132,10 @@ def arm(message: str = "running", age: float = 0.1, **values: Any) -> NodeView:
 CONTROLLER = node(
     "/controller", phase="active", left_state="following", closest_distance_m=0.0213, closest_pair="a_0|b_1"
 )
-REFUSING = node("/controller", "target of left not used: begins 4 cm off", "warn", phase="active")
-
+REFUSED = Reason.of(ReasonKind.TWO_PUBLISHERS, arm="left", source="").as_json()
+REFUSING = node("/controller", "a target of one not used", "warn", phase="active", left_target_refusal=REFUSED)
+OTHER_REFUSED = node("/controller", "left out of this", "warn", phase="active", right_target_refusal=REFUSED)
+FAULT = node("/controller", "wrong", "error", phase="braking", fault=Reason(ReasonKind.STOP_SERVICE).as_json())
 
 ENGAGED = arm(state="engaged")
 HELD_UP = arm(state="engaged", slip=0.012), CONTROLLER
@@ -146,7 +150,9 @@ WHY: dict[str, tuple[tuple[NodeView, ...], str]] = {
     "engaged": ((ENGAGED, CONTROLLER), "follows the hand"),
     "no hand": ((arm(state="engaged", hand_age=3.4),), "no pose of the left hand for 3 s"),
     "held up": (HELD_UP, "12 mm short of the hand; nearest pair a_0 | b_1, 21 mm"),
-    "refused": ((ENGAGED, REFUSING), "/controller: target of left not used"),
+    "refused": ((ENGAGED, REFUSING), f"/controller: {ReasonKind.TWO_PUBLISHERS.template.format(source='')}"),
+    "another arm's refused": ((ENGAGED, OTHER_REFUSED), "follows the hand"),
+    "stopped": ((ENGAGED, FAULT), f"/controller: {ReasonKind.STOP_SERVICE.template}"),
     "strange values": ((arm(state="engaged", hand_age="old", slip=None),), "follows the hand"),
 }
 

@@ -74,13 +74,12 @@ def test_the_script_waits_until_both_hands_are_listened_to(node: Any, processes:
     states = States(node, "simulation_input")
     left = subscribe(node, "left")
     process = start(processes, side="both", frame_id="room")
-    assert states.wait_for("waits for a subscriber of the right hand")["samples"] == 0
+    assert states.wait_for(without_subscriber=["right"])["samples"] == 0
     time.sleep(0.2)
     assert left["pose"].empty()
     for queues in (subscribe(node, "right"), left):
         assert queues["pose"].get(timeout=PATIENCE).header.frame_id == "room"
-    state = states.wait_for("circle of left and right")
-    assert state["level"] == "ok"
+    states.wait_for(level="ok", without_subscriber=[])
     assert process.interrupt() == 0
 
 
@@ -96,7 +95,7 @@ def test_the_script_waits_for_an_arm_to_be_ready_and_presses_until_it_follows(no
     arm = speaking_arm(node, ready=False, message="no tool yet")
     states, left = States(node, "simulation_input"), subscribe(node, "left")
     start(processes, side="left", trajectory="line")
-    states.wait_for("no tool yet")
+    states.wait_for(level="warn", without_subscriber=[])
     time.sleep(2.0)
     held = drained(left["pose"])
     assert not any(message.button_lower for message in drained(left["inputs"])), "nothing is pressed meanwhile"

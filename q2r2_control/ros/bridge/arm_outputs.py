@@ -23,10 +23,8 @@ from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.hand_motion import MAX_OFFSET
 
 _POSE = 2  # of moveit_msgs/srv/ServoCommandType
-# Reports of the built-in controller on an arm that takes a stream of targets, and the cure where it takes none.
+# Reports of the built-in controller on an arm that takes a stream of targets.
 _READY = ("holding", "following", "homing")
-_NO_FAULT = ("active", "paused")
-_CURES = {"stopped": "reset", "paused": "pause with data: false"}
 _ANSWER = 0.2  # the controller has told of all earlier streams by then [s]
 _RETRY = 1.0  # the service is called again if it has not answered for this long [s]
 
@@ -64,7 +62,7 @@ class ArmOutputs:
             self._follows = FollowWatch(node, values.builtin_node, arm, 2.0 * values.listener_timeout)
         service = preset.command_type
         self._command_type = None if service is None else CommandType(node, service.format(ctrl=values.prefix))
-        self._safe_problem: str | None = self._safe_target.problem  # why the relay could not begin now
+        self._safe_problem: Reason | None = self._safe_target.problem  # why the relay could not begin now
         self._relaying = False
 
     def limit(self, guard: GuardSettings) -> None:
@@ -74,27 +72,27 @@ class ArmOutputs:
             output.guard.change(guard)
 
     @property
-    def conflict(self) -> str | None:
-        """One line if an output's topic has other publishers."""
-        return next((line for output in self._all if (line := output.conflict)), None)
+    def conflict(self) -> Reason | None:
+        """A reason if an output's topic has other publishers."""
+        return next((conflict for output in self._all if (conflict := output.conflict)), None)
 
     @property
     def unready(self) -> Reason | None:
         """Why the arm may not be engaged yet."""
-        if line := next((line for output in self._all if (line := output.unready)), None):
-            return Reason.of(ReasonKind.NO_SUBSCRIBER, text=line)
+        if unready := next((unready for output in self._all if (unready := output.unready)), None):
+            return unready
         if self._last is not None and not self._relaying:
-            line = self._safe_problem
-        if line is None and self._follows is not None:
-            line = self._follows.unready
-        if line is None and self._command_type is not None:
-            line = self._command_type.unready
-        return _refused(line)
+            unready = self._safe_problem
+        if unready is None and self._follows is not None:
+            unready = self._follows.unready
+        if unready is None and self._command_type is not None:
+            unready = self._command_type.unready
+        return _refused(unready)
 
     @property
-    def homing(self) -> tuple[bool, str]:
-        """Whether the built-in controller says that it goes home, and how the last way ended."""
-        return (False, "") if self._follows is None else (self._follows.homing, self._follows.homing_ended)
+    def homing(self) -> tuple[bool, Reason | None]:
+        """Whether the built-in controller says that it goes home, and how the last way ended by itself."""
+        return (False, None) if self._follows is None else (self._follows.homing, self._follows.homing_outcome)
 
     @property
     def gripper_held(self) -> str | None:
@@ -138,7 +136,7 @@ class ArmOutputs:
         self._safe_problem = self._safe_target.problem if safe is None else None
         if safe is not None and tool is not None and not near(safe, tool, *MAX_OFFSET):
             where = self._safe_target.topic
-            self._safe_problem = f"{where} is not where the tool is: the arm moves, or tool_frame is wrong"
+            self._safe_problem = Reason.of(ReasonKind.SAFE_TARGET_AWAY, topic=where)
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
@@ -165,14 +163,15 @@ class FollowWatch:
         self._follows: bool | None = None
         self._since = math.inf  # targets have been sent and not followed [s]
         self._followed_since = math.inf  # targets have been sent and followed [s]
-        self.unready: str | None = None  # why the controller would follow no stream of targets now
-        self.homing, self.homing_ended = False, ""  # whether it says that it goes home; how the last way ended
+        self.unready: Reason | None = None  # why the controller would follow no stream of targets now
+        self.homing = False  # whether it says that it goes home
+        self.homing_outcome: Reason | None = None  # of the last way, where that ended by itself
         self.gripper_held = ""  # what keeps the gripper from going farther
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, f"{controller}/state", self._on_state, 1)
 
-    def refusal(self, sending: bool, now: float) -> str | None:
-        """One line if targets are ``sending`` and are followed no more, or not yet after the timeout."""
+    def refusal(self, sending: bool, now: float) -> Reason | None:
+        """A reason if targets are ``sending`` and are followed no more, or not yet after the timeout."""
         if self.homing:
             return None
         followed = sending and self._follows is True
@@ -185,7 +184,7 @@ class FollowWatch:
         self._since, self._followed_since = min(self._since, now), math.inf
         if self._follows is None or not (dropped or now - self._since > self._timeout):
             return None
-        return f"{self._topic} says that targets are not followed" + (" any more" if dropped else "")
+        return Reason.of(ReasonKind.FOLLOWED_NO_MORE if dropped else ReasonKind.NOT_FOLLOWED, topic=self._topic)
 
     def _on_following(self, message: Bool) -> None:
         self._follows = bool(message.data)
@@ -193,15 +192,24 @@ class FollowWatch:
     def _on_state(self, message: String) -> None:
         try:
             said = json.loads(message.data)
-            state, why = said[f"{self._arm}_state"], said["message"]
+            state, fault, outcome = said[f"{self._arm}_state"], said["fault"], said["homing_outcome"]
+            self.unready = self._unready(state, None if fault is None else Reason.from_json(fault))
+            self.homing_outcome = None if outcome is None else Reason.from_json(outcome)
         except (ValueError, TypeError, KeyError):
             return  # some other node's
-        self.unready, self.gripper_held = None, str(said.get(f"{self._arm}_gripper_held_by", ""))
-        self.homing, self.homing_ended = state == "homing", str(said.get("homing_ended", ""))
-        if state not in _READY:
-            line = state if why in _NO_FAULT else f"{state}: {why}".replace("~", self.controller)
-            cure = f"{self.controller}/{_CURES[state]}" if state in _CURES else ""
-            self.unready = f"{self.controller} is {line}" + ("" if cure in line else f"; call {cure}")
+        self.homing, self.gripper_held = state == "homing", str(said.get(f"{self._arm}_gripper_held_by", ""))
+
+    def _unready(self, state: str, fault: Reason | None) -> Reason | None:
+        if state in _READY:
+            return None
+        if state == "paused":
+            return Reason.of(ReasonKind.CONTROLLER_ON_PAUSE, controller=self.controller)
+        if fault is None:
+            return Reason.of(ReasonKind.CONTROLLER_PHASE, phase=state)
+        if fault.kind is ReasonKind.CONTROLLER_DEACTIVATED:
+            return fault
+        kind = ReasonKind.CONTROLLER_STOPPED if state == "stopped" else ReasonKind.CONTROLLER_FAULT
+        return Reason.of(kind, fault, controller=self.controller, phase=state)
 
 
 class CommandType:
@@ -217,8 +225,8 @@ class CommandType:
         self._answer: Any = None  # future of the last call
 
     @property
-    def unready(self) -> str | None:
-        return None if self._agreed else f"{self._service} has not agreed to poses yet"
+    def unready(self) -> Reason | None:
+        return None if self._agreed else Reason.of(ReasonKind.NO_POSE_COMMANDS, service=self._service)
 
     def step(self, starts: int, now: float) -> None:
         """Call the service if that is due; ``starts``: how often the controller has appeared."""
@@ -231,5 +239,5 @@ class CommandType:
             self._answer = self._client.call_async(self._kind.Request(command_type=_POSE))
 
 
-def _refused(line: str | None) -> Reason | None:
-    return None if line is None else Reason.of(ReasonKind.CONTROLLER_REFUSES, text=line)
+def _refused(why: Reason | None) -> Reason | None:
+    return None if why is None else Reason(ReasonKind.CONTROLLER_REFUSES, cause=why)

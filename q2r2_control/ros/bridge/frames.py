@@ -17,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from tf2_msgs.msg import TFMessage
 
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import nanoseconds, pose_of, pose_of_numbers
 from q2r2_control.ros.monitoring import Publishers
@@ -122,14 +123,14 @@ class FrameListener:
         node.create_subscription(TFMessage, "/tf", self._take, 100, raw=True)
         node.create_subscription(TFMessage, "/tf_static", self._take_fixed, latched, raw=True)
 
-    def conflict(self, frame: str) -> str | None:
-        """One line while two publishers disagree about ``frame`` or what it hangs on."""
+    def conflict(self, frame: str) -> Reason | None:
+        """A reason while two publishers disagree about ``frame`` or what it hangs on."""
         if not self._disagree:
             return None
         now = time.monotonic()
         for name, _ in self.tree.upwards(frame):
             if now - self._disagree.get(name, -math.inf) <= _REMEMBERED:
-                return f"two publishers on /tf say different things of {name}: end one of {self._publishers.of('/tf')}"
+                return Reason.of(ReasonKind.FRAME_DISPUTED, frame=name, publishers=self._publishers.of("/tf"))
         return None
 
     def _take(self, message: bytes, info: Mapping[str, int | None]) -> None:
@@ -157,15 +158,16 @@ class ToolFrame:
     def __init__(self, node: BaseNode, frame: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
         self._publishers = Publishers(node, ["/tf"])
-        self.problem: str | None = None
+        self.problem: Reason | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
         """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         placement = self._tree.find(self._frame, self._world)
         if placement is None:
-            self.problem = f"no transform from {self._frame} to {self._world} on /tf"
+            self.problem = Reason.of(ReasonKind.NO_TRANSFORM, frame=self._frame, world=self._world)
         elif (age := now - placement.received) > self._timeout:
-            self.problem = f"{self._frame} on /tf{self._publishers.source('/tf')} is {age:.2f} s old"
+            source = self._publishers.source("/tf")
+            self.problem = Reason.of(ReasonKind.TRANSFORM_OLD, frame=self._frame, source=source, age=age)
         else:
             self.problem = None
             return placement.pose
@@ -180,23 +182,23 @@ class PoseTopic:
         self._newest: tuple[str, int, float] | None = None  # its frame, its stamp [ns], and when it was received [s]
         self._pose: pin.SE3 | None = None  # of the newest, in the message's frame
         self.topic, self._publishers = topic, Publishers(node, [topic])
-        self.problem: str | None = None
+        self.problem: Reason | None = None
         node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 
     def at(self, now: float) -> pin.SE3 | None:
         if self._newest is None:
-            self.problem = f"nothing on {self.topic}"
+            self.problem = Reason.of(ReasonKind.TOPIC_EMPTY, topic=self.topic)
             return None
         frame, _, received = self._newest
         if now - received > self._timeout:
             source = self._publishers.source(self.topic)
-            self.problem = f"{self.topic}{source} is silent for {now - received:.2f} s"
+            self.problem = Reason.of(ReasonKind.TOPIC_SILENT, topic=self.topic, source=source, age=now - received)
             return None
         placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
         if self._pose is None:
-            self.problem = f"{self.topic}: not finite or not a rotation"
+            self.problem = Reason.of(ReasonKind.TOPIC_NOT_A_POSE, topic=self.topic)
         elif placement is None:
-            self.problem = f"no transform from {frame} of {self.topic} to {self._world} on /tf"
+            self.problem = Reason.of(ReasonKind.NO_TRANSFORM, frame=f"{frame} of {self.topic}", world=self._world)
         else:
             self.problem = None
             return placement.pose * self._pose
@@ -207,8 +209,8 @@ class PoseTopic:
         """The newest message's own, by its sender's clock [ns]; None: there is none."""
         return None if self._newest is None else self._newest[1]
 
-    def take_silence(self, now: float) -> str | None:
-        """One line, returned once, if poses came and have stopped coming."""
+    def take_silence(self, now: float) -> Reason | None:
+        """A reason, returned once, if poses came and have stopped coming."""
         if self._newest is None or now - self._newest[2] <= self._timeout:
             return None
         self.at(now)

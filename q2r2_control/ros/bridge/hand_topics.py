@@ -11,6 +11,7 @@ from geometry_msgs.msg import PoseStamped, Twist
 from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from rclpy.node import Node
 
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
@@ -143,8 +144,8 @@ class HandIntake:
         """Receipt times of the newest pose and inputs; -inf before the first [s]."""
         return -math.inf if self._pose is None else self._pose[1], self._inputs[1]
 
-    def silence(self, now: float) -> str | None:
-        """One line if data are missing, and from which node: poses are needed to move, buttons to stop."""
+    def silence(self, now: float) -> Reason | None:
+        """A reason if data are missing, and from which node: poses are needed to move, buttons to stop."""
         ages = {what: now - stamp for what, stamp in zip(("pose", "inputs"), self.stamps, strict=True)}
         missing = {what: age for what, age in ages.items() if age > self._timeout}
         if not missing:
@@ -152,8 +153,9 @@ class HandIntake:
         first = next(iter(missing))
         what = "data" if len(missing) == len(ages) else "pose" if first == "pose" else "button data"
         source = self._publishers[self.hand].source(_topic(self.hand, first))
-        age = min(missing.values())
-        return f"no {what} of the {self.hand} hand{source} " + (f"for {age:.2f} s" if age < math.inf else "yet")
+        if (age := min(missing.values())) == math.inf:
+            return Reason.of(ReasonKind.HAND_UNKNOWN, data=what, hand=self.hand, source=source)
+        return Reason.of(ReasonKind.HAND_SILENT, data=what, hand=self.hand, source=source, age=age)
 
     def feel(self, pulse: HapticFeedback) -> None:
         feedback = OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude)

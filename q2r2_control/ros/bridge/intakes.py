@@ -71,11 +71,11 @@ class TargetIntake:
     def source(self, arm: str) -> str:
         return self.publishers.source(self.topics[arm])
 
-    def faults(self) -> list[str]:
-        """A line for each arm whose targets were refused lately."""
+    def faults(self) -> dict[str, Reason]:
+        """Why the targets of each arm were refused lately; only arms of which some were."""
         now = self._node.now
         self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _WARNING_TIME}
-        return [f"target of {arm} not used: {sentence(refusal)}" for arm, (refusal, _) in self._refused.items()]
+        return {arm: refusal for arm, (refusal, _) in self._refused.items()}
 
     def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
         frame, now, frame_id = self.frames[arm], self._node.now, message.header.frame_id
@@ -181,7 +181,7 @@ class JointIntake:
         silent = now - self._external_stamp > STREAM_TIMEOUT
         self.state = RobotState(q=q, v=v, tau=tau, tau_external=None if silent else self._external, stamp=oldest)
         if silent and self._needs_external_torque:
-            take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=f"no external torques on {self._external_topic}"), now)
+            take(Reason.of(ReasonKind.NO_EXTERNAL_TORQUES, topic=self._external_topic), now)
         else:
             take(self.state, now)
 

@@ -19,6 +19,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.drives.base import Drive, make_drive
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.messages import joint_state_message
@@ -179,8 +180,8 @@ class JointOutput:
         """
         return True in [channel.publisher.waits() for channel in self._channels]  # all are asked: each has its own gap
 
-    def listener_fault(self, off_reference: bool) -> str | None:
-        """One line where what took the commands is gone, or is not alone any more; to be asked before each is sent.
+    def listener_fault(self, off_reference: bool) -> Reason | None:
+        """A reason where what took the commands is gone, or is not alone any more; to be asked before each is sent.
 
         Asked only where the arms are ``off_reference``, since looking costs a message now and then, and not of torques.
         Arms that yield are off their reference by design, and a torque for where they are is no jump.
@@ -192,8 +193,8 @@ class JointOutput:
                 publisher.begin(acknowledged=True)
             return None
         if self._listeners > before:
-            return "a new receiver takes the commands, and the arms are not where these are"
-        return next((line for publisher in publishers if (line := publisher.silence())), None)
+            return Reason(ReasonKind.NEW_RECEIVER)
+        return next((silence for publisher in publishers if (silence := publisher.silence())), None)
 
 
 def joints_of(robot: Robot, arms: Iterable[str]) -> np.ndarray:

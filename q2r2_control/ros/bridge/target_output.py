@@ -10,6 +10,7 @@ from std_msgs.msg import Empty
 
 from q2r2_control.config.presets import BUILTIN, Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import ended_topic, stamped_pose, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
@@ -51,7 +52,7 @@ class TargetOutput:
         self._node, self._controller, self._frame = node, controller, frame
         self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
         self.topic = self._publisher.topic_name  # as the graph knows it
-        self._unknown_node = f"{self.topic} has a subscriber whose node is not known yet"
+        self._unknown_node = Reason.of(ReasonKind.SUBSCRIBER_UNKNOWN, topic=self.topic)
         self._wrench = None
         if preset.zero_wrench is not None:
             wrench = preset.zero_wrench.format(ctrl=values.prefix)
@@ -60,7 +61,7 @@ class TargetOutput:
         self.last_sent: pin.SE3 | None = None  # what the controller was asked for last, world frame; None: nothing
         self._ends = node.create_publisher(Empty, ended_topic(topic), SENT_COMMAND_QOS) if preset is BUILTIN else None
         self._sent_at = -math.inf  # the last target of a stream that has not ended yet [s]
-        self._fault: str | None = None  # why the controller that is driven is not the one of before
+        self._fault: Reason | None = None  # why the controller that is driven is not the one of before
         self._endpoints: set[bytes] = set()  # of the controller
         self._listeners = 0
         self._unknown = False  # a subscriber's node is not known yet
@@ -72,20 +73,20 @@ class TargetOutput:
         return self._publisher.sent
 
     @property
-    def conflict(self) -> str | None:
-        """One line if there are other publishers of the same topic."""
+    def conflict(self) -> Reason | None:
+        """A reason if there are other publishers of the same topic."""
         if (count := self._node.handle.get_count_publishers(self.topic)) <= 1:
             return None
-        return f"{count} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
+        return Reason.of(ReasonKind.SEVERAL_PUBLISHERS, count=count, topic=self.topic)
 
     @property
-    def unready(self) -> str | None:
-        """One line if the topic has no subscriber, or one whose node is not known yet."""
+    def unready(self) -> Reason | None:
+        """A reason if the topic has no subscriber, or one whose node is not known yet."""
         if self._publisher.listeners == 0:
-            return f"{self.topic} has no subscriber"
+            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=self.topic)
         return self._unknown_node if self._unknown and not self.following else None
 
-    def take_fault(self, now: float) -> str | None:
+    def take_fault(self, now: float) -> Reason | None:
         """Check the subscribers; returns once why the controller that is driven is not there any more."""
         listeners = self._present()
         if listeners > self._listeners or listeners == 0:
@@ -103,7 +104,7 @@ class TargetOutput:
         fault, self._fault = self._fault, None
         if fault is None and self.following and (silence := self._publisher.silence()) is not None:
             self.forget(now)  # the controller is gone, and its successor must not get an old target
-            return f"{self._controller}: {silence}"
+            return Reason.of(ReasonKind.CONTROLLER_SILENT, silence, controller=self._controller)
         return fault
 
     def step(
@@ -176,7 +177,8 @@ class TargetOutput:
         endpoints = {bytes(info.endpoint_gid) for name, info in found if name == self._controller}
         appeared, gone = endpoints - self._endpoints, self._endpoints and not endpoints
         if self.following and (appeared or gone):
-            self._fault = f"{self._controller} was restarted" if appeared else f"{self._controller} has ended"
+            kind = ReasonKind.CONTROLLER_RESTARTED if appeared else ReasonKind.CONTROLLER_ENDED
+            self._fault = Reason.of(kind, controller=self._controller)
         if appeared or gone:
             self.forget(now)
         if appeared:

@@ -40,7 +40,7 @@ class HomeClient:
         self._since: float | None = None  # of a way home: asked for, or accepted [s]; None: there is none
         self._said = self._seen = False  # that it goes home, now and on this way
 
-    def update(self, teleop: Teleop, said: bool, outcome: str, now: float) -> None:
+    def update(self, teleop: Teleop, said: bool, outcome: Reason | None, now: float) -> None:
         """Once a tick; ``said``: whether the controller says that it goes home, ``outcome``: how the last way ended."""
         asked, begins, self._said = teleop.homing, said and not self._said, said
         if self._since is None and begins and not asked:  # whoever has called the service
@@ -57,38 +57,40 @@ class HomeClient:
         elif self._since is not None:
             self._watch(teleop, outcome, now)
 
-    def _watch(self, teleop: Teleop, outcome: str, now: float) -> None:
+    def _watch(self, teleop: Teleop, outcome: Reason | None, now: float) -> None:
         """End the way home if it is over, or the controller does not go."""
         self._seen |= self._said
         accepted = self._answer is None or (self._answer.done() and self._answer.result().success)
         late = self._since is not None and now - self._since > _PATIENCE
         if self._seen:
             if not self._said:
-                self._end(teleop, now, outcome or f"{self._name} ended the way home", arrived=bool(outcome))
+                self._end(teleop, now, outcome or Reason(ReasonKind.HOMING_ENDED))
         elif accepted and late:
-            self._end(teleop, now, outcome or f"{self._name} did not begin", arrived=bool(outcome))
+            self._end(teleop, now, outcome or Reason.of(ReasonKind.HOMING_NOT_BEGUN, controller=self._name))
         elif not accepted and self._answer.done():
-            self._end(teleop, now, self._answer.result().message)
+            self._end(teleop, now, Reason.in_words(self._answer.result().message))
         elif late:
             self._home.remove_pending_request(self._answer)
-            self._end(teleop, now, f"{self._name}/home does not answer")
+            self._end(teleop, now, Reason.of(ReasonKind.NO_ANSWER, service=f"{self._name}/home"))
 
     def _call_home(self, teleop: Teleop, now: float) -> None:
+        self._seen = False
         if self._home is None:
-            self._end(teleop, now, "this arm's controller has no way home")
+            self._end(teleop, now, Reason(ReasonKind.NO_WAY_HOME))
         elif not self._home.service_is_ready():
-            self._end(teleop, now, f"there is no service {self._name}/home")
+            self._end(teleop, now, Reason.of(ReasonKind.NO_SERVICE, service=f"{self._name}/home"))
         else:
-            self._since, self._seen, self._answer = now, False, self._home.call_async(Trigger.Request())
+            self._since, self._answer = now, self._home.call_async(Trigger.Request())
 
     def _call_hold(self) -> None:
         if self._hold is not None:
             self._hold.call_async(Trigger.Request())
 
-    def _end(self, teleop: Teleop, now: float, outcome: str, arrived: bool = False) -> None:
+    def _end(self, teleop: Teleop, now: float, outcome: Reason) -> None:
         self._since = self._answer = None
-        reason = Reason.in_words(outcome)
-        teleop.end_homing(now, reason if arrived else Reason(ReasonKind.NOT_HOMING, cause=reason), arrived)
+        arrived = outcome.kind is ReasonKind.HOMING_ARRIVED
+        fault = Reason(ReasonKind.HOMING_FAULT if self._seen else ReasonKind.NOT_HOMING, cause=outcome)
+        teleop.end_homing(now, outcome if arrived else fault, arrived)
 
 
 class RecorderLink:
@@ -187,7 +189,7 @@ class TeleopLoop:
             in_step=len(references) == 1 and None not in references,
         )
         going_home = [node.outputs.homing for node in nodes]
-        outcome = next((outcome for _, outcome in going_home if outcome), "")
+        outcome = next((outcome for _, outcome in going_home if outcome), None)
         self._home.update(teleop, any(homing for homing, _ in going_home), outcome, now)
         for node in nodes:
             if (fault := node.follow(targets[node.arm_name], now, decided)) is not None:
@@ -204,9 +206,8 @@ class TeleopLoop:
     def _watch_time(self) -> None:
         """Pause where simulated time stands still: the hands go on, and must not be followed later."""
         timeout = self.teleop.settings.gate.timeout
-        if (line := self.nodes[0].clock_problem(timeout)) is None:
+        if (problem := self.nodes[0].clock_problem(timeout)) is None:
             return
-        problem = Reason.in_words(line)
         for node in self.nodes:
             node.refuse(problem)
         self._without_time = problem

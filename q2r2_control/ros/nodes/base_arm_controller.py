@@ -102,7 +102,7 @@ class BaseArmController(BaseNode):
         self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
         self._target = ArmTarget(None, OPEN)
         # Until the first tick, which where time stands still never comes.
-        not_begun = Reason.of(ReasonKind.NO_TOOL_POSE, text="the node has not begun yet")
+        not_begun = Reason(ReasonKind.NO_TOOL_POSE, cause=Reason(ReasonKind.NODE_BEGINS))
         self._refusal: tuple[bytes, Reason] | None = WARN, not_begun
         self.inputs = TickInputs(None, None, None, None)
 
@@ -152,8 +152,7 @@ class BaseArmController(BaseNode):
         tool, base, controlled = self.current_pose(), self._base(), self._safe_target.at(now)
         obstacle = self._obstacle(tool, base)
         silence = None if self.state in _WITHOUT_HAND else self.intake.silence(now)
-        silent = None if silence is None else (WARN, Reason.of(ReasonKind.HAND_SILENT, text=silence))
-        self._refusal = obstacle or silent
+        self._refusal = obstacle or (None if silence is None else (WARN, silence))
         reference = None if controlled is None else self._safe_target.stamp
         commanded = None if tool is None else self._commanded(tool, controlled)
         self._base_pose = base
@@ -219,9 +218,10 @@ class BaseArmController(BaseNode):
         if self._refusal is not None:
             level, reason = self._refusal
             return level, sentence(reason), values | {"kind": str(reason.kind)}
-        for problem in (self.gripper.problem, self.outputs.gripper_held):
-            if problem is not None:
-                return WARN, problem, values
+        if self.gripper.problem is not None:
+            return WARN, self.gripper.problem, values | {"kind": str(ReasonKind.GRIPPER_FAILED)}
+        if (held := self.outputs.gripper_held) is not None:
+            return WARN, held, values
         if self.state in AT_REST:
             return OK, f"ready to engage ({self.feedback.paused})", values  # whatever refused an earlier press is over
         return OK, self.feedback.last_line, values
@@ -235,10 +235,11 @@ class BaseArmController(BaseNode):
     def _obstacle(self, tool: pin.SE3 | None, base: pin.SE3 | None) -> tuple[bytes, Reason] | None:
         """Why the arm may not be engaged now, its hand aside, with the level of the diagnostics."""
         values = self.parameters
-        if (line := self.outputs.conflict or self._frames.conflict(values.tool_frame)) is not None:
-            return ERROR, Reason.of(ReasonKind.SEVERAL_PUBLISHERS, text=line)
+        if (conflict := self.outputs.conflict or self._frames.conflict(values.tool_frame)) is not None:
+            return ERROR, conflict
         if tool is None:
-            return WARN, Reason.of(ReasonKind.NO_TOOL_POSE, text=self._tool.problem or "current_pose() gives none")
+            why = self._tool.problem or Reason(ReasonKind.NO_CURRENT_POSE)
+            return WARN, Reason(ReasonKind.NO_TOOL_POSE, cause=why)
         if base is None:
             return WARN, Reason.of(ReasonKind.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         return None if (unready := self.outputs.unready) is None else (WARN, unready)

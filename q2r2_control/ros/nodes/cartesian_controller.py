@@ -42,8 +42,6 @@ from q2r2_control.wording import sentence
 _LONGEST_STOP = 3.0  # [s]
 _QUIET = 0.3  # nobody else commands the arms for so long before this node does [s]
 _LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
-_DEACTIVATED = "deactivated"
-_CURE = "ros2 lifecycle set /cartesian_controller activate takes over where the arms are"
 _SAFE_TARGET_PERIOD = 0.008  # [s]
 
 
@@ -97,6 +95,7 @@ class CartesianControllerNode(ManagedNode):
         every = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._last_tick = self.now
+        self._deactivated = Reason.of(ReasonKind.CONTROLLER_DEACTIVATED, controller=self.get_fully_qualified_name())
         self._others = self._output.watch(self)
         self._connect()
         self.start_active()
@@ -133,7 +132,7 @@ class CartesianControllerNode(ManagedNode):
             return
         # Commands that the arms do not follow are not for a receiver that has just come.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
-            self._supervisor.let_go(Reason.in_words(fault), now)
+            self._supervisor.let_go(fault, now)
         state, openings = self._joints.state, self._grippers.openings(now)
         step = self._loop.step(state, {}, now, dt, self._grippers.wanted, openings)
         self._grippers.answer()
@@ -157,7 +156,7 @@ class CartesianControllerNode(ManagedNode):
 
     def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
         served = self.is_active or act == self._stop
-        refusal = act() if served else Reason.in_words(f"{_DEACTIVATED}: {_CURE}")
+        refusal = act() if served else self._deactivated
         self.report_health()
         return _answer(response, refusal)
 
@@ -167,18 +166,22 @@ class CartesianControllerNode(ManagedNode):
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         supervisor, now = self._supervisor, self.now
-        homed = supervisor.homing.outcome
+        fault = supervisor.fault if self.is_active else self._deactivated
+        refused, ended, homed = self._targets.faults(), supervisor.targets.ended, supervisor.homing.outcome
         values: dict[str, Any] = {
             "phase": supervisor.phase,
             "lifecycle": self.lifecycle_state,
-            "homing_ended": "" if homed is None else sentence(homed),
+            "fault": None if fault is None else fault.as_json(),
+            "homing_outcome": None if homed is None else homed.as_json(),
             "loop_rate_hz": self.tick_rate(),
             "missed_ticks": self._loop.pacer.missed_ticks,
             "sent": self._output.sent,
         }
         for arm, rejected in self._targets.rejected.items():
             state = "paused" if supervisor.paused else supervisor.arm_state(arm)
-            values[f"{arm}_state"] = state if self.is_active else _DEACTIVATED
+            values[f"{arm}_state"] = state if self.is_active else "deactivated"
+            refusal = refused.get(arm)
+            values[f"{arm}_target_refusal"] = None if refusal is None else refusal.as_json()
             age = supervisor.targets.age(arm, now)
             values[f"{arm}_target_age_s"] = round(age, 3) if age < 1e6 else "none"
             values[f"{arm}_targets_rejected"] = rejected
@@ -193,37 +196,35 @@ class CartesianControllerNode(ManagedNode):
             values["qp_status"] = str(report.status)
             values["closest_pair"] = "|".join(report.closest_pair)
             values["closest_distance_m"] = round(report.closest_distance, 4)
-        if supervisor.state_fault is not None:
-            values["kind"] = str(ReasonKind.BAD_JOINT_STATES)
-        fault = _CURE if supervisor.fault is None else sentence(supervisor.fault)
-        if not self.is_active or supervisor.fault is not None:
-            return ERROR if self.is_active else WARN, fault, values
-        ended, faults = list(map(sentence, supervisor.targets.ended.values())), self._targets.faults()
-        doing = faults or ["paused" if supervisor.paused else "active"]
-        return WARN if faults else OK, "; ".join(doing + ended), values
+        if fault is not None:
+            values["kind"] = str(fault.kind)
+            cure = "; ~/reset activates again" if supervisor.phase is Phase.STOPPED and self.is_active else ""
+            return ERROR if self.is_active else WARN, sentence(fault) + cure, values
+        doing = [f"target of {arm} not used: {sentence(why)}" for arm, why in refused.items()]
+        doing = doing or ["paused" if supervisor.paused else "active"]
+        return WARN if refused else OK, "; ".join([*doing, *map(sentence, ended.values())]), values
 
     def begin(self) -> str | None:
         """Take over where the arms stand, if they do and nobody else commands them."""
         self._tick_until(lambda: False, _QUIET)
         if (other := self._others.commander(_QUIET)) is not None:
-            return other
+            return sentence(other)
         if (refusal := self._supervisor.reset()) is not None:
             return sentence(refusal)
         settle = float(self.get_parameter("settle_time").value)
         active = self._tick_until(lambda: self._supervisor.phase is Phase.ACTIVE, settle + _LONGEST_ACTIVATION)
-        fault = self._supervisor.fault
-        problem = None if active else "the arms do not stand still" if fault is None else sentence(fault)
+        problem = None if active else self._supervisor.fault or Reason(ReasonKind.ARMS_MOVE)
         # Nothing was commanded yet: that begins with the next tick.
         if (problem := self._others.commander(_QUIET) or problem) is not None:
-            self._supervisor.let_go(Reason.in_words(problem), self.now)
-            self._supervisor.stop(Reason.in_words(_CURE))
-            return problem
+            self._supervisor.let_go(problem, self.now)
+            self._supervisor.stop(self._deactivated)
+            return sentence(problem)
         self._others.end()
         return None
 
     def end(self) -> str | None:
         """Bring the arms to rest along the certified stop; then nothing is commanded, and another node may."""
-        self._come_to_rest(_CURE, self._tick_on)
+        self._come_to_rest(self._deactivated, self._tick_on)
         self._others.begin()
         return None
 
@@ -234,10 +235,10 @@ class CartesianControllerNode(ManagedNode):
             if self.executor is not None:
                 self.executor.spin_once(timeout_sec=self._period)
 
-        self._come_to_rest("ending", spin)
+        self._come_to_rest(Reason(ReasonKind.NODE_ENDS), spin)
 
-    def _come_to_rest(self, why: str, go_on: Callable[[], None]) -> None:
-        self._supervisor.stop(Reason.in_words(why))
+    def _come_to_rest(self, why: Reason, go_on: Callable[[], None]) -> None:
+        self._supervisor.stop(why)
         last = time.monotonic()
         deadline = last + _LONGEST_STOP
         advances = self._advances

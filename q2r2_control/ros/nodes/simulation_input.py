@@ -65,15 +65,17 @@ class SimulationInput(BaseNode):
         self._timer = self.create_tick(_LONGEST, self._tick)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        values = {"samples": self._samples, "sent": self._hand_publishers.sent}
+        missing = self._missing() if self._waits_for_subscribers else []
+        values = {"samples": self._samples, "sent": self._hand_publishers.sent, "without_subscriber": missing}
         if self._waits_for_subscribers:
-            return WARN, f"waits for a subscriber of {' and '.join(self._missing())}", values
+            return WARN, f"waits for a subscriber of the {' and the '.join(missing)} hand", values
         if self._starts and (unready := self._listeners.unready()) is not None:
             return WARN, f"waits: {unready}", values
         return OK, self._title, values
 
     def _missing(self) -> list[str]:
-        return [f"the {hand} hand" for hand in self._hands if not self._hand_publishers.subscribers(hand)]
+        """Hands that nobody listens to."""
+        return [hand for hand in self._hands if not self._hand_publishers.subscribers(hand)]
 
     def _tick(self) -> None:
         """Play, and come again when the next sample is due."""

@@ -12,6 +12,7 @@ import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from q2r2_control.events import ReasonKind
 from q2r2_control.ros.launch.build import interface_packages
@@ -20,18 +21,26 @@ from q2r2_control.ros.watching.set_view import SILENT, NodeView, SetView
 from q2r2_control.teleop.arm_states import ArmState
 
 _ONE = "end all but one (a killed one counts for some seconds)"
+_START_CONTROLLER = "start the arm's controller, or set preset or ctrl_prefix to the one that runs"
+_START_HANDS = "start tcp_endpoint and connect the headset, or SimulationInput"
+_BAD_STATES = (
+    *(ReasonKind.NO_STATES_YET, ReasonKind.STATES_SILENT, ReasonKind.STATE_NOT_FINITE, ReasonKind.STATE_JUMPED),
+    *(ReasonKind.BAD_JOINT_STATES, ReasonKind.NO_EXTERNAL_TORQUES),
+)
 # The cure, by the kind of the fault.
 _CURES = {
-    ReasonKind.NO_SUBSCRIBER: "start the arm's controller, or set preset or ctrl_prefix to the one that runs",
+    **dict.fromkeys((ReasonKind.NO_SUBSCRIBER, ReasonKind.SUBSCRIBER_UNKNOWN), _START_CONTROLLER),
     ReasonKind.NO_TOOL_POSE: (
         "start the robot or robot_state_publisher, or look whether its transforms have stopped; parameters "
         "end_effector_link_name, world_frame_id"
     ),
     ReasonKind.NO_TRANSFORM: "start what publishes that frame; parameters base_frame_id, world_frame_id",
-    ReasonKind.HAND_SILENT: "start tcp_endpoint and connect the headset, or SimulationInput",
-    ReasonKind.SEVERAL_PUBLISHERS: _ONE,
-    ReasonKind.BAD_JOINT_STATES: "look at the robot's driver, and at joint_states_topic of cartesian_controller",
+    **dict.fromkeys((ReasonKind.HAND_SILENT, ReasonKind.HAND_UNKNOWN), _START_HANDS),
+    **dict.fromkeys((ReasonKind.SEVERAL_PUBLISHERS, ReasonKind.FRAME_DISPUTED), _ONE),
+    **dict.fromkeys(_BAD_STATES, "look at the robot's driver, and at joint_states_topic of cartesian_controller"),
 }
+# Whose sentences say what helps, as those of a stopped arm do.
+_CURE_IN_SENTENCE = {ReasonKind.CONTROLLER_REFUSES, ReasonKind.CONTROLLER_DEACTIVATED}
 _SEE = "docs/ros.md, What moves an arm, and what stops it"
 
 
@@ -122,7 +131,7 @@ def _arms(view: SetView) -> Iterator[Finding]:
 def _cure(node: NodeView, line: str) -> str:
     """By the kind of what a node reports; a controller that refuses, and a stop, say themselves what helps."""
     kind = node.values.get("kind")
-    if kind == ReasonKind.CONTROLLER_REFUSES or node.values.get("state") == ArmState.STOPPED:
+    if kind in _CURE_IN_SENTENCE or node.values.get("state") == ArmState.STOPPED:
         return line
     return next((cure for known, cure in _CURES.items() if known == kind), _SEE)
 
@@ -133,19 +142,20 @@ PACKAGES = (
     *("sensor_msgs", "std_msgs", "std_srvs", "trajectory_msgs", "visualization_msgs"),
 )
 _GREATEST_DOMAIN = 232
-# Also tries each package of messages, whose code is given; the last line is the middleware's name.
+# Also tries each package of messages, whose code is given. Its last line is one JSON object.
 _TRY = """
 import json, sys
 import rclpy
 from rclpy.utilities import get_rmw_implementation_identifier
 rclpy.init(args=[])
 rclpy.create_node("q2r2_doctor_try", enable_rosout=False)
+lacking = []
 for name, proof in json.loads(sys.argv[1]).items():
     try:
         exec(proof)
     except Exception:
-        print("lacks", name)
-print(get_rmw_implementation_identifier())
+        lacking.append(name)
+print(json.dumps({"middleware": get_rmw_implementation_identifier(), "lacking": lacking}))
 """
 _INSTALL = "pip install 'q2r2_control[ros]', or source a ROS 2 Jazzy"
 
@@ -180,16 +190,15 @@ def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str],
         if isinstance(answer, Finding):
             findings.append(answer)
         else:
-            *lines, facts["middleware"] = answer
-            lacking = [line.removeprefix("lacks ") for line in lines if line.startswith("lacks ")]
+            facts["middleware"], lacking = answer["middleware"], answer["lacking"]
     if lacking:
         what = f"the messages of {', '.join(lacking)} cannot be imported"
         findings.append(error(what, "q2r2 ros build-interfaces"))
     return facts, findings
 
 
-def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> list[str] | Finding:
-    """The output of a node that tries ROS and the code of ``packages``, or why there is no node."""
+def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> dict[str, Any] | Finding:
+    """The findings of a node that tries ROS and the code of ``packages``, or why there is no node."""
     own = dict(environment)
     set_up_middleware(own)
     try:
@@ -199,7 +208,8 @@ def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> lis
     except subprocess.TimeoutExpired:
         return error("a node does not start within 60 s", "look for what else takes this machine's processors")
     if run.returncode == 0:
-        return run.stdout.splitlines()
+        answer: dict[str, Any] = json.loads(run.stdout.splitlines()[-1])
+        return answer
     lines = [line for line in run.stderr.splitlines() if line.strip()]
     wanted = environment.get("RMW_IMPLEMENTATION")
     cure = f"unset RMW_IMPLEMENTATION, or install {wanted}" if wanted else _INSTALL

@@ -8,7 +8,9 @@ from typing import Any
 
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
+from q2r2_control.events import Reason
 from q2r2_control.teleop.arm_states import AT_REST, ArmState
+from q2r2_control.wording import sentence
 
 SILENT = 2.0  # nodes say what they do twice a second [s]
 _SLIPPED = 0.005  # a target that has slipped farther is held up [m]
@@ -58,7 +60,15 @@ class NodeView:
 
     @property
     def clock_problem(self) -> str:
-        return str(self.values.get("clock_problem", ""))
+        problem = self.reason("clock_problem")
+        return "" if problem is None else sentence(problem)
+
+    def reason(self, key: str) -> Reason | None:
+        """The reason that the node tells as this value; None where it tells none."""
+        try:
+            return Reason.from_json(self.values[key])
+        except (KeyError, TypeError, ValueError):
+            return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +152,8 @@ def _why_engaged(values: Mapping[str, Any], controller: NodeView | None, arm: st
         distance, pair = nearest.get("closest_distance_m"), str(nearest.get("closest_pair", "")).replace("|", " | ")
         near = f"; nearest pair {pair}, {1e3 * distance:.0f} mm" if isinstance(distance, int | float) else ""
         return f"held up, {1e3 * slip:.0f} mm short of the hand{near}"
-    if controller is not None and controller.level != "ok" and arm in controller.message:
-        return f"engaged; {controller.name}: {controller.message}"
+    if controller is not None:
+        why = controller.reason("fault") or controller.reason(f"{arm}_target_refusal")
+        if why is not None:
+            return f"engaged; {controller.name}: {sentence(why)}"
     return "follows the hand"
