@@ -48,7 +48,11 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 
 @pytest.fixture(scope="session", autouse=True)
 def precedence() -> None:
-    """This process and those that it starts go first, where that is permitted: timeouts of 100 ms have to hold."""
+    """This process and those that it starts go before all others, where that is permitted.
+
+    All of a test have the same priority, so none goes before another: a test sees what it would see on a machine that
+    does nothing else. A stall that the nodes cause themselves is as long as without this.
+    """
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
     with suppress(OSError):
