@@ -50,7 +50,7 @@ class PatientRun:
         loop = self.loop = loop_of(source, teleop=EPISODES)
         with (
             Recorder(folder, "test", waits=True) as recorder,
-            EpisodeJudge(lambda: recorder.file, self._tell) as judge_now,
+            EpisodeJudge(lambda: recorder.file, self._report) as judge_now,
         ):
             self.judge, self._due = judge_now, dict(VERDICTS_BY)
             self.pid = judge_now.pid
@@ -61,7 +61,7 @@ class PatientRun:
         assert recorder.file is not None
         self.file = recorder.file
 
-    def _tell(self, reason: Reason) -> None:
+    def _report(self, reason: Reason) -> None:
         self.told.append(reason)
         self.loop.record_outcome(reason)
 
@@ -70,7 +70,7 @@ class PatientRun:
             wait_until(partial(self._judged, self._due.pop(due)))
 
     def _judged(self, count: int) -> bool:
-        self.judge.look()
+        self.judge.report_verdicts()
         return len(self.told) >= count or self.judge.pid is None
 
 
@@ -114,10 +114,10 @@ def test_one_that_is_discarded_before_its_verdict_is_there_gets_none(run: Patien
     told: list[Reason] = []
     with EpisodeJudge(lambda: run.file, told.append) as judge_now:
         for t, kind in zip((1.0, 2.5, 2.6, 4.0, 6.0), (BEGINS, ENDS, DISCARDED, BEGINS, ENDS), strict=True):
-            judge_now.note(Event(t, "left", "", "", Reason(kind)))
+            judge_now.record_event(Event(t, "left", "", "", Reason(kind)))
 
         def answered() -> bool:
-            judge_now.look()
+            judge_now.report_verdicts()
             return bool(told)
 
         wait_until(answered)
