@@ -155,15 +155,13 @@ class _Batch:
 
 def _templates(joints: list[str]) -> dict[str, MessageTemplate]:
     n, none = len(joints), np.empty(0)
-    lists = list(np.arange(1.0, 3 * n + 1.0).reshape(3, n))
-    states = MessageTemplate(messages.JOINTS, messages.joint_state(joints, *lists), 3 * n)
+    q, v, a = np.arange(1.0, 3 * n + 1.0).reshape(3, n)
+    states = MessageTemplate(messages.JOINTS, messages.joint_state(joints, q, v, a), 3 * n)
     return {
         messages.JOINT_STATES: states,
         messages.JOINT_COMMANDS: states,
-        messages.EXTERNAL_TORQUE: MessageTemplate(
-            messages.JOINTS, messages.joint_state(joints, none, none, lists[0]), n
-        ),
-        messages.REFERENCE: MessageTemplate(messages.TRAJECTORY, messages.joint_trajectory(joints, *lists), 3 * n),
+        messages.EXTERNAL_TORQUE: MessageTemplate(messages.JOINTS, messages.joint_state(joints, none, none, q), n),
+        messages.REFERENCE: MessageTemplate(messages.TRAJECTORY, messages.joint_trajectory(joints, q, v, a), 3 * n),
     }
 
 

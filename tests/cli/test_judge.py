@@ -51,14 +51,6 @@ def test_json_has_every_number_and_every_reason(recordings: Path, tmp_path: Path
     assert [episode["verdict"] for episode in episodes] == ["keep", "keep"]
 
 
-def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "notes.mcap").write_text("no recording")
-    says = {"empty": "no file .mcap in it", "missing": "no such file or folder", "notes.mcap": "not an MCAP file"}
-    for name, words in says.items():
-        assert f"{name}: {words}" in q2r2("judge", str(tmp_path / name)).stderr
-
-
 def test_a_report_is_one_page_of_all_of_them(recordings: Path, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     result = q2r2("report", str(recordings), "--output", str(page))

@@ -53,9 +53,7 @@ def test_a_part_that_lay_back_for_a_second_may_be_taken_elsewhere() -> None:
         ([LIES, GRIPPED, HELD], "put_back_mm", 100.0),
     ],
 )
-def test_what_is_not_lifted_held_and_put_back_fails_by_one_figure(
-    phases: list[Phase], name: str, figure: float
-) -> None:
+def test_a_part_that_is_not_lifted_and_put_back_fails(phases: list[Phase], name: str, figure: float) -> None:
     judge = play(LiftJudge("part"), phases)
     assert len(judge.faults()) == 1
     assert judge.measured()[name] == pytest.approx(figure)

@@ -129,13 +129,3 @@ def test_arrays_and_texts_are_read_as_they_were_written_and_no_others() -> None:
     with pytest.raises(ValueError, match="has not 4 numbers"):
         messages.numbers_of(payloads, 4)
     assert messages.data_of(messages.text("grüezi"), messages.TEXT) == "grüezi"
-
-
-@pytest.mark.parametrize("length", [0, 1, 2, 3, 4, 5001])
-def test_a_picture_is_read_as_it_was_also_where_a_middleware_filled_the_message_up(length: int) -> None:
-    jpeg = bytes(number % 251 for number in range(length))
-    payload = messages.picture("front", 1_500_000_000, jpeg)
-    message: Any = messages.STORE.deserialize_cdr(payload, messages.PICTURE)
-    assert (message.header.frame_id, message.format) == ("front", "jpeg")
-    for padding in range(4):
-        assert bytes(messages.data_of(payload + bytes(padding), messages.PICTURE)) == jpeg

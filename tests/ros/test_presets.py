@@ -41,7 +41,6 @@ from tests.ros.arm_rig import ArmRig, ArmRigs, patient
 from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
 from tests.ros.processes import wait_until
 
-POSES = 2  # of moveit_msgs/srv/ServoCommandType
 PRESET = "kuka_lbr_impedance"
 STILL = 4e-3  # how far a tool at rest may move [m]
 NEAR = 6e-3  # a tool this near has arrived [m]
@@ -182,8 +181,8 @@ def test_moveit_servo_is_told_to_take_poses_after_each_of_its_starts(
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ConfigError, match="moveit_msgs, which cannot be imported"):
         CommandType(node, service)
-    # SetBool is on the wire, since moveit_msgs is not installed here.
-    asks = {"__init__": lambda self, command_type: SetBool.Request.__init__(self, data=command_type == POSES)}
+    # SetBool is on the wire, since moveit_msgs is not installed here; 2 means poses.
+    asks = {"__init__": lambda self, command_type: SetBool.Request.__init__(self, data=command_type == 2)}
     request = type(SetBool.Request.__name__, (SetBool.Request,), {**asks, "__module__": SetBool.Request.__module__})
     kind = type("ServoCommandType", (SetBool,), {"Request": request})
     monkeypatch.setitem(sys.modules, module, SimpleNamespace(ServoCommandType=kind))
