@@ -22,19 +22,19 @@ need_ros()
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import String
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording.bag import METADATA_FILE
-from q2r2_control.recording.messages import CONTROLLER_TICK, RECORDER_EVENTS
+from q2r2_control.recording.messages import RECORDER_EVENTS
 from q2r2_control.recording.reader import Recording, read_spans
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
 from q2r2_control.teleop.haptics import EPISODE_BEGINS, EPISODE_DISCARDED, EPISODE_ENDS, Pulse
 from tests.recording.runs import read_elsewhere
 from tests.ros.arm_rig import ArmRig
-from tests.ros.processes import States, call, subscribed, wait_until
+from tests.ros.processes import States, call, wait_until
 from tests.support.processes import children
 
 HAND = "/q2r_left_hand_pose"
@@ -190,8 +190,9 @@ def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes:
         String, RECORDER_EVENTS, lambda event: told.append(Event.from_json(json.loads(event.data))), RECORDED_QOS
     )
     assert call(node, "/recorder/start").success
-    ticks = subscribed(node, Float64MultiArray, CONTROLLER_TICK, RECORDED_QOS)
-    wait_until(lambda: ticks.qsize() > 500, "the arms are moved", patience=600.0)
+    states = States(node, "recorder")
+    enough = states.wait_for("")["messages"] + 10_000  # of some 10 topics a tick
+    wait_until(lambda: states.wait_for("")["messages"] > enough, "the arms are moved", patience=600.0)
     assert call(node, "/recorder/stop").success
     # The process that judges gets nothing while others want the processors: an hour tells a hang from a busy machine.
     wait_until(lambda: any(event.kind is ReasonKind.VERDICT for event in told), "the verdict is told", patience=3600.0)
