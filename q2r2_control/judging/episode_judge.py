@@ -86,14 +86,16 @@ def written_episode(question: Question) -> Episode | None:
 
 
 class EpisodeJudge:
-    """A listener of a recorded run, as a context around it; for others :meth:`note` and :meth:`look`.
+    """A listener of a recorded run, as a context around it. It raises nothing: what fails is logged once.
 
-    The work is done by a process of low priority. It raises nothing: what fails is logged once.
+    Others call :meth:`record_event` and :meth:`report_verdicts`. The work is done by a process of low priority.
     """
 
-    def __init__(self, file: Callable[[], Path | None], tell: Callable[[Reason], None], *, timed: bool = True) -> None:
+    def __init__(
+        self, file: Callable[[], Path | None], report: Callable[[Reason], None], *, timed: bool = True
+    ) -> None:
         """``timed``: times of events are those of ticks in the ``file``, so only an episode's have to be read."""
-        self._file, self._tell, self._timed = file, tell, timed
+        self._file, self._report, self._timed = file, report, timed
         self._events: list[Event] = []
         self._asked: Question | None = None
         self._count = 0
@@ -117,12 +119,12 @@ class EpisodeJudge:
     def __call__(self, tick: Tick) -> None:
         """Take one tick; never raises, and waits for nothing."""
         for event in tick.events:
-            self.note(event)
+            self.record_event(event)
         self._count += 1
         if self._count % _TICKS_BETWEEN_LOOKS == 0:
-            self.look()
+            self.report_verdicts()
 
-    def note(self, event: Event) -> None:
+    def record_event(self, event: Event) -> None:
         """Learn of an event; one that ends an episode asks for the verdict on it."""
         if event.kind not in _OF_EPISODES:
             return
@@ -137,13 +139,13 @@ class EpisodeJudge:
             self._process.send(question)
         self._asked = question
 
-    def look(self) -> None:
+    def report_verdicts(self) -> None:
         while self._answers:
             verdict = self._answers.popleft()
             if spans_of(self._events)[verdict.detail["episode"] - 1].discarded:
                 continue  # its operator has been faster
             _logger.info(sentence(verdict))
-            self._tell(verdict)
+            self._report(verdict)
         if self._process is not None and self._process.fault is not None:
             self._fail(self._process.fault)
 

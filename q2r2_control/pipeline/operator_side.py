@@ -144,7 +144,7 @@ class OperatorSide:
         """Send the vibrations of one tick to the hands."""
         now = tick.now
         for event in tick.events:
-            self._pulses[event.arm].tell(event)
+            self._pulses[event.arm].start_pulse(event)
         self._conditions.note(tick.reference.report, now)
         self._due = max(self._due, now - _PERIOD + self._wait)  # each arm once at most
         while now >= self._due:

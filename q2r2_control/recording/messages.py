@@ -23,7 +23,6 @@ POSE, JOINTS = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState"
 TRAJECTORY, HAND_INPUTS = "trajectory_msgs/msg/JointTrajectory", "quest2ros/msg/OVR2ROSInputs"
 NANOSECONDS = 1_000_000_000
 _ENCAPSULATION = 4  # bytes before the message
-_ARRAY_HEAD = 20  # bytes before the numbers of an array
 WORLD = "world"  # frame of targets
 TICK, SAMPLES, STATE = "/q2r2/tick", "/q2r2/hand_samples", "/q2r2/state"
 JOINT_STATES, EXTERNAL_TORQUE = "/joint_states", "/q2r2/external_torque"
@@ -170,12 +169,15 @@ class Message(NamedTuple):
 
 
 class MessageTemplate:
-    """Makes many messages that differ in float64 numbers, and where they have a header in its stamp."""
+    """Makes many messages that differ in float64 numbers, and in the stamp of the header that they all have.
+
+    Measured for the poses and joints of one tick of two arms: 3 us, and 110 us by rosbags, 11 % of a processor.
+    """
 
     def __init__(self, kind: str, example: Any, count: int) -> None:
         """``example``: a message whose numbers are 1, 2, ... ``count`` in the order in which they will be given."""
         payload = serialized(kind, example)
-        self._size, self._stamped = len(payload), hasattr(example, "header")
+        self._size = len(payload)
         padding = bytes(-(len(payload) - _ENCAPSULATION) % 8)
         self._bytes = np.frombuffer(payload + padding, dtype=np.uint8)
         # CDR aligns a float64 to its size, counted from behind the encapsulation.
@@ -183,12 +185,11 @@ class MessageTemplate:
         self._places = [int(np.flatnonzero(floats == number)[0]) for number in range(1, count + 1)]
 
     def filled(self, numbers: Array, stamps: npt.NDArray[np.int64]) -> list[bytes]:
-        """n messages with ``numbers`` (n, count), and ``stamps`` (n,) [ns] where they have a header."""
+        """n messages with ``numbers`` (n, count) and ``stamps`` (n,) [ns]."""
         made = np.tile(self._bytes, (len(numbers), 1))
         made[:, _ENCAPSULATION:].view("<f8")[:, self._places] = numbers
-        if self._stamped:
-            stamp = made[:, _ENCAPSULATION : _ENCAPSULATION + 8].view("<u4")
-            stamp[:, 0], stamp[:, 1] = stamps // NANOSECONDS, stamps % NANOSECONDS
+        stamp = made[:, _ENCAPSULATION : _ENCAPSULATION + 8].view("<u4")
+        stamp[:, 0], stamp[:, 1] = stamps // NANOSECONDS, stamps % NANOSECONDS
         data, length = made.tobytes(), len(self._bytes)
         return [data[begin : begin + self._size] for begin in range(0, len(data), length)]
 
@@ -233,6 +234,10 @@ def joint_trajectory(names: list[str], q: Array, v: Array, a: Array, stamp: int 
     return make(TRAJECTORY, header(stamp=stamp), names, [point])
 
 
+def array(numbers: Array) -> bytes:
+    return serialized(ARRAY, float_array(numbers))
+
+
 def text(data: str) -> bytes:
     return serialized(TEXT, make(TEXT, data))
 
@@ -248,7 +253,8 @@ def data_of(payload: bytes, kind: str) -> Any:
 
 
 def numbers_of(payloads: list[bytes], count: int) -> Array:
-    """(n, count) of n arrays without dimensions. Raises :class:`ValueError` for arrays of another length."""
-    if any(len(payload) != _ARRAY_HEAD + 8 * count for payload in payloads):
+    """(n, count) of n arrays. Raises :class:`ValueError` for arrays of another length."""
+    arrays = [data_of(payload, ARRAY) for payload in payloads]
+    if any(len(array) != count for array in arrays):
         raise ValueError(f"an array that has not {count} numbers")
-    return np.frombuffer(b"".join(payload[_ARRAY_HEAD:] for payload in payloads)).reshape(-1, count)
+    return np.array(arrays, dtype=np.float64).reshape(-1, count)

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from mcap.exceptions import EndOfFile, McapError
-from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
 from rosbags.serde import SerdeError
 from zstandard import ZstdError
@@ -43,9 +43,6 @@ from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.types import Array
 
 _LARGEST = 1 << 30  # of a record [bytes]
-_OPCODE_AND_LENGTH = 9
-# Of a message: opcode, length, channel, sequence, log and publish time. The package mcap takes ten times as long.
-_HEAD = struct.Struct("<BQHIQQ")
 _BROKEN = (
     *(McapError, ZstdError, SerdeError, ValueError, KeyError, IndexError),
     *(struct.error, TypeError, OverflowError, MemoryError, AssertionError),
@@ -149,8 +146,9 @@ class Recording:
                 if isinstance(record, Chunk) and record.message_end_time >= self.since:
                     declared = self.declared_topics.items()
                     channels = {channel for channel, topic in declared if topics is None or topic.name in topics}
-                    stream, size = get_chunk_data_stream(record, validate_crc=True)
-                    yield list(_messages_in(stream.read(size), channels))
+                    records = breakup_chunk(record, validate_crc=True)
+                    found = (one for one in records if isinstance(one, McapMessage) and one.channel_id in channels)
+                    yield [Message(m.channel_id, m.sequence, m.log_time, m.publish_time, m.data) for m in found]
 
     @contextmanager
     def _faults(self) -> Iterator[None]:
@@ -220,18 +218,6 @@ class Recording:
             raise RecordingError(f"{self.file}: damaged: no {error.args[0]}") from error
         except ValueError as error:
             raise RecordingError(f"{self.file}: {reason_of(error):.200}") from error
-
-
-def _messages_in(data: bytes, channels: Container[int]) -> Iterator[Message]:
-    at = 0
-    while at < len(data):
-        opcode, length, channel, number, time, sent = _HEAD.unpack_from(data, at)
-        end = at + _OPCODE_AND_LENGTH + length
-        if end > len(data):
-            raise ValueError("a chunk that does not end with a message")
-        if opcode == Opcode.MESSAGE and channel in channels:  # and not the schema or the channel of one
-            yield Message(channel, number, time, sent, data[at + _HEAD.size : end])
-        at = end
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:

@@ -53,7 +53,7 @@ class RosRecording(Recording):
         previous: TickChunk | None = None
         for messages in self.messages():
             with self._faults():
-                chunk = ticks.take((self.declared_topics[one.channel].name, one) for one in messages)
+                chunk = ticks.add_messages((self.declared_topics[one.channel].name, one) for one in messages)
             if len(chunk.rows):
                 if previous is not None:
                     yield previous
@@ -96,24 +96,24 @@ class RosTicks:
         self._due: deque[_Tick] = deque()  # wait for their references
         self._references: deque[tuple[float, Array]] = deque()  # by the controller's time [s]
         self._last_index, self._number = 0, -1  # of the newest tick
-        self._take: dict[str, Callable[[Any, int], None]] = {
+        self._handlers: dict[str, Callable[[Any, int], None]] = {
             names.JOINT_STATES: self._on_joints,
             names.REFERENCE: self._on_reference,
             names.CONTROLLER_TICK: self._on_tick,
             names.RECORDER_EVENTS: self._on_event,
         }
         for place, arm in enumerate(about.arms):
-            self._take[names.target(arm)] = partial(self._on_target, place)
-            self._take[names.arm_flags(arm)] = partial(self._on_flags, place)
-            self._take[names.arm_events(arm)] = self._on_event
+            self._handlers[names.target(arm)] = partial(self._on_target, place)
+            self._handlers[names.arm_flags(arm)] = partial(self._on_flags, place)
+            self._handlers[names.arm_events(arm)] = self._on_event
         for side, hand in enumerate(SIDES):
-            self._take[names.hand_pose(hand)] = partial(self._on_hand, side)
+            self._handlers[names.hand_pose(hand)] = partial(self._on_hand, side)
 
-    def take(self, messages: Iterable[tuple[str, Message]]) -> TickChunk:
+    def add_messages(self, messages: Iterable[tuple[str, Message]]) -> TickChunk:
         """The ticks that are known after some more messages, with their topics; there may be none."""
         for topic, message in messages:
-            if (take := self._take.get(topic)) is not None:
-                take(STORE.deserialize_cdr(message.payload, self._types[topic]), message.time)
+            if (handle := self._handlers.get(topic)) is not None:
+                handle(STORE.deserialize_cdr(message.payload, self._types[topic]), message.time)
         return self._chunk(list(self._whole_ticks()))
 
     def rest(self, last: TickChunk | None) -> TickChunk:

@@ -67,7 +67,7 @@ class TickEncoder:
         self._type = tick_type(len(robot.arms), len(robot.joints))
         self._start: float | None = None  # of the loop's clock [s]
         self._stamps: dict[tuple[float, int], float] = {}  # the last of each hand's poses and inputs
-        self._templates = _templates(list(robot.joints), topics[messages.TICK])
+        self._templates = _templates(list(robot.joints))
         self._poses = {
             frame: MessageTemplate(messages.POSE, messages.pose_stamped(np.arange(1.0, 8.0), frame), 7)
             for frame in ("", messages.WORLD)
@@ -84,7 +84,7 @@ class TickEncoder:
             first.append(Message(channel, 0, self._epoch, self._epoch, messages.text(self._robot.urdf)))
         made = _Batch(self._topics, rows["index"].astype(np.int64), self._times(rows["now"]))
         every, arms = np.arange(len(rows)), rows["arms"]
-        made.add(messages.TICK, every, self._templates[messages.TICK].filled(numbers_in(rows), made.times))
+        made.add(messages.TICK, every, [messages.array(numbers) for numbers in numbers_in(rows)])
         for at, tick in enumerate(batch):
             self._add_samples(made, at, np.frombuffer(tick.samples).reshape(-1, len(SAMPLE_FIELDS)))
         felt = np.flatnonzero(rows["external"])
@@ -120,7 +120,7 @@ class TickEncoder:
         """Samples of a tick as the loop got them; poses and inputs that are new as messages of the nodes too."""
         for sample in samples:
             hand = SIDES[int(sample[_HAND])]
-            made.add(messages.SAMPLES, [at], [messages.serialized(messages.ARRAY, messages.float_array(sample))])
+            made.add(messages.SAMPLES, [at], [messages.array(sample)])
             if self._is_new(sample, _POSE_STAMP):
                 (stamp,) = self._times(sample[_POSE_STAMP : _POSE_STAMP + 1]).tolist()
                 pose = messages.pose_stamped(sample[_X : _X + len(POSE_FIELDS)], stamp=stamp)
@@ -153,19 +153,15 @@ class _Batch:
             self.messages[place].append(Message(channel, self._numbers[place], time, time, payload))
 
 
-def _templates(joints: list[str], tick: Topic) -> dict[str, MessageTemplate]:
-    n, count = len(joints), len(tick.labels)
-    none, numbers = np.empty(0), np.arange(1.0, max(3 * n, count) + 1.0)
-    lists = numbers[:n], numbers[n : 2 * n], numbers[2 * n : 3 * n]
-    states = MessageTemplate(messages.JOINTS, messages.joint_state(joints, *lists), 3 * n)
+def _templates(joints: list[str]) -> dict[str, MessageTemplate]:
+    n, none = len(joints), np.empty(0)
+    q, v, a = np.arange(1.0, 3 * n + 1.0).reshape(3, n)
+    states = MessageTemplate(messages.JOINTS, messages.joint_state(joints, q, v, a), 3 * n)
     return {
-        messages.TICK: MessageTemplate(messages.ARRAY, messages.float_array(numbers[:count]), count),
         messages.JOINT_STATES: states,
         messages.JOINT_COMMANDS: states,
-        messages.EXTERNAL_TORQUE: MessageTemplate(
-            messages.JOINTS, messages.joint_state(joints, none, none, lists[0]), n
-        ),
-        messages.REFERENCE: MessageTemplate(messages.TRAJECTORY, messages.joint_trajectory(joints, *lists), 3 * n),
+        messages.EXTERNAL_TORQUE: MessageTemplate(messages.JOINTS, messages.joint_state(joints, none, none, q), n),
+        messages.REFERENCE: MessageTemplate(messages.TRAJECTORY, messages.joint_trajectory(joints, q, v, a), 3 * n),
     }
 
 

@@ -91,7 +91,7 @@ class CarryMode:
         tools.frame = frame = se3_of(self.leader.target(now, None if slowest is None else floats_of(slowest)))
         targets = tools.at(frame)
         if len(frames := tools.frames_of(at_once)) == len(targets):
-            self._keeper.note(frames[leader], frames[follower], now)
+            self._keeper.update_shift(frames[leader], frames[follower], now)
         position, rotation = floats_of(tools.tool_at(follower, self._keeper.frame(frame)))
         targets[follower] = se3_of((self._box.clip(position), rotation))
         return targets

@@ -64,7 +64,7 @@ class RelationKeeper:
         self._shift, self._turn = np.zeros(3), np.eye(3)
         self._now: float | None = None
 
-    def note(self, leading: pin.SE3, carried: pin.SE3, now: float) -> None:
+    def update_shift(self, leading: pin.SE3, carried: pin.SE3, now: float) -> None:
         """Where the controller's reference has the frame of either tool at ``now`` [s], world frame."""
         dt = 0.0 if self._now is None else min(max(now - self._now, 0.0), LONGEST_DT)
         self._now = now

@@ -92,7 +92,7 @@ class HapticPulses:
         self._grasps = False
         self._waiting: Pulse | None = None
 
-    def tell(self, event: Event) -> None:
+    def start_pulse(self, event: Event) -> None:
         """Start the pulse for an event of the arm."""
         if is_fault(event):
             self._want(FAULT)

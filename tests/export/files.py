@@ -19,7 +19,7 @@ from q2r2_control.export.sampling import Pixels
 from q2r2_control.inputs.played import EvenSampling, PlayedInput
 from q2r2_control.recording.about import About, Conclusion, as_yaml
 from q2r2_control.recording.bag import BagWriter
-from q2r2_control.recording.messages import ARRAY, TICK, Message, float_array, picture, picture_topic, serialized
+from q2r2_control.recording.messages import TICK, Message, array, picture, picture_topic
 from q2r2_control.recording.tick_rows import numbers_in, tick_type
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, HandInputs
@@ -74,7 +74,7 @@ def write_recording(
         arms[name] = values
     with BagWriter(path, topics.values(), about) as bag:
         for place, (row, time) in enumerate(zip(numbers_in(rows), times, strict=True)):
-            payload = serialized(ARRAY, float_array(row))
+            payload = array(row)
             number, stamp = int(rows["index"][place]), EPOCH + time
             bag.write([Message(topics[TICK].channel, number, stamp, stamp, payload)])
             if place % CHUNK == CHUNK - 1:

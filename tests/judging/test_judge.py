@@ -140,14 +140,14 @@ def test_a_damaged_recording_is_judged_by_what_is_before_the_damage(clean: Path,
     (tmp_path / "damaged.mcap").write_bytes(data)
     found = judged(tmp_path / "damaged.mcap")
     assert found.verdict.reasons[0].name == "damaged"
-    assert found.verdict.reasons[0].text.startswith(f"after {found.figures.duration_s:.2f} s damaged: ")
+    assert 0.0 < found.figures.duration_s < judged(clean).figures.duration_s
     (tmp_path / "cut.mcap").write_bytes(clean.read_bytes()[:-5000])
     assert "needs_end" in {reason.name for reason in judged(tmp_path / "cut.mcap").verdict.reasons}
 
 
 def test_a_run_in_which_no_arm_was_engaged_says_only_that(tmp_path: Path) -> None:
     found = judged(record_episode(tmp_path, hands(SEED, inputs=lambda hand, t: HandInputs()), 0.5))
-    assert found.verdict.line == "discard: no arm was ever engaged"
+    assert [reason.name for reason in found.verdict.reasons] == ["never_engaged"]
 
 
 @pytest.mark.parametrize("ticks", [0, 1])
@@ -241,7 +241,7 @@ def test_a_failure_is_discarded_unless_failures_are_kept_and_a_run_that_a_fault_
     assert [reason.name for reason in verdict_of(failed, JudgeSettings()).reasons] == ["keep_failed"]
     assert verdict_of(failed, JudgeSettings(keep_failed=True)).keep
     ended = changed(ended_by="left_A3 stands still")
-    assert verdict_of(ended, JudgeSettings()).line == "discard: a fault ended the run: left_A3 stands still"
+    assert [reason.name for reason in verdict_of(ended, JudgeSettings()).reasons] == ["ended_by"]
 
 
 def test_a_number_that_is_none_is_not_judged_and_one_that_is_no_number_is_discarded() -> None:

@@ -84,11 +84,10 @@ POSITIONS, VELOCITIES, EFFORTS = (np.arange(first, first + 3, dtype=np.float64) 
 @pytest.mark.parametrize(
     ("kind", "example"),
     [
-        (messages.ARRAY, messages.float_array(np.arange(1.0, 10.0))),
         (messages.JOINTS, messages.joint_state(list(NAMES), POSITIONS, VELOCITIES, EFFORTS)),
         (messages.TRAJECTORY, messages.joint_trajectory(list(NAMES), POSITIONS, VELOCITIES, EFFORTS)),
     ],
-    ids=["array", "joint state", "trajectory"],
+    ids=["joint state", "trajectory"],
 )
 def test_a_filled_template_is_the_message_that_rosbags_writes(kind: str, example: Any) -> None:
     numbers = np.random.default_rng(0).normal(size=(2, 9))
@@ -97,14 +96,12 @@ def test_a_filled_template_is_the_message_that_rosbags_writes(kind: str, example
     ):
         message: Any = messages.STORE.deserialize_cdr(payload, kind)
         assert bytes(messages.STORE.serialize_cdr(message, kind)) == payload
-        if kind == messages.ARRAY:
-            found = [message.data]
-        elif kind == messages.JOINTS:
+        if kind == messages.JOINTS:
             found = [message.position, message.velocity, message.effort]
         else:
             found = [message.points[0].positions, message.points[0].velocities, message.points[0].accelerations]
         np.testing.assert_array_equal(np.concatenate(found), row)
-        assert kind == messages.ARRAY or message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
+        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
 
 
 def test_every_number_of_a_tick_has_a_name_of_its_own_and_its_place() -> None:
@@ -127,20 +124,8 @@ def test_every_number_of_a_tick_has_a_name_of_its_own_and_its_place() -> None:
 
 def test_arrays_and_texts_are_read_as_they_were_written_and_no_others() -> None:
     numbers = np.array([[0.5, np.nan, -0.0], [1.0, np.inf, 2.0]])
-    payloads = messages.MessageTemplate(messages.ARRAY, messages.float_array(np.arange(1.0, 4.0)), 3).filled(
-        numbers, STAMPS
-    )
+    payloads = [messages.array(row) for row in numbers]
     assert messages.numbers_of(payloads, 3).tobytes() == numbers.tobytes()
     with pytest.raises(ValueError, match="has not 4 numbers"):
         messages.numbers_of(payloads, 4)
     assert messages.data_of(messages.text("grüezi"), messages.TEXT) == "grüezi"
-
-
-@pytest.mark.parametrize("length", [0, 1, 2, 3, 4, 5001])
-def test_a_picture_is_read_as_it_was_also_where_a_middleware_filled_the_message_up(length: int) -> None:
-    jpeg = bytes(number % 251 for number in range(length))
-    payload = messages.picture("front", 1_500_000_000, jpeg)
-    message: Any = messages.STORE.deserialize_cdr(payload, messages.PICTURE)
-    assert (message.header.frame_id, message.format) == ("front", "jpeg")
-    for padding in range(4):
-        assert bytes(messages.data_of(payload + bytes(padding), messages.PICTURE)) == jpeg

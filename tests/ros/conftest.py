@@ -48,7 +48,8 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 
 @pytest.fixture(scope="session", autouse=True)
 def precedence() -> None:
-    """This process and those that it starts go first, where that is permitted: timeouts of 100 ms have to hold."""
+    """This process and those that it starts go before all others, where that is permitted."""
+    # No process of a test goes before another, so a test sees what it would see on a machine without other load.
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
     with suppress(OSError):

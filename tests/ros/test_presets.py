@@ -9,12 +9,12 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import MagicMock
 
 import numpy as np
 import pinocchio as pin
@@ -33,6 +33,7 @@ need_ros()
 pytestmark = pytest.mark.alone
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from std_srvs.srv import SetBool
 
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
 from q2r2_control.ros.bridge.arm_outputs import CommandType
@@ -174,27 +175,37 @@ def test_a_controller_gets_targets_by_its_rules_in_both_modes(
     assert (wrench.wrench.force.x, wrench.wrench.force.z, wrench.wrench.torque.x) == (0.0, 0.0, 0.0)
 
 
-def test_moveit_servo_is_told_to_take_poses_after_each_of_its_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    servo = MagicMock()  # the node that calls the service
-    client = servo.create_client.return_value
-    monkeypatch.setitem(sys.modules, "moveit_msgs.srv", None)
+def test_moveit_servo_is_told_to_take_poses_after_each_of_its_starts(
+    node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, module = "/servo/switch_command_type", "moveit_msgs.srv"
+    monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ConfigError, match="moveit_msgs, which cannot be imported"):
-        CommandType(servo, "/servo/switch_command_type")
-    messages = SimpleNamespace(ServoCommandType=SimpleNamespace(Request=SimpleNamespace))
-    monkeypatch.setitem(sys.modules, "moveit_msgs", MagicMock())
-    monkeypatch.setitem(sys.modules, "moveit_msgs.srv", messages)
-    command_type = CommandType(servo, "/servo/switch_command_type")
+        CommandType(node, service)
+    # SetBool is on the wire, since moveit_msgs is not installed here; 2 means poses.
+    asks = {"__init__": lambda self, command_type: SetBool.Request.__init__(self, data=command_type == 2)}
+    request = type(SetBool.Request.__name__, (SetBool.Request,), {**asks, "__module__": SetBool.Request.__module__})
+    kind = type("ServoCommandType", (SetBool,), {"Request": request})
+    monkeypatch.setitem(sys.modules, module, SimpleNamespace(ServoCommandType=kind))
+    command_type, asked = CommandType(node, service), []
 
-    def agreed(starts: int, now: float) -> bool:
-        command_type.step(starts, now)
+    def agreed(starts: int) -> bool:
+        command_type.step(starts, time.monotonic())
         return command_type.unready is None
 
-    answers = [MagicMock(**{"result.return_value.success": agrees}) for agrees in (False, False, True, True)]
-    client.call_async.side_effect = answers
-    assert [agreed(0, now) for now in (0.0, 0.5, 1.2)] == [False] * 3  # it refuses
-    assert [agreed(0, now) for now in (2.4, 2.5, 9.0)] == [False, True, True]
-    assert not agreed(1, 10.0)  # it was started again
-    assert [call.args[0].command_type for call in client.call_async.call_args_list] == [2, 2, 2, 2]
+    def answer(request: Any, response: Any) -> Any:
+        asked.append(request.data)
+        response.success = len(asked) > 1
+        return response
+
+    assert not agreed(0)  # no service yet
+    node.create_service(SetBool, service, answer)
+    wait_until(lambda: agreed(0), "it agrees")
+    assert asked == [True, True]  # the first time it refused
+    assert agreed(0)
+    assert not agreed(1)  # it was started again
+    wait_until(lambda: agreed(1), "it agrees again")
+    assert asked == [True, True, True]
 
 
 @pytest.mark.parametrize("name", ["fzi", "mayr", "crisp", "kuka_lbr_clik"])

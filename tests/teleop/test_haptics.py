@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 
@@ -13,6 +12,7 @@ from q2r2_control.events import ReasonKind as K
 from q2r2_control.teleop import haptics as pulses
 from q2r2_control.teleop.haptics import VOCABULARY, ArmCondition, HapticPulses, Pulse
 from q2r2_control.types import HapticFeedback
+from tests.support.docs import table_rows
 
 
 def event(source: str, destination: str, reason: Reason | K) -> Event:
@@ -51,7 +51,7 @@ def feedback(pulse: Pulse) -> HapticFeedback:
 @pytest.mark.parametrize(("happens", "pulse"), EVENTS.values(), ids=EVENTS)
 def test_an_event_is_felt_once_and_ends(happens: Event, pulse: Pulse) -> None:
     haptics = HapticPulses()
-    haptics.tell(happens)
+    haptics.start_pulse(happens)
     assert haptics.at(1.0, "left") == feedback(pulse)
     assert haptics.at(1.0 + 0.9 * pulse.duration, "left") is None
     assert haptics.at(1.01 + pulse.duration, "left") == HapticFeedback("left", 0.0, 0.0)
@@ -60,7 +60,7 @@ def test_an_event_is_felt_once_and_ends(happens: Event, pulse: Pulse) -> None:
 
 def test_a_pause_that_is_complete_is_not_felt_again() -> None:
     haptics = HapticPulses()
-    haptics.tell(event("pausing", "paused", K.PRESSED))
+    haptics.start_pulse(event("pausing", "paused", K.PRESSED))
     assert haptics.at(1.0, "left") is None
 
 
@@ -78,7 +78,7 @@ def test_slipping_is_felt_at_every_stretch_of_it_and_anew_after_engaging() -> No
 
 def test_a_weaker_vibration_does_not_cut_a_stronger_one_short() -> None:
     haptics = HapticPulses()
-    haptics.tell(JUMPED)
+    haptics.start_pulse(JUMPED)
     assert haptics.at(1.0, "left") == feedback(pulses.FAULT)
     haptics.slip(1.0, 0.0)
     assert haptics.at(1.1, "left") is None
@@ -133,20 +133,20 @@ def test_a_joint_at_its_limit_and_a_grasp_are_each_felt_once_for_as_long_as_they
 
 def test_two_vibrations_are_felt_as_two_and_a_fault_waits_for_none() -> None:
     haptics = HapticPulses()
-    haptics.tell(event("paused", "engaged", K.PRESSED))
+    haptics.start_pulse(event("paused", "engaged", K.PRESSED))
     first = felt(haptics, 1.0, 1.0 + pulses.ENGAGED.duration + 0.002)
     assert [one.amplitude for one in first] == [pulses.ENGAGED.amplitude, 0.0]
     haptics.notice(condition(limits=("left_A4",)))
     assert felt(haptics, 1.09, 1.12) == []
     assert felt(haptics, 1.12, 1.2)[0] == feedback(pulses.LIMIT)
-    haptics.tell(JUMPED)
+    haptics.start_pulse(JUMPED)
     assert haptics.at(1.21, "left") == feedback(pulses.FAULT)
 
 
 @pytest.mark.parametrize(("strength", "expected"), [(0.5, [0.5 * pulses.FAULT.amplitude, 0.0]), (0.0, [])])
 def test_the_strength_of_all_is_a_setting_and_0_sends_nothing(strength: float, expected: list[float]) -> None:
     haptics = HapticPulses(HapticSettings(strength=strength))
-    haptics.tell(JUMPED)
+    haptics.start_pulse(JUMPED)
     assert [sent.amplitude for sent in felt(haptics, 1.0, 2.0)] == expected
 
 
@@ -160,9 +160,9 @@ def test_of_two_at_once_the_one_that_stands_later_in_the_vocabulary_is_felt() ->
 
 
 def test_the_table_in_the_docs_is_the_vocabulary() -> None:
-    table = (Path(__file__).resolve().parents[2] / "docs" / "operator.md").read_text()
+    rows = [row for row in table_rows("operator.md") if row[-1].isdigit()]
+    numbers = {meaning: [float(n) for n in re.findall(r"[\d.]+", " ".join(cells))] for meaning, *cells in rows}
+    assert numbers.keys() == {pulse.meaning for pulse in VOCABULARY}
     for pulse in VOCABULARY:
-        amplitude = f"{pulse.amplitude:g}" + (f" to {pulse.strongest:g}" if pulse.strongest else "")
-        row = f"| {pulse.meaning} | {pulse.frequency:g} | {amplitude} | {1e3 * pulse.duration:.0f} |"
-        assert row in table
-    assert len(re.findall(r"^\|.*\| \d+ \|$", table, re.MULTILINE)) == len(VOCABULARY)
+        amplitudes = [pulse.amplitude, *([pulse.strongest] if pulse.strongest else [])]
+        assert numbers[pulse.meaning] == pytest.approx([pulse.frequency, *amplitudes, 1e3 * pulse.duration])

@@ -106,7 +106,7 @@ class ArmFeedback:
         if event.destination in AT_REST and not is_refusal(event):
             self.paused = self.last_line
         self._node.get_logger().info(self.last_line)
-        self.haptics.tell(event)
+        self.haptics.start_pulse(event)
         self._events.publish(String(data=json.dumps(event.as_json())))
         self._node.report_health()
 

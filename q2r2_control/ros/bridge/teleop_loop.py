@@ -165,7 +165,7 @@ class TeleopLoop:
         decided, now, nodes, teleop = time.monotonic(), self.nodes[0].now, self.nodes, self.teleop
         for reason in self._recorder.update(teleop.marks):
             for node in nodes:
-                node.feedback.haptics.tell(Event(now, node.arm_name, node.state, node.state, reason))
+                node.feedback.haptics.start_pulse(Event(now, node.arm_name, node.state, node.state, reason))
         faults = {node.arm_name: node.begin_tick(now) for node in nodes}
         # Read after the nodes were judged: the process may have been frozen in the middle of this tick. A gap in the
         # node's own ticks comes first, since it makes others look silent.

@@ -121,7 +121,7 @@ class RecorderNode(BaseNode):
         if told:
             event = Event.from_json(json.loads(deserialize_message(payload, String).data))
             self._marks.follow(event.kind)
-            self._judge.note(self._event(event.reason))
+            self._judge.record_event(self._event(event.reason))
             self.report_health()
 
     def _day(self) -> int:
@@ -136,7 +136,7 @@ class RecorderNode(BaseNode):
         until, self._looked = self._looked, self._day()
         self._recorder.record([one for one in self._waiting if one.time <= until])
         self._waiting = [one for one in self._waiting if one.time > until]
-        self._judge.look()
+        self._judge.report_verdicts()
         if self._marks.recorded and self._recorder.fault is not None:
             self._marks.recorded = False
             self.get_logger().error(f"nothing is recorded any more: {self._recorder.fault}")
@@ -147,7 +147,7 @@ class RecorderNode(BaseNode):
         response.success, response.message = refusal is None, refusal or sentence(reason)
         if refusal is None:
             self._marks.follow(kind)
-            self._judge.note(self._event(reason))
+            self._judge.record_event(self._event(reason))
             self._tell(reason)
         return response
 
