@@ -190,8 +190,8 @@ def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes:
     )
     assert call(node, "/recorder/start").success
     states = States(node, "recorder")
-    enough = states.wait_for("")["messages"] + 10_000  # of some 10 topics a tick
-    wait_until(lambda: states.wait_for("")["messages"] > enough, "the arms are moved", patience=600.0)
+    enough = states.wait_for()["messages"] + 10_000  # of some 10 topics a tick
+    wait_until(lambda: states.wait_for()["messages"] > enough, "the arms are moved", patience=600.0)
     assert call(node, "/recorder/stop").success
     # The process that judges gets nothing while others want the processors: an hour tells a hang from a busy machine.
     wait_until(lambda: any(event.kind is ReasonKind.VERDICT for event in told), "the verdict is told", patience=3600.0)
