@@ -97,9 +97,7 @@ class CartesianController:
 
     @property
     def kept_distances(self) -> Array:
-        """The distance that every monitored pair keeps now (p,) [m]; another array, not a changed one, when that
-        changes.
-        """
+        """Kept distance of every monitored pair now (p,) [m]; another array, not a changed one, when that changes."""
         return self._live.kept
 
     @property
@@ -239,9 +237,7 @@ class CartesianController:
 
     @property
     def object_distances(self) -> Array:
-        """The distance that every pair of ``Robot.objects`` keeps now (pairs,) [m]; minus infinity while it does not
-        count.
-        """
+        """Kept distance of every pair of ``Robot.objects`` now (pairs,) [m]; minus infinity while it does not count."""
         return self._objects.kept.copy()
 
     def _observe_again(self, grown: IntArray) -> int:

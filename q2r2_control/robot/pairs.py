@@ -38,9 +38,7 @@ class KnownParts:
 
     @classmethod
     def carried_by(cls, tree: LinkTree, chains: Mapping[str, Sequence[str]]) -> KnownParts:
-        """The facts that the tree alone shows, ``chains`` being each arm's joints: those that it carries move its
-        fingers.
-        """
+        """Roles that the tree shows, ``chains`` being each arm's joints: those that it carries move its fingers."""
         of_arms = {joint for chain in chains.values() for joint in chain}
         last = {arm: joint_end(tree.movable()[chain[-1]], "child") for arm, chain in chains.items()}
         fingers = {

@@ -40,9 +40,7 @@ class GripperLimiter:
         self.changed = False  # whether the controller's openings did, in the last tick
 
     def limit(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> dict[str, float]:
-        """The openings that may be commanded at ``now`` [s], 0 closed .. 1 open; as it was where nothing believable is
-        measured.
-        """
+        """Openings that may be commanded at ``now`` [s], 0 closed .. 1 open; as before where no measurement counts."""
         self.changed = False
         granted = dict(wanted)
         for arm, gripper in self._grippers.items():

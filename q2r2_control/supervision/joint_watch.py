@@ -39,9 +39,7 @@ class WatchSettings:
 
 
 def watch_settings(settings: SupervisionSettings, yields: bool) -> WatchSettings:
-    """The rules that the cell's settings ask for; ``yields``: whether arms that are pushed leave their reference by
-    design.
-    """
+    """The rules of the cell's settings; ``yields``: whether arms that are pushed leave their reference by design."""
     return WatchSettings(
         timeout=settings.state_timeout,
         unusable_time=settings.unusable_time,

@@ -1,6 +1,4 @@
-"""The errors that a headset adds to exact poses: noise of the size asked for, uneven times, and nothing else unless
-asked.
-"""
+"""Errors of a headset in exact poses: noise of the size asked for, uneven times, and no others unless asked."""
 
 from __future__ import annotations
 

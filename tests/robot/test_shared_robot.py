@@ -58,9 +58,7 @@ TIAGO: dict[str, Any] = {
 
 
 def _tiago_pairs() -> str:
-    """Contacts that its maker did not list: the forearm's capsule reaches into the palm's, the torso's into the
-    shoulder's.
-    """
+    """Not listed by its maker: the forearm's capsule reaches into the palm's, the torso's into the shoulder's."""
     hand = ("safety_box", "palm_link", "index_link", "mrl_link", "thumb_link")
     pairs = [(f"arm_{side}_5_link", f"hand_{side}_{part}") for side in ("left", "right") for part in hand]
     pairs += [("torso_lift_link", f"arm_{side}_2_link") for side in ("left", "right")]

@@ -102,9 +102,7 @@ def circling(t: float) -> pin.SE3:
 
 
 def played(pose: Callable[[float], pin.SE3], until: float, *, lines: bool, jitter: float = 4e-4) -> list[pin.SE3]:
-    """The target that the loop follows at each tick, where both tick late by up to ``jitter`` [s] and messages take as
-    long.
-    """
+    """The loop's target at each tick, where both tick late by up to ``jitter`` [s] and messages take as long."""
     random, line, clock = np.random.default_rng(0), TargetExtrapolator(), TickClock(LOOP)
     sent = [SENDER * k + random.uniform(0.0, jitter) for k in range(int(until / SENDER))]
     received = [t + 5e-4 + random.uniform(0.0, jitter) for t in sent]

@@ -1,6 +1,4 @@
-"""Settings that change while a node runs. Parameters that are set together change as a whole or not at all, with the
-reason.
-"""
+"""Settings that change while a node runs. Those set together change as a whole or not at all, with the reason."""
 
 from __future__ import annotations
 
