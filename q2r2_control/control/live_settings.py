@@ -157,7 +157,7 @@ class LiveSettings:
         self._objects.change(settings)
         gains = self._gains_of(settings)
         if not all(map(np.array_equal, gains, self._gains)):
-            now = _arrays((self._model.tasks, self._safety.approach.gain))
+            now = arrays_in((self._model.tasks, self._safety.approach.gain))
             self._gains, self._ramp = gains, _RAMP_TIME
             self._changing = [pair for pair in zip(now, gains, strict=True) if not np.array_equal(*pair)]
         return None
@@ -201,7 +201,7 @@ class LiveSettings:
 
     def _gains_of(self, settings: ControllerSettings) -> tuple[Array, ...]:
         tasks = task_model_of(self._robot, settings, self._model.tasks.chain)
-        return tuple(_arrays((tasks, np.array([settings.separation_gain]))))
+        return tuple(arrays_in((tasks, np.array([settings.separation_gain]))))
 
     def _approach_gains(self, h: float) -> None:
         share, self._ramp = min(h / self._ramp, 1.0) if self._ramp else 1.0, max(self._ramp - h, 0.0)
@@ -209,10 +209,10 @@ class LiveSettings:
             values[:] = goal if share == 1.0 else values + share * (goal - values)
 
 
-def _arrays(values: tuple[Any, ...]) -> Iterator[Array]:
+def arrays_in(values: tuple[Any, ...]) -> Iterator[Array]:
     """All arrays in a tuple and the tuples within it."""
     for value in values:
         if isinstance(value, tuple):
-            yield from _arrays(value)
+            yield from arrays_in(value)
         elif isinstance(value, np.ndarray):
             yield value

@@ -7,8 +7,10 @@ import pytest
 
 from q2r2_control.config.control import LIVE, ControllerSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.live_settings import GROWTH
+from q2r2_control.control.live_settings import GROWTH, arrays_in
+from q2r2_control.control.tasks.built_in import task_model_of
 from q2r2_control.robot.kept_distances import kept_distances
+from tests.control.cells import kernel_model
 from tests.control.scenarios import SCENARIOS, circle
 from tests.control.test_scenarios import robot_of
 from tests.support.driven import Driven
@@ -106,6 +108,18 @@ def test_what_was_changed_is_what_a_controller_that_is_made_with_it_has(name: st
     made[1].reset(made[1].robot.home)
     np.testing.assert_array_equal(_way(made[1]), ways[0])
     assert np.abs(ways[0] - ways[1]).max() > 1e-4
+
+
+def test_a_setting_is_live_if_the_model_of_a_task_has_it_in_an_array() -> None:
+    usual = ControllerSettings(priority="left")
+
+    def arrays(settings: ControllerSettings) -> bytes:
+        model = task_model_of(robot_of("iiwa7"), settings, kernel_model("dual_iiwa7").tasks.chain)
+        return b"".join(array.tobytes() for array in arrays_in(model))
+
+    numbers = {name: 0.4 * value for name, value in usual if isinstance(value, float)}
+    found = {name for name, value in numbers.items() if arrays(usual.model_copy(update={name: value})) != arrays(usual)}
+    assert found | {"min_distance", "separation_gain"} == set(LIVE)
 
 
 def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(controller: CartesianController) -> None:
