@@ -36,7 +36,7 @@ class PoseScratch(NamedTuple):
 
 
 class TaskTargets(NamedTuple):
-    """What the arms are asked to do."""
+    """Targets of the arms in one tick."""
 
     member: Array  # (n, nv) 1 where a joint is the arm's
     follows: IntArray  # (n,) 1: the tool follows its target, 0: the arm's joints hold

@@ -189,7 +189,7 @@ class OperatorSide:
         if asked and not self._homing:
             refusal = self._supervisor.go_home()
             if refusal is not None:
-                self._teleop.end_homing(now, Reason(ReasonKind.NOT_HOMING, cause=refusal), arrived=False)
+                self._teleop.end_homing(now, Reason(ReasonKind.NOT_HOMING, cause=refusal))
             self._homing = refusal is None
         elif self._homing and not asked:
             self._homing = False

@@ -158,9 +158,10 @@ class Teleop:
         """Both arms shall go home, because a program says so. An obstacle is told as an event."""
         self._pair.home(now, None)
 
-    def end_homing(self, now: float, outcome: Reason, arrived: bool = True) -> None:
-        """The way home is over, with this ``outcome``; not ``arrived``: because of a fault."""
-        self._pair.change(Cause.HOMED if arrived else Cause.FAULT, now, outcome)
+    def end_homing(self, now: float, outcome: Reason) -> None:
+        """The way home is over, with this ``outcome``: at home, without a way there, or by a fault."""
+        fault = outcome.kind in (ReasonKind.HOMING_FAULT, ReasonKind.NOT_HOMING)
+        self._pair.change(Cause.FAULT if fault else Cause.HOMED, now, outcome)
 
     def record_event(self, now: float, reason: Reason) -> None:
         """The things that the operator should know of both arms."""

@@ -44,12 +44,14 @@ class WayHome:
     ("outcome", "event"),
     [
         (Reason(ReasonKind.HOMING_ARRIVED), "paused: homing_arrived"),
-        (Reason.of(ReasonKind.HOMING_HELD_UP, by="a | b"), "lost: homing_fault: homing_held_up"),
-        (Reason(ReasonKind.HOMING_NO_WAY), "lost: homing_fault: homing_no_way"),
+        (Reason.of(ReasonKind.HOMING_HELD_UP, by="a | b"), "paused: homing_held_up"),
+        (Reason(ReasonKind.HOMING_NO_WAY), "paused: homing_no_way"),
         (None, "lost: homing_fault: homing_ended"),
     ],
 )
-def test_both_arms_are_at_home_only_where_the_controller_has_arrived(outcome: Reason | None, event: str) -> None:
+def test_a_way_home_ends_with_the_outcome_that_the_controller_tells_and_without_one_by_a_fault(
+    outcome: Reason | None, event: str
+) -> None:
     way = WayHome()
     assert way.update(0.0, goes=True) == ["homing: homing"] * 2
     assert way.update(1.0, goes=False, outcome=outcome) == [event] * 2

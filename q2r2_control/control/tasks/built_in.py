@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class TaskModel(NamedTuple):
-    """What does not change in a tick. Between ticks, arrays made of settings that are live may (live_settings.py)."""
+    """The constants of a tick. Between ticks, arrays made of settings that are live may (live_settings.py)."""
 
     chain: Chain
     tools: Tools

@@ -64,7 +64,9 @@ class HomeClient:
         late = self._since is not None and now - self._since > _PATIENCE
         if self._seen:
             if not self._said:
-                self._end(teleop, now, outcome or Reason(ReasonKind.HOMING_ENDED))
+                self._end(
+                    teleop, now, outcome or Reason(ReasonKind.HOMING_FAULT, cause=Reason(ReasonKind.HOMING_ENDED))
+                )
         elif accepted and late:
             self._end(teleop, now, outcome or Reason.of(ReasonKind.HOMING_NOT_BEGUN, controller=self._name))
         elif not accepted and self._answer.done():
@@ -88,9 +90,9 @@ class HomeClient:
 
     def _end(self, teleop: Teleop, now: float, outcome: Reason) -> None:
         self._since = self._answer = None
-        arrived = outcome.kind is ReasonKind.HOMING_ARRIVED
-        fault = Reason(ReasonKind.HOMING_FAULT if self._seen else ReasonKind.NOT_HOMING, cause=outcome)
-        teleop.end_homing(now, outcome if arrived else fault, arrived)
+        if not self._seen:
+            outcome = Reason(ReasonKind.NOT_HOMING, cause=outcome)
+        teleop.end_homing(now, outcome)
 
 
 class RecorderLink:
