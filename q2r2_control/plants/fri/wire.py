@@ -1,0 +1,260 @@
+"""KUKA's Fast Robot Interface on the wire: datagrams in, messages out, and the other way round.
+
+A cabinet sends a :class:`Monitoring` datagram every period, its client answers with a :class:`Command`. FRI 1 sends the
+protobuf message itself; FRI 2 puts its length before it and a CRC-32 behind it, both uint32, little endian.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+from google.protobuf.message import DecodeError, EncodeError
+
+from q2r2_control.errors import ProtocolError
+from q2r2_control.plants.fri.schema import CommandMessage, MonitoringMessage
+
+JOINTS = 7
+LONGEST = 1500  # of a datagram [bytes]
+_MONITORING, _COMMAND = 0x245142, 0x34001  # identifiers of the two messages
+_FIRST_FIELD = 0x0A  # the first byte of a message whose field 1 is a message
+_LENGTH = struct.Struct("<I")
+
+Joints = tuple[float, ...]  # seven of them
+IoValue = bool | int | float
+
+
+class Session(IntEnum):
+    """How far a cabinet and its client have come."""
+
+    IDLE = 0
+    MONITORING_WAIT = 1
+    MONITORING_READY = 2
+    COMMANDING_WAIT = 3
+    COMMANDING_ACTIVE = 4
+
+
+class Quality(IntEnum):
+    """Of the connection, as the cabinet judges it by answers in time; it lets a client command from GOOD on."""
+
+    POOR = 0
+    FAIR = 1
+    GOOD = 2
+    EXCELLENT = 3
+
+
+class Safety(IntEnum):
+    """Stop that the cabinet's safety controller asks for."""
+
+    NORMAL = 0
+    STOP_0_OR_1 = 1
+    STOP_1_ON_PATH = 2
+    STOP_2 = 3
+
+
+class Operation(IntEnum):
+    """Of the cabinet's key switch."""
+
+    T1 = 0
+    T2 = 1
+    AUTOMATIC = 2
+
+
+class Drives(IntEnum):
+    """State of the drives; that of the worst joint."""
+
+    OFF = 0
+    TRANSITIONING = 1
+    ACTIVE = 2
+
+
+class CommandKind(IntEnum):
+    """What the Sunrise application lets a client overlay."""
+
+    NONE = 0
+    POSITION = 1
+    WRENCH = 2
+    TORQUE = 3
+    CARTESIAN_POSE = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Monitoring:
+    """One message of a cabinet. Joints are A1 .. A7 [rad, Nm]; None: the message has none."""
+
+    version: int  # 1 or 2
+    counter: int  # of the cabinet's messages
+    reflected: int  # counter of the client's message that the cabinet heard last
+    session: Session
+    quality: Quality
+    period: float  # between two messages of the cabinet [s]
+    multiplier: int  # one answer is due for so many messages
+    q: Joints  # measured
+    stamp: float = 0.0  # by the cabinet's clock [s]
+    tau: Joints | None = None  # measured
+    external_tau: Joints | None = None  # by contacts, as the cabinet estimates it
+    commanded_q: Joints | None = None  # of FRI 1
+    ipo_q: Joints | None = None  # where the cabinet's own motion is, which a client's command overlays
+    command: CommandKind = CommandKind.NONE
+    safety: Safety = Safety.NORMAL
+    operation: Operation = Operation.AUTOMATIC
+    drives: Drives = Drives.ACTIVE
+    io: dict[str, IoValue] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One answer of a client."""
+
+    counter: int  # of the client's messages, from 0
+    reflected: int  # counter of the message that is answered
+    q: Joints | None = None  # due one answer's period from now [rad]
+    tau: Joints | None = None  # added to the cabinet's own joint impedance [Nm]
+    io: dict[str, IoValue] = field(default_factory=dict)
+
+
+def read_monitoring(datagram: bytes) -> Monitoring:
+    """A cabinet's message. Raises :class:`ProtocolError` for bytes that are none."""
+    version, message = _parsed(datagram, MonitoringMessage, _MONITORING)
+    data, connection, ipo, robot = message.data, message.connection, message.ipo, message.robot
+    if (q := _joints(data, "q")) is None:
+        raise ProtocolError("FRI monitoring message without measured joint positions: allowed: seven of them")
+    return Monitoring(
+        version=version,
+        counter=message.header.counter,
+        reflected=message.header.reflected,
+        session=_member(Session, connection.session),
+        quality=_member(Quality, connection.quality),
+        period=1e-3 * connection.period,
+        multiplier=max(connection.multiplier, 1),
+        q=q,
+        stamp=data.stamp.sec + 1e-9 * data.stamp.nanosec,
+        tau=_joints(data, "tau"),
+        external_tau=_joints(data, "external_tau"),
+        commanded_q=_joints(data, "commanded_q"),
+        ipo_q=_joints(ipo, "q"),
+        command=_member(CommandKind, ipo.command_mode),
+        safety=_member(Safety, robot.safety),
+        operation=_member(Operation, robot.operation),
+        drives=min((_member(Drives, drive) for drive in robot.drives), default=Drives.ACTIVE),
+        io=_io_of(data.io),
+    )
+
+
+def write_monitoring(monitoring: Monitoring) -> bytes:
+    """The datagram of a cabinet's message, for one that stands in for a cabinet."""
+    message = MonitoringMessage()
+    _set_header(message, _MONITORING, monitoring.counter, monitoring.reflected)
+    message.robot.joints, message.robot.control = JOINTS, 0
+    message.robot.safety, message.robot.operation = monitoring.safety, monitoring.operation
+    message.robot.drives.extend([monitoring.drives] * JOINTS)
+    connection = message.connection
+    connection.session, connection.quality = monitoring.session, monitoring.quality
+    connection.period, connection.multiplier = round(1e3 * monitoring.period), monitoring.multiplier
+    message.data.stamp.sec = int(monitoring.stamp)
+    message.data.stamp.nanosec = int(1e9 * (monitoring.stamp % 1.0))
+    for name in ("q", "tau", "external_tau", "commanded_q"):
+        _set_joints(message.data, name, getattr(monitoring, name))
+    _set_joints(message.ipo, "q", monitoring.ipo_q)
+    message.ipo.command_mode = monitoring.command
+    _set_io(message.data.io, monitoring.io, direction=0)
+    return _datagram(message, monitoring.version)
+
+
+def read_command(datagram: bytes) -> tuple[int, Command]:
+    """Version and answer of a client. Raises :class:`ProtocolError` for bytes that are none."""
+    version, message = _parsed(datagram, CommandMessage, _COMMAND)
+    data, header = message.data, message.header
+    return version, Command(header.counter, header.reflected, _joints(data, "q"), _joints(data, "tau"), _io_of(data.io))
+
+
+def write_command(command: Command, version: int) -> bytes:
+    """The datagram of an answer in FRI ``version`` 1 or 2."""
+    message = CommandMessage()
+    _set_header(message, _COMMAND, command.counter, command.reflected)
+    _set_joints(message.data, "q", command.q)
+    _set_joints(message.data, "tau", command.tau)
+    _set_io(message.data.io, command.io, direction=1)
+    return _datagram(message, version)
+
+
+def version_of(datagram: bytes) -> int:
+    """FRI 1 or 2. The length that FRI 2 begins with is below 1500, so its second byte is never a message's length."""
+    return 1 if len(datagram) > 1 and datagram[0] == _FIRST_FIELD and datagram[1] > 5 else 2
+
+
+def _parsed(datagram: bytes, kind: Any, identifier: int) -> tuple[int, Any]:
+    if len(datagram) > LONGEST:
+        raise ProtocolError(f"FRI datagram of {len(datagram)} bytes: allowed: at most {LONGEST}")
+    version, body = version_of(datagram), datagram
+    if version == 2:
+        length = _LENGTH.unpack_from(datagram)[0] if len(datagram) >= 8 else -1
+        if length != len(datagram) - 8:
+            raise ProtocolError(f"FRI datagram of {len(datagram)} bytes is neither of FRI 1 nor has FRI 2's length")
+        body = datagram[4:-4]
+        if zlib.crc32(body) != _LENGTH.unpack_from(datagram, len(datagram) - 4)[0]:
+            raise ProtocolError("FRI 2 datagram whose checksum is wrong")
+    try:
+        message = kind.FromString(body)
+    except DecodeError as error:
+        raise ProtocolError(f"FRI datagram of {len(datagram)} bytes that cannot be read: {error!s:.80}") from error
+    if message.header.identifier != identifier:
+        raise ProtocolError(f"FRI message {message.header.identifier:#x}: allowed: {identifier:#x}")
+    return version, message
+
+
+def _datagram(message: Any, version: int) -> bytes:
+    try:
+        body: bytes = message.SerializeToString()
+    except EncodeError as error:
+        raise ProtocolError(f"FRI message that cannot be written: {error!s:.80}") from error
+    if version == 1:
+        return body
+    return _LENGTH.pack(len(body)) + body + _LENGTH.pack(zlib.crc32(body))
+
+
+def _set_header(message: Any, identifier: int, counter: int, reflected: int) -> None:
+    header = message.header
+    header.identifier, header.counter, header.reflected = identifier, counter & 0xFFFFFFFF, reflected & 0xFFFFFFFF
+
+
+def _joints(message: Any, name: str) -> Joints | None:
+    """Seven finite numbers, or None where the message has none."""
+    if not message.HasField(name):
+        return None
+    values = tuple(getattr(message, name).value)
+    if len(values) != JOINTS or not math.isfinite(math.hypot(*values)):
+        raise ProtocolError(f"FRI {name} = {values!s:.80}: allowed: {JOINTS} finite numbers")
+    return values
+
+
+def _set_joints(message: Any, name: str, values: Joints | None) -> None:
+    if values is not None:
+        getattr(message, name).value.extend(values)
+
+
+def _member(kind: type[Any], value: int) -> Any:
+    try:
+        return kind(value)
+    except ValueError as error:
+        allowed = ", ".join(f"{one.value} {one.name.lower()}" for one in kind)
+        raise ProtocolError(f"FRI {kind.__name__.lower()} {value}: allowed: {allowed}") from error
+
+
+def _io_of(values: Any) -> dict[str, IoValue]:
+    """Values by name: booleans, numbers of bits, and analog ones."""
+    kinds: tuple[Any, ...] = (lambda io: bool(io.digital), lambda io: io.digital, lambda io: io.analog)
+    return {io.name.decode(errors="replace"): kinds[io.type](io) for io in values if 0 <= io.type < len(kinds)}
+
+
+def _set_io(message: Any, values: dict[str, IoValue], direction: int) -> None:
+    for name, value in values.items():
+        io = message.add(name=name.encode(), direction=direction)
+        if isinstance(value, float):
+            io.type, io.analog = 2, value
+        else:
+            io.type, io.digital = 0 if isinstance(value, bool) else 1, int(value)

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import struct
+import zlib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.errors import ProtocolError
+from q2r2_control.plants.fri.wire import (
+    Command,
+    CommandKind,
+    Drives,
+    Monitoring,
+    Operation,
+    Quality,
+    Safety,
+    Session,
+    read_command,
+    read_monitoring,
+    version_of,
+    write_command,
+    write_monitoring,
+)
+
+Q = (0.1, -0.2, 0.3, -1.4, 0.5, 1.6, -0.7)
+MONITORING = Monitoring(
+    version=2,
+    counter=7,
+    reflected=5,
+    session=Session.COMMANDING_ACTIVE,
+    quality=Quality.EXCELLENT,
+    period=0.005,
+    multiplier=2,
+    q=Q,
+    stamp=1234.25,
+    tau=tuple(10.0 * value for value in Q),
+    external_tau=Q,
+    commanded_q=Q,
+    ipo_q=Q,
+    command=CommandKind.TORQUE,
+    safety=Safety.STOP_2,
+    operation=Operation.T1,
+    drives=Drives.TRANSITIONING,
+    io={"gripper_open": True, "width": 0.25, "status": 3},
+)
+
+
+def _field(number: int, wire_type: int, payload: bytes) -> bytes:
+    return bytes([number << 3 | wire_type]) + payload
+
+
+def _inner(number: int, payload: bytes) -> bytes:
+    return _field(number, 2, bytes([len(payload)]) + payload)
+
+
+def _double(value: float) -> bytes:
+    return struct.pack("<d", value)
+
+
+# Written by hand from the published field numbers: header, joints one by one, session 4, quality 3, 5 ms.
+HEADER = _inner(1, b"\x08\xc2\xa2\x91\x01" + b"\x10\x07" + b"\x18\x05")
+JOINTS = b"".join(_field(1, 1, _double(value)) for value in Q)
+CONNECTION = _inner(4, b"\x08\x04\x10\x03\x18\x05\x20\x02")
+BY_HAND = HEADER + _inner(3, _inner(1, JOINTS)) + CONNECTION
+
+
+def test_a_message_written_by_hand_from_the_field_numbers_is_understood() -> None:
+    found = read_monitoring(BY_HAND)
+    assert (found.version, found.counter, found.reflected, found.q) == (1, 7, 5, Q)
+    assert (found.session, found.quality) == (Session.COMMANDING_ACTIVE, Quality.EXCELLENT)
+    assert (found.period, found.multiplier, found.ipo_q) == (0.005, 2, None)
+
+
+def test_packed_joints_are_understood_too() -> None:
+    packed = _field(1, 2, bytes([56]) + b"".join(map(_double, Q)))
+    assert read_monitoring(HEADER + _inner(3, _inner(1, packed)) + CONNECTION).q == Q
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_what_is_written_is_read_again(version: int) -> None:
+    sent = dataclasses.replace(MONITORING, version=version)
+    datagram = write_monitoring(sent)
+    assert version_of(datagram) == version
+    assert read_monitoring(datagram) == sent
+    command = Command(4, 7, q=Q, tau=(1.0,) * 7, io={"gripper_close": False, "force": 0.5})
+    assert read_command(write_command(command, version)) == (version, command)
+
+
+def test_the_frame_of_fri_2_is_a_length_and_the_crc_of_zlib() -> None:
+    command = Command(0, 1, q=Q)
+    body = write_command(command, 1)
+    assert write_command(command, 2) == struct.pack("<I", len(body)) + body + struct.pack("<I", zlib.crc32(body))
+
+
+def test_an_answer_without_positions_has_no_command_data() -> None:
+    assert read_command(write_command(Command(0, 1), 1)) == (1, Command(0, 1))
+
+
+def _with_joints(*values: float) -> bytes:
+    return write_monitoring(dataclasses.replace(MONITORING, q=values))
+
+
+REFUSED = {
+    "nothing": (b"", "neither of FRI 1"),
+    "too long": (b"\x0a" * 1501, "at most 1500"),
+    "a wrong checksum": (write_monitoring(MONITORING)[:-1] + b"\x00", "checksum"),
+    "an answer instead": (write_command(Command(0, 1, q=Q), 2), "allowed: 0x245142"),
+    "six joints": (_with_joints(*Q[:6]), "7 finite numbers"),
+    "a joint that is no number": (_with_joints(*Q[:6], float("nan")), "7 finite numbers"),
+    "no joints": (HEADER + CONNECTION, "without measured joint positions"),
+    "an unknown session": (BY_HAND.replace(b"\x08\x04\x10\x03", b"\x08\x09\x10\x03"), "allowed: 0 idle"),
+    "no header": (_inner(3, _inner(1, JOINTS)) + CONNECTION, "neither of FRI 1"),
+    "cut short": (BY_HAND[:60], "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("case", list(REFUSED))
+def test_other_bytes_are_refused_with_what_is_allowed(case: str) -> None:
+    datagram, told = REFUSED[case]
+    with pytest.raises(ProtocolError, match=told):
+        read_monitoring(datagram)
+
+
+def test_a_name_that_is_no_text_is_read_all_the_same() -> None:
+    datagram = write_monitoring(dataclasses.replace(MONITORING, version=1, io={"valve": True}))
+    assert read_monitoring(datagram.replace(b"valve", b"val\xff\xfe")).io == {"val\ufffd\ufffd": True}
+
+
+@given(edits=st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=8), end=st.integers(0, 400))
+@settings(derandomize=True, max_examples=500, deadline=None)
+def test_changed_bytes_are_read_or_refused_and_never_raise_anything_else(
+    edits: list[tuple[int, int]], end: int
+) -> None:
+    for version in (1, 2):
+        datagram = bytearray(write_monitoring(dataclasses.replace(MONITORING, version=version)))
+        for place, value in edits:
+            datagram[place % len(datagram)] = value
+        body = bytes(datagram[: max(end, 1)])
+        if version == 2:  # beyond its checksum
+            body = struct.pack("<I", len(body)) + body + struct.pack("<I", zlib.crc32(body))
+        with contextlib.suppress(ProtocolError):
+            read_monitoring(body)
