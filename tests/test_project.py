@@ -30,6 +30,7 @@ ROS = ROOT / PACKAGE / "ros"
 IMPORTS = {
     **{"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"},
     "pillow": "PIL",
+    "protobuf": "google",
 }
 WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core"}  # come with pin, mujoco, lerobot and pydantic
 NODES = set(ROS.rglob("*.py"))

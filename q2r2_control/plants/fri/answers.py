@@ -2,8 +2,8 @@
 
 **Two clocks.** A cabinet asks by its own clock, which drifts against ours, through a network that jitters and loses.
 It takes the difference of two answers over its period for a velocity. An answer for the very time at which a question
-arrived would pass the network's jitter on to the arm. So an answer is for an even time: that of the answer before
-which the cabinet has heard, and one period more.
+arrived would pass the network's jitter on to the arm. An answer is therefore for an even time: that of the newest
+answer that the cabinet has heard, and one period more.
 
 **Catching up.** Lost messages and drift let the even time fall behind. It catches up at up to ``CATCH_UP`` of its
 rate, and its rate changes by ``CATCH_UP_RAMP`` a second. With the reference at v and a the cabinet sees at most

@@ -130,7 +130,7 @@ class Cabinet:
         self._commanded = self.arm.q
 
     def safety_stop(self, stop: Safety) -> None:
-        """What the safety controller asks for; ``NORMAL`` ends a stop."""
+        """A stop that the safety controller asks for; ``NORMAL`` ends it."""
         self.safety = stop
         if stop is not Safety.NORMAL:
             self.stop(Trip.SAFETY)

@@ -73,7 +73,7 @@ class Drives(IntEnum):
 
 
 class CommandKind(IntEnum):
-    """What the Sunrise application lets a client overlay."""
+    """The commands that the Sunrise application lets a client overlay."""
 
     NONE = 0
     POSITION = 1
