@@ -16,7 +16,6 @@ its certified stop follows.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -123,8 +122,3 @@ class AnswerTimes:
             self._arrival = expected + (arrival - expected) / min(self._questions, _SETTLED)
         self._counter = question
         return self._arrival
-
-
-def joints_of(q: Array, joints: Sequence[int]) -> tuple[float, ...]:
-    """The seven joints of one arm, A1 to A7."""
-    return tuple(q[list(joints)].tolist())
