@@ -101,7 +101,7 @@ MUTATIONS = (
     Mutation(
         "a pair that is too close must not come closer",
         "stop_certificate.py",
-        "if now < before - _CLOSER:",
+        "if now < before - closer:",
         "if now < -1.0:",
     ),
     Mutation(
@@ -109,6 +109,12 @@ MUTATIONS = (
         "stop_certificate.py",
         "if rate < -_STILL:",
         "if rate < -1e3:",
+    ),
+    Mutation(
+        "rounding does not add up",
+        "stop_certificate.py",
+        "if data.distance[p] < model.min_distance[p] - 0.5 * ROUNDING and not",
+        "if data.distance[p] < -1.0 and not",
     ),
     Mutation(
         "rounding is no penetration",

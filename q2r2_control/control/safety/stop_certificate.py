@@ -30,6 +30,7 @@ from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, w
 # Distances of a pair that is too close are compared to this.
 _CLOSER = 1e-12  # [m], and relative
 _STILL = 1e-9  # [m/s]
+_NOISE = 1e-15  # of a distance that is measured twice [m]
 # The gap along a plane is less than the distance that it is made of by up to this much. The closest points of a box and
 # a segment are found to so many digits. Without it a pair at its distance could never be proven to part again.
 _LAST_DIGITS = 1e-11  # [m]
@@ -64,7 +65,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
             continue
         data.unproven[0] = p
         if is_too_close(model, data, p):
-            if not _comes_no_closer(model, data, p, duration):
+            if not _comes_no_closer(model, data, p, duration, _CLOSER):
                 return False
         elif not _keeps_apart(model, data, p, h, duration):
             return False
@@ -81,6 +82,10 @@ def is_too_close(model: SafetyModel, data: SafetyData, p: int) -> bool:
 def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float) -> bool:
     """Prove pair ``p`` apart in the step and in the stop: with one plane, or else piece by piece."""
     data.distance[p] = measure(model.collision, data.collision, p)
+    if data.distance[p] < model.min_distance[p] - 0.5 * ROUNDING and not _comes_no_closer(
+        model, data, p, duration, _NOISE
+    ):
+        return False  # or the digits below would add up, tick by tick, to more than rounding
     threshold = min(model.min_distance[p], data.distance[p] - _LAST_DIGITS)
     if stays_beyond(model.collision, data.collision, p, data.rollout.step, h, data.rollout.stop, duration, threshold):
         return True
@@ -159,7 +164,7 @@ def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: fl
 
 
 @kernel
-def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: float) -> bool:
+def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: float, closer: float) -> bool:
     """For a pair that is too close already: no sample of the stop is closer than the one before, or closing in.
 
     Distances alone would miss a pair that opens and closes again between two samples. At the last one all joints rest,
@@ -171,7 +176,7 @@ def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: flo
     for i in range(last + 1):
         sample = sample_of(model, data, i, duration)
         now = measure(model.collision, sample, p)
-        if now < before - _CLOSER:
+        if now < before - closer:
             return False
         before = now
         distance_row(model.collision, sample, p, row)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.control.safety.joint_limits import next_velocity_box
-from q2r2_control.control.safety.safety_data import VelocityBox
+from q2r2_control.control.safety.safety_data import ROUNDING, VelocityBox
 from q2r2_control.control.safety.stop_certificate import certify, step_travel
 from q2r2_control.control.safety.stop_rollout import ARM_BY_ARM, OWN, SHAPES, TOGETHER, brake, write_stop
 from q2r2_control.types import Array
@@ -197,6 +197,21 @@ def test_a_step_that_brings_a_pair_closer_which_is_too_close_is_refused_although
             found += 1
             assert not _certified(name, motion_of(name, q, -4.0 * parting, parting))
     assert found >= 10
+
+
+def test_digits_that_rounding_leaves_do_not_add_up_over_many_ticks() -> None:
+    name, random = "dual_iiwa7", np.random.default_rng(23)
+    for q in _starts_apart(name, random, True, 3):
+        for _ in range(2):  # to a start at the pair's distance
+            apart = distances(cell(name), q[None])[0]
+            pair = apart.argmin()
+            gradient = (distances(cell(name), q + 1e-6 * np.eye(len(q)))[:, pair] - apart.min()) / 1e-6
+            q = q - (apart.min() - MIN_DISTANCE) * gradient / np.linalg.norm(gradient) ** 2
+        closing = -5e-9 * gradient / np.linalg.norm(gradient) ** 2  # at 5e-9 m/s, thus 5e-12 m a step
+        for _ in range(400):
+            motion = motion_of(name, q, np.zeros_like(q), closing)
+            q = motion.q_next if _certified(name, motion) else q
+        assert distances(cell(name), q[None])[0][pair] >= MIN_DISTANCE - 0.9 * ROUNDING
 
 
 def _turning_at_its_end(name: str, random: np.random.Generator, count: int) -> Iterator[Motion]:
