@@ -149,7 +149,7 @@ def impedance_torque(
 
     Returns whether there is one, and whether an error was clipped, a limit repels and a bound held it back. There is
     none, and nothing is commanded, where the measured state, or what comes of it, is no number to go by. A reference
-    that is not is not used: the last one is held. All in one call, since a tick in torque mode would take 30 us more.
+    that is not is not used: the last one is held. All in one call, since every call from Python takes time.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     measured, reference, added = data.inputs[:2], data.inputs[2:5], data.inputs[5]
