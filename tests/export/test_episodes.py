@@ -141,7 +141,7 @@ def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Ru
 def test_a_bad_recording_is_named_or_skipped(workers: int, run: Run, tmp_path: Path) -> None:
     damaged = tmp_path / "damaged.mcap"
     data = bytearray(run.file.read_bytes())
-    data[data.rindex(ZSTD_MAGIC) + 200] ^= 0xFF
+    data[data.index(ZSTD_MAGIC) + 200] ^= 0xFF
     damaged.write_bytes(data)
     with pytest.raises(RecordingError, match=r"damaged\.mcap: damaged"):
         keep_episodes([damaged, run.file], FrameSampling(), write_vectors, tmp_path, workers=workers)

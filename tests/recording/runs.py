@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
@@ -114,14 +115,15 @@ def file_of(summary: RecordingSummary) -> Path:
 
 
 def rewrite(file: Path, target: Path, change: Callable[[str, Message], Message | None], *, whole: bool = True) -> Path:
-    """A copy in which each message is what ``change`` makes of it and its topic; None: it is not there.
+    """A copy in chunks of 200 ticks in which each message is what ``change`` makes of it and its topic, or is left out.
 
     Not ``whole``: it ends as where its writer was killed.
     """
     recording = Recording(file)
     topics = recording.declared_topics
     with BagWriter(target, topics.values(), recording.about) as bag:
-        for messages in recording.messages():
+        ordered = chain.from_iterable(recording.messages())
+        for _, messages in groupby(ordered, key=lambda message: message.number // 200):
             changed = (change(topics[message.channel].name, message) for message in messages)
             bag.write(message for message in changed if message is not None)
             bag.flush()
