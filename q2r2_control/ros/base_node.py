@@ -14,6 +14,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.action import ActionClient, ActionServer
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -30,6 +31,7 @@ from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.process.scheduling import StopRequest, schedule_process_as_others, schedule_process_first
 from q2r2_control.ros.executor import TickExecutor, TickGroup
+from q2r2_control.ros.launch.executables import LONGEST_END
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.wording import sentence
 
@@ -153,6 +155,12 @@ class BaseNode(Node):
     def close(self) -> None:
         """Called at the end, while the node can still publish."""
 
+    def destroy_node(self) -> None:
+        """Destroy actions too. rclpy leaves them behind, where others find them and they keep the middleware alive."""
+        for action in [one for one in self.waitables if isinstance(one, (ActionClient, ActionServer))]:
+            action.destroy()
+        super().destroy_node()
+
     def clock_problem(self, timeout: float = _CLOCK_TIMEOUT) -> Reason | None:
         """A reason if ROS time is simulated and has stood still for ``timeout`` [s], as far as calls of this tell."""
         clock: Any = self.get_clock()
@@ -267,8 +275,13 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
     finally:
         for node in reversed(nodes):
             node.close()
+        # No arm waits for this process any more. The middleware may take long to end, but neither first nor for ever.
+        schedule_process_as_others()
+        signal.alarm(LONGEST_END)
+        for node in reversed(nodes):
             node.destroy_node()
         rclpy.try_shutdown()
+        signal.alarm(0)
     return next((node.exit_code for node in nodes if node.exit_code is not None), 0)
 
 

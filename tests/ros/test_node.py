@@ -85,6 +85,30 @@ def test_ctrl_c_before_the_interpreter_has_started_waits_for_the_executable_of_a
     assert (output, process.returncode) == ("", -signal.SIGINT)
 
 
+HANGS = """
+import os, sys
+from q2r2_control.ros.base_node import BaseNode, run_node
+
+class Node(BaseNode):
+    exit_code, priority = 0, 5
+
+    def __init__(self):
+        super().__init__("hangs")
+
+    def destroy_node(self):
+        print(os.sched_getscheduler(0) == os.SCHED_OTHER, flush=True)
+        while True:
+            pass
+
+sys.exit(run_node(Node))
+"""
+
+
+def test_a_node_whose_middleware_does_not_end_goes_after_all_and_does_not_go_first_meanwhile() -> None:
+    run = subprocess.run([sys.executable, "-c", HANGS], cwd=ROOT, stdout=subprocess.PIPE, text=True, timeout=120)
+    assert (run.stdout, run.returncode) == ("True\n", -signal.SIGALRM)
+
+
 LISTENER = """
 import rclpy
 from std_msgs.msg import String

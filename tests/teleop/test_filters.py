@@ -36,7 +36,7 @@ def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float =
 @pytest.mark.parametrize("speed", [0.02, 2.0], ids="{} per second".format)
 def test_a_steady_motion_comes_out_late_by_exactly_the_stated_delay_at_any_speed(speed: float, dt: float) -> None:
     def path(t: float) -> pin.SE3:
-        return pose(speed * t, 0.0, 0.0, (0.0, 0.0, speed * t))
+        return pose(speed * t, 0.7 * speed * t, -0.5 * speed * t, (0.0, 0.0, speed * t))
 
     delay, outputs = follow(path, dt=dt)
     for tick in range(round(2.0 / dt), len(outputs)):

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 
+LONGEST_END = 5  # of a process after its nodes were closed; SIGALRM ends it then [s]
 # Module of ``nodes``, and in it the class of a node, or the function that runs more than one.
 NODES = {
     "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),
@@ -34,11 +35,11 @@ def _executable(name: str) -> Callable[[], int]:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         module, made = NODES[name]
         node_or_run = getattr(import_module(f"q2r2_control.ros.nodes.{module}"), made)
-        if not isinstance(node_or_run, type):
-            return int(node_or_run())
         from q2r2_control.ros.base_node import run_node
 
-        return run_node(node_or_run)
+        code = run_node(node_or_run) if isinstance(node_or_run, type) else int(node_or_run())
+        signal.alarm(LONGEST_END)  # what the middleware still does as the process goes
+        return code
 
     return run
 

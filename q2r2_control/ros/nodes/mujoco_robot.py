@@ -258,8 +258,6 @@ class MujocoRobot(BaseNode):
         return OK, mode, values
 
     def close(self) -> None:
-        for gripper in self._grippers.values():
-            gripper.server.destroy()  # rclpy leaves it behind when its node goes, and clients still find it
         self._cell.plant.close()
 
 
