@@ -151,7 +151,7 @@ class ExternalConfig(StrictModel):
     def topic(self, arm: str) -> str:
         """Where an arm's targets or joint commands go."""
         made = self.arm(arm)
-        return made.target_topic or self.terms.topic.format(ctrl=made.ctrl_prefix)
+        return made.target_topic or self.terms.topic_of(made.ctrl_prefix)
 
     def arm(self, name: str) -> ExternalArm:
         """One arm's controller."""
