@@ -116,7 +116,11 @@ class ReasonKind(StrEnum):
     TOPIC_EMPTY = "topic_empty", "nothing on {topic}"
     TOPIC_SILENT = "topic_silent", "{topic}{source} is silent for {age:.2f} s"
     TOPIC_NOT_A_POSE = "topic_not_a_pose", "{topic}: not finite or not a rotation"
-    SAFE_TARGET_AWAY = "safe_target_away", "{topic} is not where the tool is: the arm moves, or tool_frame is wrong"
+    SAFE_TARGET_AWAY = (
+        "safe_target_away",
+        "{topic} is {distance:.3f} m and {angle:.2f} rad from {frame}: the arm moves, or {frame} is not the cell's "
+        "tool; tool_frame (end_effector_link_name) has to name a frame at the tool of the cell's YAML",
+    )
     NO_SUBSCRIBER = "no_subscriber", "{topic} has no subscriber"
     SUBSCRIBER_UNKNOWN = "subscriber_unknown", "{topic} has a subscriber whose node is not known yet"
     SEVERAL_PUBLISHERS = (

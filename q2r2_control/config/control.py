@@ -211,4 +211,7 @@ class SupervisionSettings(StrictModel):
     max_deviation_torque: float = Field(
         1.5, ge=0.01, le=3, description="the same in torque mode, where arms that are pushed yield [rad]"
     )
+    max_deviation_external: float = Field(
+        0.6, ge=0.01, le=3, description="the same where another controller follows safe targets, and may lag [rad]"
+    )
     deviation_time: float = Field(0.5, ge=0.05, le=10, description="a longer deviation stops the arms [s]")

@@ -95,7 +95,9 @@ class ExternalArm(StrictModel):
 
     ctrl_prefix: AbsoluteName = Field(description="name of the controller's node, with its namespace")
     base_frame: FrameName = Field(description="frame_id of its targets; a frame of /tf")
-    tool_frame: FrameName | None = Field(None, description="frame of /tf that the operator moves; none: the cell's")
+    tool_frame: FrameName | None = Field(
+        None, description="frame of /tf that the operator moves, in mode filtered at the cell's tool; none: the cell's"
+    )
     target_topic: RosName | None = Field(None, description="of its targets or joint commands; none: the preset's")
     joint_states_topic: RosName = Field("joint_states", description="where the arm's joint states are")
     gripper: ExternalGripper = ExternalGripper()
@@ -151,7 +153,7 @@ class ExternalConfig(StrictModel):
     def topic(self, arm: str) -> str:
         """Where an arm's targets or joint commands go."""
         made = self.arm(arm)
-        return made.target_topic or self.terms.topic.format(ctrl=made.ctrl_prefix)
+        return made.target_topic or self.terms.topic_of(made.ctrl_prefix)
 
     def arm(self, name: str) -> ExternalArm:
         """One arm's controller."""

@@ -1,6 +1,7 @@
 """Terms of community controllers: topic, type, frame, rate, activation, limits.
 
 ``{ctrl}`` stands for the controller's own name with its namespace, the parameter ``ctrl_prefix`` of an arm controller.
+``{robot}`` stands for that namespace alone.
 """
 
 from __future__ import annotations
@@ -50,6 +51,10 @@ class Preset:
         """Whether it takes tool poses; other presets take joint positions."""
         return self.message == POSE
 
+    def topic_of(self, ctrl_prefix: str) -> str:
+        """Where the controller with this name takes its targets."""
+        return self.topic.format(ctrl=ctrl_prefix, robot=ctrl_prefix.rpartition("/")[0])
+
 
 _LATCHES = "active; keeps the last target for ever"
 BUILTIN = Preset("builtin", "always on", rate=200.0, lowest_rate=20.0, hold=Hold.SILENCE, guard=_WIDE)
@@ -79,7 +84,7 @@ _ALL = (
     Preset(
         "lbr_position",
         "the first command equals the measured positions",
-        topic="{ctrl}/command/joint_position",
+        topic="{robot}/command/lbr_joint_position_command",  # resolved in its namespace, so beside the node
         message="lbr_fri_idl/msg/LBRJointPositionCommand",
         rate=200.0,
         lowest_rate=100.0,

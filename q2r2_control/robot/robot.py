@@ -35,6 +35,8 @@ from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.robot.urdf_parts import acceleration_limit
 from q2r2_control.types import Array
 
+_SAME_FRAME = 1e-3  # two frames that are one in two files differ by less [m], [rad]
+
 
 @dataclass(frozen=True, slots=True)
 class Arm:
@@ -130,6 +132,7 @@ class Robot:
         urdf = parse_urdf(cell.urdf, cell.name)
         robot = cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name, cell.parts)
         robot._add_objects(config)
+        robot._check_operators_frames(config)
         return robot
 
     @classmethod
@@ -210,6 +213,25 @@ class Robot:
                 has = f"the cell has a link {held.link}"
                 raise ConfigError(f"arms.{arm}.gripper.object: {has}; allowed: none of that name")
             self.roles[held.link] = Role(LinkClass.OBJECT, frozenset({arm}))
+
+    def _check_operators_frames(self, config: Config) -> None:
+        """In mode filtered the frame that the operator moves has to be the cell's tool, or no target begins there."""
+        if config.external is None or not config.external.filtered:
+            return
+        for arm in self.arms:
+            frame, tool = config.external.arm(arm).tool_frame, self.arms[arm].tool_frame
+            if frame is None or not self.model.existFrame(frame, pin.FrameType.BODY):
+                continue  # only /tf knows it, and the arm's node compares it there
+            at_home = self.tool_pose(self.home, arm)
+            frame_id = self.model.getFrameId(frame, pin.FrameType.BODY)
+            between = at_home.actInv(pin.updateFramePlacement(self.model, self._data, frame_id))
+            distance, angle = (float(np.linalg.norm(way)) for way in (between.translation, pin.log3(between.rotation)))
+            if max(distance, angle) > _SAME_FRAME:
+                raise ConfigError(
+                    f"external.arms.{arm}.tool_frame = {frame!r}: {distance:.3f} m and {angle:.2f} rad from {tool}, "
+                    "the cell's tool, which mode filtered moves; "
+                    f"allowed: a frame at the tool, or null with {tool} on /tf"
+                )
 
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:

@@ -182,10 +182,15 @@ class ExternalSettings:
 
 
 def settings_for_external_arms(config: Config) -> Config:
-    """The cell's configuration with elbows that are free to follow."""
+    """The cell's configuration with elbows that are free to follow, and with the deviation for arms that lag.
+
+    The lag is the other controller's. Arms that come too close are found in what is measured, at any deviation.
+    """
     control = config.control.model_copy(update=_FOLLOW)
     stiff = config.admittance.model_copy(update={"enabled": False})  # compliance is the other controller's
-    return config.model_copy(update={"control": control, "admittance": stiff})
+    supervision = config.supervision
+    lagging = supervision.model_copy(update={"max_deviation": supervision.max_deviation_external})
+    return config.model_copy(update={"control": control, "admittance": stiff, "supervision": lagging})
 
 
 class ExternalArms:

@@ -36,6 +36,15 @@ def test_check_says_what_drives_the_arms_and_how(tmp_path: Path) -> None:
     assert one_object(q2r2("check", file, "--json").stdout)["driven"]["right"] == line
 
 
+def test_check_refuses_a_filtered_cell_whose_operator_moves_another_frame_than_the_tool(tmp_path: Path) -> None:
+    text = Path(external_cell(tmp_path, new="mode: filtered")).read_text(encoding="utf-8")
+    (file := tmp_path / "cell.yaml").write_text(text.replace("left_arm_link_ee", "left_link_ee"), encoding="utf-8")
+    result = q2r2("check", str(file))
+    assert result.exit_code == 2
+    assert "external.arms.left.tool_frame = 'left_link_ee': 0.144 m and 0.00 rad from left_tool_frame" in result.stderr
+    assert "allowed: a frame at the tool, or null with left_tool_frame on /tf" in result.stderr
+
+
 def test_check_as_json_has_limits_and_distances_in_order() -> None:
     cell = one_object(q2r2("check", CELL, "--json").stdout)
     assert [arm["name"] for arm in cell["arms"]] == ["left", "right"]

@@ -182,15 +182,21 @@ def test_an_arm_whose_tool_is_on_a_topic_pauses_when_that_ends(rig: ArmRig, node
     assert "/left/current_pose from /test" in rig.state["last_event"]
 
 
-def test_an_arm_waits_while_its_controllers_tool_is_elsewhere(rig: ArmRig, node: Any, processes: Processes) -> None:
+@pytest.mark.parametrize("preset", ["fzi", "jtc"])  # one takes poses, the other joints of the built-in controller
+def test_an_arm_waits_while_its_controllers_tool_is_elsewhere(
+    rig: ArmRig, node: Any, processes: Processes, preset: str
+) -> None:
     safe = offset(TOOL, (0.0, 0.0, 0.15))  # as with a tool_frame that is not the cell's
     publisher = node.create_publisher(PoseStamped, "/cartesian_controller/safe_target/left", 10)
     timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(safe, "world", 0.0)))
     node.create_subscription(PoseStamped, "/theirs/target_frame", lambda _: None, 10)
-    rig.start(processes, {"mode": "filtered", "preset": "fzi", "target_topic": "/theirs/target_frame"})
+    process = rig.start(processes, {"mode": "filtered", "preset": preset, "target_topic": "/theirs/target_frame"})
     rig.wait(lambda: rig.state.get("kind") == ReasonKind.CONTROLLER_REFUSES, "the arm is not ready")
     rig.press()
     rig.wait(lambda: rig.state["last_event_kind"] == ReasonKind.SAFE_TARGET_AWAY, "the press is refused")
+    says = "safe_target/left is 0.150 m and 0.00 rad from left_tool_frame: the arm moves, or left_tool_frame is not the"
+    assert says in rig.state["last_event"]
+    assert process.output.count(f"controller]: /cartesian_controller/{says}") == 1  # not again at each tick
     assert not rig.targets
     safe = TOOL
     rig.engage()

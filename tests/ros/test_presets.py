@@ -37,6 +37,7 @@ from std_srvs.srv import SetBool
 
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
 from q2r2_control.ros.bridge.arm_outputs import CommandType
+from q2r2_control.ros.bridge.joint_outputs import KINDS
 from q2r2_control.ros.bridge.messages import pose_of, seconds
 from tests.ros.arm_rig import ArmRig, ArmRigs, patient
 from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
@@ -50,7 +51,7 @@ LONGEST_GAP = 0.3  # in a stream, on a machine with other load [s]
 NAMES = {
     **dict.fromkeys(("builtin", "kuka_lbr_clik", "kuka_lbr_impedance", "fzi"), "target_frame"),
     **{"mayr": "reference_pose", "crisp": "target_pose", "moveit_servo": "pose_target_cmds"},
-    **{"lbr_position": "command/joint_position", "forward_position": "commands", "jtc": "joint_trajectory"},
+    **{"forward_position": "commands", "jtc": "joint_trajectory"},
 }
 JOINTS = ("lbr_position", "forward_position", "jtc")
 
@@ -216,11 +217,16 @@ def test_a_preset_that_is_not_run_differs_from_the_one_that_is_in_names_and_what
 
 
 def test_the_presets_have_the_topics_of_their_controllers() -> None:
-    assert PRESETS.keys() == NAMES.keys()
+    # lbr_fri_ros2_stack names it relative to its controller's node: the name resolves in the robot's namespace.
+    lbr = PRESETS["lbr_position"].topic_of
+    assert lbr("/left/lbr_joint_position_command_controller") == "/left/command/lbr_joint_position_command"
+    assert lbr("/lbr_joint_position_command_controller") == "/command/lbr_joint_position_command"
+    assert lbr("/{arm}/lbr_joint_position_command_controller") == KINDS["lbr_position"].topic
+    assert PRESETS.keys() == {*NAMES, "lbr_position"}
     assert {name for name, preset in PRESETS.items() if not preset.takes_poses} == set(JOINTS)
-    for name, topic in NAMES.items():
-        preset = PRESETS[name]
-        assert preset.topic.format(ctrl="/robot/left_ctrl") == f"/robot/left_ctrl/{topic}"
+    for name, preset in PRESETS.items():
+        if name in NAMES:
+            assert preset.topic_of("/robot/left_ctrl") == f"/robot/left_ctrl/{NAMES[name]}"
         assert preset.rate >= preset.lowest_rate
         assert (preset.zero_wrench is not None) == (name == "kuka_lbr_impedance")
         assert (preset.command_type is not None) == (name == "moveit_servo")

@@ -122,10 +122,13 @@ def test_a_set_has_the_controller_that_its_preset_needs_with_its_topics_and_fram
     per_arm = {f"{arm}.{name}": value for arm in SIDES for name, value in each.items()}
     assert nodes[0].parameters == {"config": file, "output": "none", **per_arm}
 
-    parameters = nodes_of(external_cell(tmp_path, "lbr_position", "filtered"))[0].parameters
+    arms = external()["external"]["arms"]
+    for arm in SIDES:
+        arms[arm]["ctrl_prefix"] = f"/{arm}/lbr_joint_position_command_controller"
+    parameters = nodes_of(external_cell(tmp_path, "lbr_position", "filtered", arms=arms))[0].parameters
     assert (parameters["output"], parameters["rate"]) == ("lbr_position", 200.0)
     for arm in SIDES:
-        assert parameters[f"{arm}.output_topic"] == f"/bh_robot/{arm}_arm_clik_controller/command/joint_position"
+        assert parameters[f"{arm}.output_topic"] == f"/{arm}/command/lbr_joint_position_command"
         assert parameters[f"{arm}.target_frame_id"] == "bh_robot_base"
 
 

@@ -13,16 +13,22 @@ from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.cell import Config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.events import ReasonKind
-from q2r2_control.supervision.joint_watch import ExternalArms, ExternalSettings, settings_for_external_arms
+from q2r2_control.supervision.joint_watch import (
+    ExternalArms,
+    ExternalSettings,
+    settings_for_external_arms,
+    watch_settings,
+)
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
-from tests.supervision.conftest import CONFIG, STRICT, unhurried
+from tests.supervision.conftest import CONFIG, unhurried
 from tests.support.reasons import kinds
 
 DT = 0.005  # [s]
 SPEED = 0.3  # of the elbow's swing, in the norm of the joints' velocities [rad/s]
 POST, RADIUS = 2.6, 0.04  # where a post is on the elbow's way, and its own radius [rad], [m]
+LAG, PACE = 0.6, 0.3  # of a soft controller [s], of a tool or a joint that it moves [m/s], [rad/s]
 MIN_DISTANCE, TOLERANCE = 0.02, 0.01  # [m]
 
 
@@ -62,8 +68,9 @@ class World:
         self.robot = Robot.from_config(config)
         self.controller = CartesianController(self.robot, unhurried(config))
         streams, settings = StreamSettings(), ExternalSettings(tolerance=TOLERANCE)
-        external = ExternalArms(self.robot, self.controller, settings, streams, STRICT)
-        self.supervisor = Supervisor(self.robot, self.controller, streams, STRICT, external=external)
+        watch = watch_settings(config.supervision, yields=False)
+        external = ExternalArms(self.robot, self.controller, settings, streams, watch)
+        self.supervisor = Supervisor(self.robot, self.controller, streams, watch, external=external)
         self.now = 0.0
 
     def show(self, postures: list[Array]) -> Reference | None:
@@ -115,6 +122,33 @@ def test_a_tool_that_is_not_where_its_reference_is_starts_over(world: World) -> 
     assert world.supervisor.phase is Phase.ACTIVE
     tool = world.robot.tool_pose(moved, "left").translation
     assert np.linalg.norm(world.controller.tool_pose("left").translation - tool) < 1e-3
+
+
+def test_a_soft_controller_that_lags_is_followed_and_an_arm_that_runs_away_starts_over(world: World) -> None:
+    q, goal, lags = world.robot.home.copy(), world.controller.tool_pose("left"), []
+
+    def lead() -> Reference:
+        world.supervisor.update_target("left", goal, world.now)
+        reference = world.show([q.copy()])
+        assert reference is not None
+        return reference
+
+    for _ in range(round(2.0 / DT)):
+        goal = pin.SE3(goal.rotation, goal.translation + np.array([0.0, 0.0, PACE * DT]))
+        reference = lead()
+        lags.append(np.abs(reference.q - q).max())
+        q += DT / LAG * (reference.q - q)
+    assert world.supervisor.arm_state("left") == "following"
+    assert world.supervisor.events == []
+    assert min(lags[-round(0.6 / DT) :]) > 0.2  # longer than a deviation may last
+    ran = 0.0
+    while not world.supervisor.events:
+        q[0] += PACE * DT
+        ran += PACE * DT
+        lead()
+        assert ran < 1.0
+    assert kinds(world.supervisor.events[0]) == "off_reference"
+    assert world.supervisor.phase is Phase.BRAKING
 
 
 def test_the_way_home_leads_the_tools_until_they_are_there_and_takes_no_targets(config: Config) -> None:

@@ -18,7 +18,8 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import ArmParameters
-from q2r2_control.ros.bridge.target_output import TargetOutput, near
+from q2r2_control.ros.bridge.target_output import TargetOutput
+from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.hand_motion import MAX_OFFSET
 
@@ -38,7 +39,7 @@ class ArmOutputs:
 
     def __init__(self, node: BaseNode, arm: str, values: ArmParameters, safe_target: PoseTopic) -> None:
         preset, self._filtered = values.preset, values.mode is Mode.FILTERED
-        self._safe_target = safe_target
+        self._safe_target, self._tool_frame = safe_target, values.tool_frame
         self._last: TargetOutput | None = None
         if self._filtered:
             topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
@@ -133,16 +134,23 @@ class ArmOutputs:
         if self._last is None:
             return None
         safe, fault = self._safe_target.at(now), None
-        self._safe_problem = self._safe_target.problem if safe is None else None
-        if safe is not None and tool is not None and not near(safe, tool, *MAX_OFFSET):
-            where = self._safe_target.topic
-            self._safe_problem = Reason.of(ReasonKind.SAFE_TARGET_AWAY, topic=where)
+        self._safe_problem = self._safe_target.problem if safe is None else self.away(safe, tool)
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
         # A stream starts at the measured tool: the safe target may differ from it by the arm's steady-state offset.
         self._last.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
         return _refused(fault)
+
+    def away(self, safe: pin.SE3 | None, tool: pin.SE3 | None) -> Reason | None:
+        """A reason where the built-in controller has its tool elsewhere: no target of this one would be followed."""
+        if safe is None or tool is None:
+            return None
+        distance, angle = apart(safe, tool)
+        if distance <= MAX_OFFSET[0] and angle <= MAX_OFFSET[1]:
+            return None
+        kind, topic, frame = ReasonKind.SAFE_TARGET_AWAY, self._safe_target.topic, self._tool_frame
+        return Reason.of(kind, topic=topic, frame=frame, distance=distance, angle=angle)
 
     def forget(self, now: float) -> None:
         for output in self._all:

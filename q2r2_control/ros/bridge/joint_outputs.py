@@ -91,7 +91,7 @@ class JointStates(Kind):
 class LbrPosition(Kind):
     """LBRJointPositionCommand of lbr_fri_idl, one topic an arm."""
 
-    topic, joints_each = "/{arm}/command/joint_position", 7
+    topic, joints_each = "/{arm}/command/lbr_joint_position_command", 7
     type_name = "LBRJointPositionCommand"
 
     def __init__(self, period: float, robot: Robot) -> None:
@@ -108,7 +108,7 @@ class LbrTorque(LbrPosition):
     Each carries the measured position, since the driver ignores torques beside a position that is NaN.
     """
 
-    topic, mode, type_name = "/{arm}/command/torque", CommandMode.TORQUE, "LBRTorqueCommand"
+    topic, mode, type_name = "/{arm}/command/lbr_torque_command", CommandMode.TORQUE, "LBRTorqueCommand"
 
     def __init__(self, period: float, robot: Robot) -> None:
         super().__init__(period, robot)

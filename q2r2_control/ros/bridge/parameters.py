@@ -93,7 +93,7 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
         tool_frame=declare("end_effector_link_name", given.end_effector_link_name, "frame that the operator moves"),
         controller=controller or (builtin if preset is BUILTIN else prefix),
         prefix=prefix,
-        target_topic=topic or preset.topic.format(ctrl=prefix),
+        target_topic=topic or preset.topic_of(prefix),
         current_pose_topic=declare("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
         builtin_node=builtin,
         builtin_prefix=declare("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),

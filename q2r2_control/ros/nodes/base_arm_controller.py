@@ -150,7 +150,7 @@ class BaseArmController(BaseNode):
     def begin_tick(self, now: float) -> Reason | None:
         """Renew :attr:`inputs` at ``now`` [s]; returns why the arm has to hold, its hand aside, or None."""
         tool, base, controlled = self.current_pose(), self._base(), self._safe_target.at(now)
-        obstacle = self._obstacle(tool, base)
+        obstacle = self._obstacle(tool, base, controlled)
         silence = None if self.state in _WITHOUT_HAND else self.intake.silence(now)
         self._refusal = obstacle or (None if silence is None else (WARN, silence))
         reference = None if controlled is None else self._safe_target.stamp
@@ -232,7 +232,9 @@ class BaseArmController(BaseNode):
         placement = self._frames.tree.find(self.parameters.base_frame, self.parameters.world_frame)
         return None if placement is None else placement.pose
 
-    def _obstacle(self, tool: pin.SE3 | None, base: pin.SE3 | None) -> tuple[bytes, Reason] | None:
+    def _obstacle(
+        self, tool: pin.SE3 | None, base: pin.SE3 | None, controlled: pin.SE3 | None
+    ) -> tuple[bytes, Reason] | None:
         """Why the arm may not be engaged now, its hand aside, with the level of the diagnostics."""
         values = self.parameters
         if (conflict := self.outputs.conflict or self._frames.conflict(values.tool_frame)) is not None:
@@ -242,7 +244,13 @@ class BaseArmController(BaseNode):
             return WARN, Reason(ReasonKind.NO_TOOL_POSE, cause=why)
         if base is None:
             return WARN, Reason.of(ReasonKind.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
-        return None if (unready := self.outputs.unready) is None else (WARN, unready)
+        unready = self.outputs.unready
+        # An arm that follows may lag. One that holds would be engaged and lost at every press.
+        if self.outputs.builtin and self.state in HOLDING and (away := self.outputs.away(controlled, tool)):
+            unready = unready or Reason(ReasonKind.CONTROLLER_REFUSES, cause=away)
+            if self.state is ArmState.IDLE:
+                self.get_logger().warning(sentence(away), once=True)
+        return None if unready is None else (WARN, unready)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
         """For the leash and for anchors. Another controller's is not known: then the tool's, or the last target's."""
