@@ -18,8 +18,6 @@ from tests.pipeline.loops import pipeline
 from tests.support.hands_input import ENGAGED, HandsInput, Path
 from tests.support.processes import Watch, cell, speed
 
-pytestmark = pytest.mark.slow
-
 SPEED, RADIUS = 0.25, 0.08  # of the left hand's circle [m/s], [m]
 
 
@@ -102,6 +100,7 @@ def wandering(t: float) -> Array:
     return soft * np.array([0.05 * x - 0.02, 0.04 * y, -0.08 * z * z, 0.08 * about_x, 0.08 * about_y, 0.25 * about_z])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
 def test_two_tools_that_carry_keep_their_relation_while_one_hand_moves_and_turns_both(plant: str) -> None:
     hands = PlayingHands((0.35, "press_middle"), left=wandering)

@@ -17,9 +17,8 @@ from q2r2_control.types import SIDES, HandInputs, HandSample
 from tests.pipeline.loops import pipeline
 from tests.support.processes import Watch, assert_torque_bounds, cell, changes, speed
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trajectory", "human", "plant", "mode", "degrees"),
     [
@@ -66,6 +65,7 @@ def assert_begins_at_the_tool(watch: Watch, arm: str) -> None:
         assert np.linalg.norm(pose.translation - tick.tools[arm].translation) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["position", "torque"])
 def test_two_simulated_runs_are_equal_bit_for_bit_also_on_the_same_pipeline(mode: str) -> None:
     def run(loop: Pipeline) -> tuple[list[bytes], RunSummary]:
@@ -190,6 +190,7 @@ class HostileInput(ScriptedInput):
         return replace(sample, **changes[random.integers(len(changes))])  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_ten_thousand_ticks_of_hostile_samples_break_no_limit_and_raise_nothing() -> None:
     loop = Pipeline.from_config(cell(), input=HostileInput(7), plant="kinematic")
     watch = Watch(loop)

@@ -14,8 +14,6 @@ from q2r2_control.teleop.filters import PoseFilter, RestingPose
 from q2r2_control.types import SIDES, HandSample, Pose
 from tests.teleop.hands import PAUSED, Operator, pose
 
-pytestmark = pytest.mark.slow
-
 TICK, PERIOD = 0.004, 1.0 / 75.0  # of the loop and of the samples [s]
 NOISE, TURN_NOISE = 2e-4, 5e-4  # of a headset, standard deviation of each axis [m], [rad]
 AXIS = np.array([0.6, 0.0, 0.8])  # that the hand turns about
@@ -113,6 +111,7 @@ class NoisyOperator(Operator):
         self.tools |= {arm: target.pose for arm, target in self.targets.items() if target.pose is not None}
 
 
+@pytest.mark.slow
 def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool() -> None:
     driver = NoisyOperator()
     start = dict(driver.tools)
