@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import HOLD_REQUESTS, Reason, ReasonKind
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS, BaseNode
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
@@ -30,11 +30,6 @@ _LOOK_PERIOD = 0.3  # of asking the graph for nodes that report [s]
 _DISCOVERY = 2.0  # an arm that is there has said so by then: nodes report twice a second [s]
 _SILENT, _GONE = 2.0, 5.0  # without a report [s]
 _ARM = {"engaged", "ready", "hand"}  # what an arm's node says
-_K = ReasonKind
-_REQUESTS = {
-    *(_K.PAUSE_SERVICE, _K.RESET_SERVICE, _K.HOMING, _K.HOMING_ARRIVED, _K.HOMING_HELD_UP),
-    *(_K.HOMING_NO_WAY, _K.HOMING_INTERRUPTED, _K.HOMING_ENDED),
-}
 # By the number of an endpoint, which is unique. A node that the graph has lost, such as one that was frozen or
 # unreachable for longer than its lease, comes back with the same endpoints. Fast DDS never learns their node again.
 _known: dict[bytes, str] = {}
@@ -240,7 +235,7 @@ class HandListeners:
 
     def asked_to_hold(self) -> bool:
         """Whether the last event of some arm is a request for a pause, a reset or the way home, or how that ended."""
-        return any(state.get("last_event_kind") in _REQUESTS for _, state, _ in self._arms())
+        return any(state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms())
 
     def _arms(self) -> list[tuple[str, dict[str, Any], float]]:
         """Name, state and age [s] of the arms' nodes that follow these hands."""

@@ -21,7 +21,7 @@ need_ros()
 import rclpy
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, String
+from std_msgs.msg import Bool, Float64MultiArray, String
 
 from q2r2_control.ros.base_node import WARN, BaseNode
 from q2r2_control.ros.bridge.arm_outputs import FollowWatch
@@ -227,6 +227,18 @@ def test_an_arm_is_not_ready_before_each_controller_has_said_whether_it_has_join
             states.arrive(String(data=controller_state(*said)))
             assert obstacle() is kind
         controller.destroy_node()
+    arm.destroy_node()
+
+
+def test_what_cannot_be_read_is_dropped_with_a_warning_a_topic(context: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    arm, name, text = LeftArmController(context=context), "/cartesian_controller", String(data="[]")
+    bad: dict[str, Any] = {f"{name}/state": text, f"{name}/condition/left": text, "/recorder/state": text}
+    bad |= {"/tf_static": b"no message", f"{name}/opening/left": Float64MultiArray(data=[2.0, 1.0])}
+    for topic in [*bad, *bad]:
+        Arrivals(arm, topic).arrive(bad[topic])
+    lines = [line for line in capfd.readouterr().err.splitlines() if "cannot be read" in line]
+    assert len(lines) == len(bad)
+    assert all("[WARN]" in line and f" {topic}: " in line for line, topic in zip(lines, bad, strict=True))
     arm.destroy_node()
 
 

@@ -8,7 +8,6 @@ from importlib import import_module
 from typing import Any
 
 import pinocchio as pin
-from rclpy.node import Node
 from std_msgs.msg import Bool, String
 
 from q2r2_control.config.presets import BUILTIN, Mode
@@ -159,7 +158,7 @@ class FollowWatch:
     ``~/state`` is not ready before it has: it may have no joint states.
     """
 
-    def __init__(self, node: Node, controller: str, arm: str, timeout: float) -> None:
+    def __init__(self, node: BaseNode, controller: str, arm: str, timeout: float) -> None:
         self.controller, self._arm, self._timeout = controller, arm, timeout
         self._topic = f"{controller}/following/{arm}"
         self._follows: bool | None = None
@@ -213,7 +212,8 @@ class FollowWatch:
             self._unready = self._refusal_of(state, None if fault is None else Reason.from_json(fault))
             self.homing_outcome = None if outcome is None else Reason.from_json(outcome)
         except (ValueError, TypeError, KeyError):
-            return  # some other node's
+            self._node.drop(self._state_topic, f"{message.data!r:.60}")
+            return
         self.homing, self.gripper_held = state == "homing", str(said.get(f"{self._arm}_gripper_held_by", ""))
 
     def _refusal_of(self, state: str, fault: Reason | None) -> Reason | None:
