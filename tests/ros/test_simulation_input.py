@@ -129,18 +129,6 @@ def test_the_script_waits_for_an_arm_to_be_ready_and_presses_until_it_follows(no
     assert not any(message.button_lower for message in drained(left["inputs"]))
 
 
-def test_an_arm_that_a_person_pauses_early_is_not_engaged_again(node: Any, processes: Processes) -> None:
-    arm = speaking_arm(node, ready=True, message="ready to engage")
-    left = subscribe(node, "left")
-    start(processes, side="left", trajectory="line")
-    wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
-    arm["last_event_kind"] = "pause_service"
-    time.sleep(1.0)
-    drained(left["inputs"])
-    time.sleep(2.5)
-    assert not any(message.button_lower for message in drained(left["inputs"]))
-
-
 class PlayedHand(SimulationInput):
     """A left hand whose clock, and whose arm's report, are the test's."""
 
