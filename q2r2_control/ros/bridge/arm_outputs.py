@@ -181,7 +181,7 @@ class FollowWatch:
         return Reason.of(ReasonKind.TOPIC_EMPTY, topic=self._state_topic)
 
     def notice(self, starts: int) -> None:
-        """What an earlier controller reported does not count; ``starts``: how often one has appeared."""
+        """The reports of an earlier controller do not count; ``starts``: how often one has appeared."""
         if starts != self._starts:
             self._starts, self._reported, self._unready = starts, False, None
 

@@ -99,7 +99,7 @@ class SimulationInput(BaseNode):
         """Begin the script anew, where its hands rest, until the arms are ready, and then until they follow."""
         self._listeners.look()
         t = now - self._began
-        # What an arm's last event was before the first press is nothing that this press is against.
+        # An arm's last event may be a request of before the first press, which does not count.
         self._pressed = self._pressed or (self._not_to_press is not None and t >= _BEFORE_MOTION)
         if now > self._until or (self._pressed and self._listeners.asked_to_hold()):
             self._starts = False
