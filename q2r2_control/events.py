@@ -143,6 +143,7 @@ class ReasonKind(StrEnum):
     NEW_RECEIVER = "new_receiver", "a new receiver takes the commands, and the arms are not where these are"
     OTHER_COMMANDER = "other_commander", "{nodes} commands the arms on {topic}"
     ARMS_MOVE = "arms_move", "the arms do not stand still"
+    MESSAGE_UNREADABLE = "message_unreadable", "{topic}: what cannot be read is dropped, such as {text}"
     BAD_JOINT_STATES = "bad_joint_states", "{text}"
     NO_EXTERNAL_TORQUES = "no_external_torques", "no external torques on {topic}"
     # Findings of supervision.
@@ -194,6 +195,8 @@ class ReasonKind(StrEnum):
 _K = ReasonKind
 _NOT_DONE = {_K.NOT_ENGAGED, _K.NOT_HOMING, _K.NOT_CARRIED, _K.NOT_CHANGED}
 REFUSALS = frozenset({*_NOT_DONE, _K.NO_RECORDING, _K.RECORDING_ENDED, _K.NO_EPISODE})
+_WAY_HOME = {_K.HOMING, _K.HOMING_ARRIVED, _K.HOMING_HELD_UP, _K.HOMING_NO_WAY, _K.HOMING_INTERRUPTED, _K.HOMING_ENDED}
+HOLD_REQUESTS = frozenset({_K.PAUSE_SERVICE, _K.RESET_SERVICE, *_WAY_HOME})  # and how a way home ended
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,6 +71,7 @@ class BaseNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
         self._ros_time = 0.0, time.monotonic()  # the newest, and the steady time when it was first seen [s]
+        self._dropped: set[str] = set()  # topics of which some messages could not be read
         self.ticked, self._counted_at = 0, time.monotonic()  # since the rate was last asked for, and when [s]
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=STEADY)
 
@@ -137,6 +138,12 @@ class BaseNode(Node):
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """Level (OK, WARN, ERROR), one line, and figures."""
         return OK, "running", {}
+
+    def drop(self, topic: str, text: str) -> None:
+        """Warn, once for each topic, that what others send there cannot be read, such as ``text``."""
+        if topic not in self._dropped:
+            self._dropped.add(topic)
+            self.get_logger().warning(sentence(Reason.of(ReasonKind.MESSAGE_UNREADABLE, topic=topic, text=text)))
 
     def report_health(self) -> None:
         """Publish :meth:`health` now. A timer does it twice a second; call it for a change that should not wait."""

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import HOLD_REQUESTS, Reason, ReasonKind
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS, BaseNode
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
@@ -233,9 +233,9 @@ class HandListeners:
         engaged = [state["engaged"] for _, state, _ in self._arms() if state["hand"] == hand]
         return all(engaged) if engaged else None
 
-    def paused_by_a_person(self) -> bool:
-        """Whether some arm's ``~/pause`` was called."""
-        return any(state.get("last_event_kind") == ReasonKind.PAUSE_SERVICE for _, state, _ in self._arms())
+    def asked_to_hold(self) -> bool:
+        """Whether the last event of some arm is a request for a pause, a reset or the way home, or how that ended."""
+        return any(state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms())
 
     def _arms(self) -> list[tuple[str, dict[str, Any], float]]:
         """Name, state and age [s] of the arms' nodes that follow these hands."""

@@ -11,7 +11,7 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.arm import of_controls
-from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
+from q2r2_control.teleop.arm_states import AT_REST, FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import BothArms
 from q2r2_control.teleop.hand_motion import ArmMeasurements
 from q2r2_control.types import ArmTarget, HandSample
@@ -170,9 +170,15 @@ class Teleop:
 
     def reset(self, now: float, arm: str, reason: Reason) -> None:
         """An arm holds, its hand has to be seen anew before it drives the arm, and a stop of all arms is over."""
-        self.pause(now, reason, arm)
+        self.hold(now, reason, arm)
         self._arms[arm].forget()
         self._pair.change(Cause.GO_ON, now, reason)
+
+    def hold(self, now: float, reason: Reason, arm: str) -> None:
+        """An arm holds because a program asks for it, which is an event also where it holds already."""
+        if self._arms[arm].state in AT_REST:
+            self._arms[arm].record_event(now, reason)
+        self.pause(now, reason, arm)
 
     def connection_lost(self, now: float) -> None:
         """The input is lost: every arm that a hand drives stops, and everything received is forgotten."""

@@ -51,6 +51,8 @@ def cell(started: Cell) -> Iterator[Cell]:
 
 
 def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Robot) -> None:
+    assert "[INFO]" in cell.processes[1].wait_for("active: the reference"), "nothing is wrong with that"
+    assert "[WARN]" in cell.processes[1].wait_for("the stop service was called")
     stream = cell.engage("left")
     start_q, begin = cell.q, stream.poses["left"]
     stream.move("left", (0.05, 0.0, 0.0))

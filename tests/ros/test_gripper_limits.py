@@ -104,13 +104,13 @@ def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
 
 
 def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell: Cell) -> None:
-    bad = [0.5, 3.0]
+    bad, topic = [0.5, 3.0], "/q2r2/left/target_frame/wanted_opening"
     gripper = Gripper(cell)
     gripper.grants.ask(1.0)
     wait_until(lambda: gripper.grants.granted == 1.0, "it is granted")
-    sender = cell.node.create_publisher(Float64MultiArray, "/q2r2/left/target_frame/wanted_opening", LATCHED_QOS)
+    sender = cell.node.create_publisher(Float64MultiArray, topic, LATCHED_QOS)
     sender.publish(Float64MultiArray(data=bad))
-    cell.processes[1].wait_for(f"left: openings {bad} not used")
+    cell.processes[1].wait_for(f"{topic}: what cannot be read is dropped, such as {bad}")
     assert gripper.grants.granted == 1.0
     cell.node.destroy_publisher(sender)
 

@@ -19,18 +19,19 @@ from tests.ros.conftest import need_ros
 need_ros()
 
 import rclpy
-from geometry_msgs.msg import Point, Pose, Quaternion
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, String
+from std_msgs.msg import Bool, Float64MultiArray, String
 
 from q2r2_control.ros.base_node import WARN, BaseNode
 from q2r2_control.ros.bridge.arm_outputs import FollowWatch
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.messages import pose_of, robot_state, stamped_pose
+from q2r2_control.ros.nodes.arm_controllers import LeftArmController
 from q2r2_control.ros.nodes.mujoco_robot import MujocoRobot
 from q2r2_control.types import RobotState
 from q2r2_control.wording import sentence
-from tests.ros.processes import as_arguments
+from tests.ros.processes import as_arguments, wait_until
 
 USUAL, LATE = 1_000_000, 1_000_000_000  # from sending to receipt [ns]
 
@@ -206,6 +207,39 @@ def test_what_keeps_a_controller_from_following_is_read_from_its_state(
     assert watch.unready is None or watch.unready.root == (fault or watch.unready)
     assert watch.unready is None or sentence(watch.unready)  # whose fields are all there
     node.destroy_node()
+
+
+def test_an_arm_is_not_ready_before_each_controller_has_said_whether_it_has_joint_states(context: Any) -> None:
+    arm = LeftArmController(context=context)
+    states = Arrivals(arm, "/cartesian_controller/state")
+
+    def obstacle() -> ReasonKind | None:
+        arm.outputs.take_fault(arm.now)
+        return None if (unready := arm.outputs.unready) is None else unready.root.kind
+
+    for _ in range(2):
+        wait_until(lambda: obstacle() is ReasonKind.NO_SUBSCRIBER, "no controller is there")
+        controller = BaseNode("cartesian_controller", context=context)
+        controller.create_subscription(PoseStamped, arm.outputs.first.topic, lambda message: None, 1)
+        wait_until(lambda: obstacle() is ReasonKind.TOPIC_EMPTY, "a controller is there that has not reported")
+        no_states = Reason.of(ReasonKind.NO_STATES_YET, source="")
+        for said, kind in ((("inactive", no_states), ReasonKind.NO_STATES_YET), (("holding", None), None)):
+            states.arrive(String(data=controller_state(*said)))
+            assert obstacle() is kind
+        controller.destroy_node()
+    arm.destroy_node()
+
+
+def test_what_cannot_be_read_is_dropped_with_a_warning_a_topic(context: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    arm, name, text = LeftArmController(context=context), "/cartesian_controller", String(data="[]")
+    bad: dict[str, Any] = {f"{name}/state": text, f"{name}/condition/left": text, "/recorder/state": text}
+    bad |= {"/tf_static": b"no message", f"{name}/opening/left": Float64MultiArray(data=[2.0, 1.0])}
+    for topic in [*bad, *bad]:
+        Arrivals(arm, topic).arrive(bad[topic])
+    lines = [line for line in capfd.readouterr().err.splitlines() if "cannot be read" in line]
+    assert len(lines) == len(bad)
+    assert all("[WARN]" in line and f" {topic}: " in line for line, topic in zip(lines, bad, strict=True))
+    arm.destroy_node()
 
 
 NAMES = ("a", "b", "c")

@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 import time
 from queue import Queue
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.types import Array
 from tests.ros.conftest import need_ros
-from tests.ros.processes import PATIENCE, Processes, States, drained, subscribed, wait_until
+from tests.ros.processes import PATIENCE, Processes, States, as_arguments, drained, subscribed, wait_until
 
 need_ros()
 
 from std_msgs.msg import String
 
 from q2r2_control.ros.bridge.messages import seconds
+from q2r2_control.ros.nodes.simulation_input import SimulationInput
+from q2r2_control.types import HandSample
 
 RATE = 50.0  # [Hz]
 
@@ -125,13 +129,47 @@ def test_the_script_waits_for_an_arm_to_be_ready_and_presses_until_it_follows(no
     assert not any(message.button_lower for message in drained(left["inputs"]))
 
 
-def test_an_arm_that_a_person_pauses_early_is_not_engaged_again(node: Any, processes: Processes) -> None:
-    arm = speaking_arm(node, ready=True, message="ready to engage")
-    left = subscribe(node, "left")
-    start(processes, side="left", trajectory="line")
-    wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
-    arm["last_event_kind"] = "pause_service"
-    time.sleep(1.0)
-    drained(left["inputs"])
-    time.sleep(2.5)
-    assert not any(message.button_lower for message in drained(left["inputs"]))
+class PlayedHand(SimulationInput):
+    """A left hand whose clock, and whose arm's report, are the test's."""
+
+    now = 0.0
+
+    def __init__(self, trajectory: str, context: Any) -> None:
+        super().__init__(context=context, cli_args=as_arguments("side:=left", f"trajectory:={trajectory}"))
+        self.arm = {"hand": "left", "engaged": False, "ready": True, "last_event_kind": "reset_service"}
+        self.presses, self._held = 0, False
+        self._hand_publishers: Any = SimpleNamespace(publish_sample=self._count, subscribers=lambda hand: 1)
+
+    def _count(self, sample: HandSample, *_: object) -> None:
+        self.presses += sample.inputs.button_lower and not self._held
+        self._held = sample.inputs.button_lower
+
+    def play(self, until: float, **said: object) -> int:
+        self.arm |= said
+        while self.now < until:
+            self._listeners._states.newest["/arm"] = self.arm, time.monotonic()
+            self.now += 0.02
+            self._tick()
+        return self.presses
+
+
+@pytest.mark.parametrize(
+    ("kind", "presses"), [("states_silent", 4), ("pause_service", 1), ("reset_service", 1), ("homing_arrived", 1)]
+)
+def test_an_arm_is_not_engaged_again_after_somebody_asked_for_something_else(
+    kind: str, presses: int, context: Any
+) -> None:
+    hand = PlayedHand("line", context)
+    assert hand.play(0.9) == 1, "what was asked for before does not count"
+    hand.play(1.3, last_event_kind="no_subscriber")  # it was refused, and the script begins anew
+    assert hand.play(5.0, last_event_kind=kind) == presses
+    hand.destroy_node()
+
+
+@pytest.mark.parametrize("engaged", [True, False])
+def test_the_last_press_of_a_work_pauses_an_arm_and_engages_none(engaged: bool, context: Any) -> None:
+    hand = PlayedHand("meet", context)
+    hand.play(0.9)
+    assert hand.play(9.0, engaged=True, last_event_kind="pressed") == 1
+    assert hand.play(60.0, engaged=engaged) == 1 + engaged
+    hand.destroy_node()

@@ -73,6 +73,9 @@ def test_a_reset_arm_holds_until_a_press_after_its_hand_was_seen_anew() -> None:
     driver = engaged(linked=False)
     driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
     assert driver.states == {"left": "lost", "right": "engaged"}
+    driver.teleop.take_events()
+    driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
+    assert [event.kind for event in driver.teleop.take_events()] == ["reset_service"]  # told, though it holds already
     driver.silent = {"left"}
     driver.run(0.1)
     driver.press("left")

@@ -13,7 +13,6 @@ import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import Point, PoseStamped
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Float64MultiArray, String
 from visualization_msgs.msg import Marker
 
@@ -150,7 +149,7 @@ class _Condition(BaseModel):
 class ConditionPublishers:
     """Publishes the condition of each arm that somebody listens to."""
 
-    def __init__(self, node: Node, arms: Any, conditions: ArmConditions) -> None:
+    def __init__(self, node: BaseNode, arms: Any, conditions: ArmConditions) -> None:
         self._conditions = conditions
         self._publishers = {arm: node.create_publisher(String, f"~/condition/{arm}", STREAM_QOS) for arm in arms}
         self._due = -math.inf
@@ -168,15 +167,17 @@ class ConditionPublishers:
             self._publishers[arm].publish(String(data=told.model_dump_json()))
 
 
-def listen_to_condition(node: Node, controller: str, arm: str, notice: Callable[[ArmCondition], None]) -> None:
+def listen_to_condition(node: BaseNode, controller: str, arm: str, notice: Callable[[ArmCondition], None]) -> None:
     """Call ``notice`` with what the controller of this name says of an arm."""
+    topic = f"{controller}/condition/{arm}"
 
     def take(message: String) -> None:
         try:
             told = _Condition.model_validate_json(message.data)
         except ValidationError:
-            return  # some other node's
+            node.drop(topic, f"{message.data!r:.60}")
+            return
         spare = math.inf if told.spare_distance is None else told.spare_distance
         notice(ArmCondition(spare, told.joints_at_limit, told.contact_force))
 
-    node.create_subscription(String, f"{controller}/condition/{arm}", take, STREAM_QOS)
+    node.create_subscription(String, topic, take, STREAM_QOS)

@@ -8,7 +8,6 @@ from importlib import import_module
 from typing import Any
 
 import pinocchio as pin
-from rclpy.node import Node
 from std_msgs.msg import Bool, String
 
 from q2r2_control.config.presets import BUILTIN, Mode
@@ -113,6 +112,7 @@ class ArmOutputs:
         if self._command_type is not None:
             self._command_type.step(self._all[-1].starts, now)
         if self._follows is not None:
+            self._follows.notice(self.first.starts)
             faults += [self._safe_target.take_silence(now), self._follows.refusal(self.first.following, now)]
         return _refused(next((fault for fault in faults if fault), None))
 
@@ -162,21 +162,36 @@ class FollowWatch:
     """Whether the built-in controller follows the targets of an arm, as it publishes on ``~/following/<arm>``.
 
     It drops a stream for reasons of its own, such as missing joint states. It then accepts only a new one, for which
-    the arm has to be paused. A controller that publishes nothing here is taken to follow.
+    the arm has to be paused. A controller that publishes nothing here is taken to follow. One that reports on
+    ``~/state`` is not ready before it has: it may have no joint states.
     """
 
-    def __init__(self, node: Node, controller: str, arm: str, timeout: float) -> None:
+    def __init__(self, node: BaseNode, controller: str, arm: str, timeout: float) -> None:
         self.controller, self._arm, self._timeout = controller, arm, timeout
         self._topic = f"{controller}/following/{arm}"
         self._follows: bool | None = None
         self._since = math.inf  # targets have been sent and not followed [s]
         self._followed_since = math.inf  # targets have been sent and followed [s]
-        self.unready: Reason | None = None  # why the controller would follow no stream of targets now
+        self._node, self._state_topic = node, f"{controller}/state"
+        self._unready: Reason | None = None  # by the newest report
+        self._starts, self._reported = 0, False
         self.homing = False  # whether it says that it goes home
         self.homing_outcome: Reason | None = None  # of the last way, where that ended by itself
         self.gripper_held = ""  # what keeps the gripper from going farther
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
-        node.create_subscription(String, f"{controller}/state", self._on_state, 1)
+        node.create_subscription(String, self._state_topic, self._on_state, 1)
+
+    @property
+    def unready(self) -> Reason | None:
+        """Why the controller would follow no stream of targets now."""
+        if self._reported or not self._node.count_publishers(self._state_topic):
+            return self._unready
+        return Reason.of(ReasonKind.TOPIC_EMPTY, topic=self._state_topic)
+
+    def notice(self, starts: int) -> None:
+        """The reports of an earlier controller do not count; ``starts``: how often one has appeared."""
+        if starts != self._starts:
+            self._starts, self._reported, self._unready = starts, False, None
 
     def refusal(self, sending: bool, now: float) -> Reason | None:
         """A reason if targets are ``sending`` and are followed no more, or not yet after the timeout."""
@@ -198,16 +213,18 @@ class FollowWatch:
         self._follows = bool(message.data)
 
     def _on_state(self, message: String) -> None:
+        self._reported = True
         try:
             said = json.loads(message.data)
             state, fault, outcome = said[f"{self._arm}_state"], said["fault"], said["homing_outcome"]
-            self.unready = self._unready(state, None if fault is None else Reason.from_json(fault))
+            self._unready = self._refusal_of(state, None if fault is None else Reason.from_json(fault))
             self.homing_outcome = None if outcome is None else Reason.from_json(outcome)
         except (ValueError, TypeError, KeyError):
-            return  # some other node's
+            self._node.drop(self._state_topic, f"{message.data!r:.60}")
+            return
         self.homing, self.gripper_held = state == "homing", str(said.get(f"{self._arm}_gripper_held_by", ""))
 
-    def _unready(self, state: str, fault: Reason | None) -> Reason | None:
+    def _refusal_of(self, state: str, fault: Reason | None) -> Reason | None:
         if state in _READY:
             return None
         if state == "paused":

@@ -143,8 +143,8 @@ class GripperLimits:
         self._answers: dict[str, Any] = {}
         for arm in (arm for arm in targets if arm in self._grippers or arm in robot.objects.by_arm):
             self._answers[arm] = node.create_publisher(Float64MultiArray, f"~/opening/{arm}", LATCHED_QOS)
-            on_wanted = partial(self._on_wanted, arm)
-            node.create_subscription(Float64MultiArray, wanted_topic(targets[arm]), on_wanted, LATCHED_QOS)
+            topic = wanted_topic(targets[arm])
+            node.create_subscription(Float64MultiArray, topic, partial(self._on_wanted, arm, topic), LATCHED_QOS)
 
     @property
     def held(self) -> dict[str, str]:
@@ -187,11 +187,11 @@ class GripperLimits:
                 self._answered[arm] = answer
                 self._answers[arm].publish(Float64MultiArray(data=answer))
 
-    def _on_wanted(self, arm: str, message: Float64MultiArray) -> None:
+    def _on_wanted(self, arm: str, topic: str, message: Float64MultiArray) -> None:
         told = list(message.data)
         if len(told) != 2 or not 0.0 <= told[0] <= 1.0 or (told[1] == told[1] and not 0.0 <= told[1] <= 1.0):
             allowed = "two, wanted and commanded last (or NaN), 0 closed .. 1 open"
-            self._node.get_logger().warning(f"{arm}: openings {told!s:.60} not used; allowed: {allowed}")
+            self._node.drop(topic, f"{told!s:.60}; allowed: {allowed}")
             return
         wanted, commanded = told
         if arm not in self.wanted and commanded == commanded:

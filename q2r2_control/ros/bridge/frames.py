@@ -41,13 +41,9 @@ class ReadTransform(NamedTuple):
 
 @lru_cache(maxsize=_KEPT)
 def read_transforms(message: bytes) -> Sequence[ReadTransform]:
-    """The transforms in a serialized TFMessage, none where it is no message; read once for all nodes of a process."""
-    try:
-        transforms = deserialize_message(message, TFMessage).transforms
-    except rclpy_implementation.RMWError:
-        return ()  # which is some other node's fault
+    """The transforms in a serialized TFMessage, else RMWError; read once for all nodes of a process."""
     read = []
-    for one in transforms:
+    for one in deserialize_message(message, TFMessage).transforms:
         p, o = one.transform.translation, one.transform.rotation
         pose = pose_of_numbers((p.x, p.y, p.z, o.x, o.y, o.z, o.w))
         read.append(ReadTransform(_name(one.child_frame_id), _name(one.header.frame_id), pose))
@@ -135,7 +131,7 @@ class FrameListener:
 
     def _take(self, message: bytes, info: Mapping[str, int | None]) -> None:
         received, now, number = self._node.now, time.monotonic(), info["publication_sequence_number"]
-        for transform in read_transforms(message):
+        for transform in self._read("/tf", message):
             frame = transform.child_frame_id
             if number is not None:
                 senders = self._numbers[frame].take(number, now, _PAUSE)
@@ -144,8 +140,15 @@ class FrameListener:
             self.tree.set(transform, received)
 
     def _take_fixed(self, message: bytes) -> None:
-        for transform in read_transforms(message):
+        for transform in self._read("/tf_static", message):
             self.tree.set(transform, math.inf)
+
+    def _read(self, topic: str, message: bytes) -> Sequence[ReadTransform]:
+        try:
+            return read_transforms(message)
+        except rclpy_implementation.RMWError:  # which is some other node's fault
+            self._node.drop(topic, f"{len(message)} bytes")
+            return ()
 
 
 def _name(frame: str) -> str:

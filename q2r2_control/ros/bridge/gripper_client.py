@@ -12,7 +12,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.config.external import GripperSettings, GripperType
-from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, BaseNode
 
 _RESULT_TIMEOUT = 10.0  # of a goal [s]
 _ANSWER_TIMEOUT = 1.0  # of the controller that grants openings [s]
@@ -31,7 +31,7 @@ class OpeningGrants:
     gripper may be, and does not take an old wish for a new one.
     """
 
-    def __init__(self, node: Node, controller: str, arm: str, target_topic: str) -> None:
+    def __init__(self, node: BaseNode, controller: str, arm: str, target_topic: str) -> None:
         """``controller``: the built-in one's name; ``target_topic``: where the arm's targets go."""
         self._wanted, self._commanded = math.nan, math.nan
         self._answer: tuple[float, float] | None = None  # what was wanted, and what is granted of it
@@ -63,6 +63,8 @@ class OpeningGrants:
     def _on_answer(self, message: Float64MultiArray) -> None:
         if len(message.data) == 2 and all(0.0 <= number <= 1.0 for number in message.data):
             self._answer = message.data[0], message.data[1]
+        else:
+            self._node.drop(self._topic, f"{list(message.data)!s:.60}")
 
 
 class GripperClient:

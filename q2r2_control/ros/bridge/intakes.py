@@ -186,8 +186,11 @@ class JointIntake:
             take(self.state, now)
 
     def _on_external(self, message: JointState) -> None:
-        if len(message.effort) == len(message.name) and set(message.name) >= set(self._joint_names):
-            effort = dict(zip(message.name, message.effort, strict=True))
-            torques = np.array([effort[name] for name in self._joint_names])
-            if np.isfinite(torques).all():
-                self._external, self._external_stamp = torques, self._node.now
+        if not set(message.name) >= set(self._joint_names):
+            return  # of another robot
+        effort = dict(zip(message.name, message.effort, strict=False))
+        torques = np.array([effort.get(name, math.nan) for name in self._joint_names])
+        if len(message.effort) == len(message.name) and np.isfinite(torques).all():
+            self._external, self._external_stamp = torques, self._node.now
+        else:
+            self._node.drop(self._external_topic, f"{list(message.effort)!s:.60}")

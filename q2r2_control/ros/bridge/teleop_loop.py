@@ -15,7 +15,7 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.recording.messages import RECORDER
-from q2r2_control.ros.base_node import STEADY
+from q2r2_control.ros.base_node import STEADY, BaseNode
 from q2r2_control.teleop.arm_states import HOLDING
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.teleop.teleop import Teleop
@@ -98,8 +98,9 @@ class HomeClient:
 class RecorderLink:
     """The report of the recorder's node: whether it records, and whether an episode is open, whoever began it."""
 
-    def __init__(self, node: Node) -> None:
-        self._state: dict[str, Any] | None = None  # the newest that has not been used
+    def __init__(self, node: BaseNode) -> None:
+        self._node = node
+        self._state: tuple[bool, bool, bool] | None = None  # the newest marks that have not been used
         self._heard = 0.0  # [s] of steady time
         self._served: int | None = None  # services that it has answered
         self._reasons: list[Reason] = []
@@ -107,20 +108,22 @@ class RecorderLink:
 
     def update(self, marks: EpisodeMarks) -> list[Reason]:
         """Once a tick, before the teleoperation; returns the reasons of new events of its services."""
-        if (state := self._state) is not None:
-            marks.recorded, marks.open, marks.any = state["records"], state["episode_open"], state["any_episode"]
-            self._state = None
+        if self._state is not None:
+            (marks.recorded, marks.open, marks.any), self._state = self._state, None
         if marks.recorded and time.monotonic() - self._heard > _PATIENCE:
             marks.recorded = False
         reasons, self._reasons = self._reasons, []
         return reasons
 
     def _on_state(self, message: String) -> None:
-        self._state = state = json.loads(message.data)
-        self._heard = time.monotonic()
-        if self._served is not None and state["served"] != self._served:
-            self._reasons.append(Reason.from_json(state["served_last"]))
-        self._served = state["served"]
+        try:
+            state = json.loads(message.data)
+            self._state = state["records"], state["episode_open"], state["any_episode"]
+            if self._served is not None and state["served"] != self._served:
+                self._reasons.append(Reason.from_json(state["served_last"]))
+            self._served, self._heard = state["served"], time.monotonic()
+        except (ValueError, TypeError, KeyError):
+            self._node.drop(f"{RECORDER}/state", f"{message.data!r:.60}")
 
 
 class TickInputs(NamedTuple):

@@ -276,7 +276,7 @@ class BaseArmController(BaseNode):
                 node.set_parameters_atomically(changed)
 
     def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.loop.teleop.pause(self.now, Reason(ReasonKind.PAUSE_SERVICE), self.arm_name)
+        self.loop.teleop.hold(self.now, Reason(ReasonKind.PAUSE_SERVICE), self.arm_name)
         response.success, response.message = True, f"{self.arm_name} is paused"
         return response
 

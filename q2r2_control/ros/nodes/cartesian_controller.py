@@ -43,6 +43,7 @@ _LONGEST_STOP = 3.0  # [s]
 _QUIET = 0.3  # nobody else commands the arms for so long before this node does [s]
 _LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
 _SAFE_TARGET_PERIOD = 0.008  # [s]
+_ROUTINE = ReasonKind.ACTIVATED, ReasonKind.HOMING_ARRIVED, ReasonKind.NODE_ENDS  # nothing is wrong
 
 
 class CartesianControllerNode(ManagedNode):
@@ -144,8 +145,12 @@ class CartesianControllerNode(ManagedNode):
             self._output.end(state, now)
         self._commanding = step.reference is not None
         if events := self._supervisor.events:
+            log = self.get_logger()
             for event in events:
-                self.get_logger().warning(sentence(event))
+                if event.root.kind in _ROUTINE:
+                    log.info(sentence(event))
+                else:
+                    log.warning(sentence(event))
             events.clear()
             self.report_health()
 

@@ -35,8 +35,8 @@ class SimulationInput(BaseNode):
 
     The script starts when every hand that it plays has a subscriber. The hands rest until the arms' nodes say that they
     can be engaged. Then the buttons are pressed. They are pressed again where an arm is not engaged by the time the
-    hands would move, or stops in the first six seconds. From then on, and after an arm's ``~/pause``, it takes a
-    person.
+    hands would move, or stops in the first six seconds. From then on, and after an arm's ``~/pause``, ``~/reset`` or
+    way home, it takes a person: the script's own presses may pause an arm, and engage none.
     """
 
     ticks = True
@@ -58,6 +58,7 @@ class SimulationInput(BaseNode):
         self._make_script = partial(ScriptedInput, trajectory, self._hands, rate_hz=rate, jitter=jitter)
         self._listeners = HandListeners(self, self._hands if MessageType.INPUTS in _MODES[mode] else ())
         self._starts = True  # until nothing is pressed again to engage the arms
+        self._pressed = False  # once, to engage them
         self._moves = False  # whether the hands do
         self._until = math.inf  # when it ends that arms are engaged again [s]
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
@@ -98,15 +99,17 @@ class SimulationInput(BaseNode):
         """Begin the script anew, where its hands rest, until the arms are ready, and then until they follow."""
         self._listeners.look()
         t = now - self._began
-        if t < _BEFORE_PRESS or (self._not_to_press is not None and t < _BEFORE_MOTION):
-            return
-        following = [hand for hand in self._hands if self._listeners.engaged(hand) is not False]
-        pressed = self._not_to_press is not None or self._until < math.inf
-        if now > self._until or (pressed and self._listeners.paused_by_a_person()):
+        # An arm's last event may be a request of before the first press, which does not count.
+        self._pressed = self._pressed or (self._not_to_press is not None and t >= _BEFORE_MOTION)
+        if now > self._until or (self._pressed and self._listeners.asked_to_hold()):
             self._starts = False
             if not self._moves:
                 self._not_to_press = set(self._hands)
-        elif self._not_to_press is None:
+            return
+        if t < _BEFORE_PRESS or (self._not_to_press is not None and t < _BEFORE_MOTION):
+            return
+        following = [hand for hand in self._hands if self._listeners.engaged(hand) is not False]
+        if self._not_to_press is None:
             if self._listeners.unready() is None:
                 # A press would pause those that are engaged already.
                 self._not_to_press = {hand for hand in following if self._listeners.engaged(hand)}
@@ -124,7 +127,8 @@ class SimulationInput(BaseNode):
         self._began, self._not_to_press, self._moves = now, None, False
 
     def _publish(self, sample: HandSample) -> None:
-        if not self._moves and sample.hand in (self._not_to_press or ()):
+        would_engage = not self._starts and self._listeners.engaged(sample.hand) is False
+        if would_engage or (not self._moves and sample.hand in (self._not_to_press or ())):
             sample = replace(sample, inputs=replace(sample.inputs, button_lower=False))
         twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
         self._hand_publishers.publish_sample(sample, self._frame, HandTwist(twist.linear, twist.angular))
