@@ -38,6 +38,7 @@ class CameraSetup:
     model: bytes  # an mujoco.MjModel, pickled: MuJoCo may look for OpenGL when it is imported
     cameras: dict[str, CameraConfig]
     channels: dict[str, int]  # of the recording's file
+    waited_for: bool  # by the loop, in simulated time
 
 
 class PictureRequest(NamedTuple):
@@ -49,11 +50,12 @@ class PictureRequest(NamedTuple):
 
 def main(requests: Iterator[Any], answer: Callable[[Message | None], None]) -> None:
     """Answer None when ready, then each picture's message. Raises :class:`PlantError` where OpenGL is missing."""
-    with suppress(OSError):
-        os.nice(_NICENESS)
     setup = next(requests, None)
     if setup is None:
         return
+    if not setup.waited_for:
+        with suppress(OSError):
+            os.nice(_NICENESS)
     try:
         from q2r2_control.plants.mujoco_cameras import CellPictures
     except (ImportError, AttributeError, RuntimeError) as error:
@@ -98,10 +100,15 @@ class CameraRecorder:
         else:
             self._ready.set()
 
-    def prepare(self, plant: MujocoPlant, cameras: Mapping[str, CameraConfig], topics: Mapping[str, Topic]) -> None:
-        """Make ready for pictures of ``plant``, for messages of ``topics``; waits for that, some seconds at most."""
+    def prepare(
+        self, plant: MujocoPlant, cameras: Mapping[str, CameraConfig], topics: Mapping[str, Topic], *, waits: bool
+    ) -> None:
+        """Make ready for pictures of ``plant``, for messages of ``topics``; waits for that, some seconds at most.
+
+        ``waits``: the loop will wait for pictures, so they are as urgent as the loop.
+        """
         channels = {name: topics[picture_topic(name)].channel for name in cameras}
-        self.process.send(CameraSetup(pickle.dumps(plant.model), dict(cameras), channels))
+        self.process.send(CameraSetup(pickle.dumps(plant.model), dict(cameras), channels, waits))
         waited = 0.0
         while self.process.alive and waited < _READY and not self._ready.wait(0.1):
             waited += 0.1

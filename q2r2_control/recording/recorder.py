@@ -170,7 +170,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         """Make ready to take pictures of a run of ``plant``, just before :meth:`begin`; some seconds at most."""
         if self.cameras is not None:
             topics = run_topics(tuple(robot.arms), tuple(robot.joint_names), tuple(cameras))
-            self.cameras.prepare(plant, cameras, topics)
+            self.cameras.prepare(plant, cameras, topics, waits=self._waits)
             self._check_cameras()
 
     def begin(self, about: About, robot: Robot) -> None:

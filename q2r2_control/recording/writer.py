@@ -182,12 +182,13 @@ class Written(NamedTuple):
 
 def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
     """Write one recording, of lists of packed ticks or messages. Raises :class:`OSError`; what was written stays."""
-    with suppress(OSError):
-        os.nice(_NICENESS)
     setup = next((request for request in requests if request is not None), None)
     if not isinstance(setup, RecordingSetup):
         return  # there was no run
     about = setup.about
+    if about.realtime:  # another loop may wait for this process
+        with suppress(OSError):
+            os.nice(_NICENESS)
     encoder = TickEncoder(setup.robot, about.topics(), about.epoch) if setup.robot is not None else None
     received, conclusion = Written(), Conclusion()
     due = time.monotonic() + FLUSH_PERIOD
