@@ -92,7 +92,7 @@ def measure_load(config: str, duration: float) -> LoadReport:
             watcher.commands.clear()
             moving = watcher.shares(processes | script, duration)
     if not all(watcher.engaged.values()):
-        raise LoadError(f"an arm was paused within {duration:g} s; engaged: {watcher.engaged}")
+        raise LoadError(f"an arm was paused within {duration:g} s: {watcher.last_event}")
     times, q = np.array([at for at, _ in watcher.commands]), np.array([q for _, q in watcher.commands])
     rows = tuple(NodeLoad(name, idle.get(name, 0.0), moving[name]) for name in moving)
     return LoadReport(duration, _JITTER, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
@@ -104,6 +104,7 @@ class _Watcher:
     def __init__(self) -> None:
         self.active = False  # the controller
         self.engaged: dict[str, bool] = {}  # by arm
+        self.last_event: dict[str, str] = {}  # by arm
         self.commands: list[tuple[float, list[float]]] = []  # time [s] and positions [rad]
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
@@ -152,7 +153,7 @@ class _Watcher:
         if name == "cartesian_controller":
             self.active = state["phase"] == "active"
         else:
-            self.engaged[state["arm"]] = state["engaged"]
+            self.engaged[state["arm"]], self.last_event[state["arm"]] = state["engaged"], state["last_event"]
 
 
 def times_of_a_robot(times: Array) -> Array:
