@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -20,7 +22,6 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from q2r2_control.export.formats import SOURCES, join_shards, video_key, write_shard
 from q2r2_control.export.sampling import Pixels
-from tests.cli.command import q2r2
 from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, contents, record_two, with_pictures
 from tests.export.test_formats import export
 
@@ -134,9 +135,10 @@ def test_while_a_video_is_encoded_no_thread_goes_before_a_control_loop(tmp_path:
 def test_a_dataset_has_the_features_that_the_docs_name(tmp_path: Path) -> None:
     record_two(tmp_path / "recordings")
     out = tmp_path / "out"
-    result = q2r2("export", "lerobot", str(tmp_path / "recordings"), "--output", str(out), "--workers", "2")
-    assert (result.exit_code, result.stderr) == (0, "")
-    assert result.stdout == f"{out}: 2 of 2 recordings at 30 frames per second\n"
+    command = [sys.executable, "-m", "q2r2_control", "export", "lerobot", str(tmp_path / "recordings")]
+    run = subprocess.run([*command, "--output", str(out), "--workers", "2"], capture_output=True, text=True)
+    assert (run.returncode, run.stdout) == (0, f"{out}: 2 of 2 recordings at 30 frames per second\n")
+    assert "%|" not in run.stderr  # no bar of the package's own
     info = json.loads((out / "meta/info.json").read_text())
     names = [line.split("|")[1] for line in (ROOT / "docs/recording.md").read_text().splitlines() if "| `" in line]
     documented = {name for cell in names for name in cell.replace("`", " ").replace(",", " ").split()}
