@@ -19,6 +19,7 @@ from q2r2_control.errors import ConfigError
 
 # Below 50, at which Linux with PREEMPT_RT runs the interrupts that the loop itself waits for.
 _PRIORITY = 40
+LONGEST_END = 5  # of a process after all that it did is closed; SIGALRM ends it then [s]
 _CURRENT, _FUTURE = 1, 2  # of mlockall on Linux
 _ADVICE = (
     "to permit it, give the user 'rtprio 40' and 'memlock unlimited' in /etc/security/limits.conf and log in anew, or "

@@ -29,9 +29,13 @@ from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.process.scheduling import StopRequest, schedule_process_as_others, schedule_process_first
+from q2r2_control.process.scheduling import (
+    LONGEST_END,
+    StopRequest,
+    schedule_process_as_others,
+    schedule_process_first,
+)
 from q2r2_control.ros.executor import TickExecutor, TickGroup
-from q2r2_control.ros.launch.executables import LONGEST_END
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.wording import sentence
 

@@ -11,7 +11,8 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 
-LONGEST_END = 5  # of a process after its nodes were closed; SIGALRM ends it then [s]
+from q2r2_control.process.scheduling import LONGEST_END
+
 # Module of ``nodes``, and in it the class of a node, or the function that runs more than one.
 NODES = {
     "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),

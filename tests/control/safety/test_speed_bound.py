@@ -9,7 +9,7 @@ from q2r2_control.control.safety.speed_bound import fastest_approach, least_dist
 from q2r2_control.control.safety.stop_certificate import write_step
 from q2r2_control.control.safety.stop_rollout import OWN, SHAPES, TOGETHER, begin_rollout
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
+from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, placed, random_posture
 from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
 
 
@@ -37,6 +37,14 @@ def least_along(name: str, motion: Motion) -> Array:
 
 def share_no_joint(name: str) -> Array:
     return cell(name).pairs.carried == 0
+
+
+def test_bodies_are_as_fast_as_their_places_change() -> None:
+    random, robot = np.random.default_rng(60), cell("dual_panda").robot
+    q, v = random_posture(robot, random), random.uniform(-1.0, 1.0, robot.model.nv)
+    later, earlier = (placed(cell("dual_panda"), q + share * v).posed for share in (1e-6, -1e-6))
+    moved = 0.5 * (later.start + later.end - earlier.start - earlier.end)
+    np.testing.assert_allclose(kernel_data("dual_panda", q, v).safety.velocities.middle, moved / 2e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
