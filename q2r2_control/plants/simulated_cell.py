@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -93,6 +94,7 @@ class SimulatedCell:
         self.dropped = 0.0  # time that the simulation fell behind, or waited for torques, in all [s]
         self._hold_after, self._max_jump = hold_after, max_jump
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
+        self._select = lru_cache(maxsize=16)(self._find)  # senders name the same joints again and again
         self._timestep = config.mujoco.timestep
         self._follower = JointFollower(
             robot.home, robot.capped_acceleration(config.control.acceleration_limit), robot.velocity_limit
@@ -100,6 +102,9 @@ class SimulatedCell:
         self.fingers = [joint for arm in robot.arms.values() for joint in arm.finger_joints]
         self._finger_q = [self.plant.model.joint(name).qposadr[0] for name in self.fingers]
         self._finger_v = [self.plant.model.joint(name).dofadr[0] for name in self.fingers]
+        self._finger_actuators = {
+            arm: [self.plant.model.actuator(joint).id for joint in its.finger_joints] for arm, its in robot.arms.items()
+        }
         self._time: float | None = None
         self.reset()
 
@@ -126,8 +131,9 @@ class SimulatedCell:
         """
         if fault := self._unusable(names, q, v, delay):
             return fault
-        ours = [place for place, name in enumerate(names) if name in self._columns]
-        columns = np.array([self._columns[names[place]] for place in ours])
+        if isinstance(selected := self._select(tuple(names)), str):
+            return selected
+        ours, columns = selected
         q = q[ours]
         reference = self._follower.q if self._tau is None else self.plant.state().q
         jump = np.abs(q - reference[columns])
@@ -166,8 +172,7 @@ class SimulatedCell:
 
     def gripper_force(self, arm: str) -> float:
         """The force of an arm's gripper [N]."""
-        forces = [self.plant.data.actuator(joint).force[0] for joint in self.robot.arms[arm].finger_joints]
-        return float(np.abs(forces).max(initial=0.0))
+        return float(np.abs(self.plant.data.actuator_force[self._finger_actuators[arm]]).max(initial=0.0))
 
     def finger_positions(self) -> Array:
         """Positions of ``fingers`` [m or rad]."""
@@ -219,8 +224,12 @@ class SimulatedCell:
             return "a number is not finite"
         if not 0.0 <= delay <= 1.0:
             return f"due in {delay:g} s; allowed: 0 .. 1"
+        return None
+
+    def _find(self, names: tuple[str, ...]) -> tuple[list[int], Array] | str:
+        """The places of our joints among ``names``, and their indices here; or the fault of these names."""
         if len(set(names)) != len(names):
             return "a joint is named twice"
-        if not set(names) & self._columns.keys():
+        if not (ours := [place for place, name in enumerate(names) if name in self._columns]):
             return f"none of its joints is one of {', '.join(self._columns)}"[:200]
-        return None
+        return ours, np.array([self._columns[names[place]] for place in ours])

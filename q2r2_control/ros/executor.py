@@ -19,7 +19,7 @@ from rclpy.clock import ROSClock
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
 
-_SERVED = 0.02  # period of services, slow timers, latched topics and all else that is no tick and no stream [s]
+_SERVED = 0.05  # period of services, slow timers, silent topics and all else that is no tick and no stream [s]
 _MOST_CALLS = 20  # of these at once: a coroutine that waits for something is ready all the time
 _MOST_MESSAGES = 100  # of one subscription between two ticks
 _SIMULATED = 0.001  # period of looking at a simulated clock [s]
@@ -35,14 +35,13 @@ class TickGroup(MutuallyExclusiveCallbackGroup):
 
 
 class TickExecutor(SingleThreadedExecutor):
-    """Runs each node's ``tick_group`` itself; rclpy runs all other callbacks, for which it looks each 20 ms."""
+    """Runs each node's ``tick_group`` itself; rclpy runs all other callbacks, for which it looks each 50 ms."""
 
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
         self._changed = True  # entities were made or destroyed
-        # Of each subscription: what takes a message and its times, its type, raw or not, its callback, and how many of
-        # both the callback gets.
-        self._streams: list[tuple[Any, Any, bool, Any, int]] = []
+        self._subscriptions: list[Any] = []  # and how many arguments the callback of each gets
+        self._streams: list[Any] = []  # those with a publisher; to look for a message takes long where none can come
         self._ticks: list[Any] = []  # timers
         self._served_at = -math.inf  # [s]
 
@@ -55,7 +54,7 @@ class TickExecutor(SingleThreadedExecutor):
         super().wake()
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Sleep until a tick is due, for 20 ms or ``timeout_sec`` at most; run what is due then."""
+        """Sleep until a tick is due, for 50 ms or ``timeout_sec`` at most; run what is due then."""
         if self._changed:
             self._collect()
         longest = _SERVED if timeout_sec is None or timeout_sec < 0.0 else min(timeout_sec, _SERVED)
@@ -71,20 +70,23 @@ class TickExecutor(SingleThreadedExecutor):
                 timer.handle.call_timer()
                 timer.callback()
         if (now := time.monotonic()) - self._served_at >= _SERVED:
-            self._served_at = now
+            self._served_at, self._streams = now, self._subscriptions
+            self.take_messages()  # a publisher may have come, and even gone
+            if not self._changed:
+                self._streams = [one for one in self._streams if one[0].handle.get_publisher_count()]
             self._serve()
 
     def take_messages(self) -> None:
         """Run the callbacks of all messages that have arrived; also for a service that ticks by itself for a while."""
         if self._changed:
             self._collect()
-        for take, kind, raw, callback, arguments in self._streams:
+        for one, arguments in self._streams:
             for _ in range(_MOST_MESSAGES):
                 if self._changed:
                     return  # this subscription may be destroyed
-                if (taken := take(kind, raw)) is None:
+                if (taken := one.handle.take_message(one.msg_type, one.raw)) is None:
                     break
-                callback(*taken[:arguments])
+                one.callback(*taken[:arguments])
 
     def _time_left(self, longest: float) -> float:
         if any(isinstance(timer.clock, ROSClock) and timer.clock.ros_time_is_active for timer in self._ticks):
@@ -106,9 +108,7 @@ class TickExecutor(SingleThreadedExecutor):
         groups = [(node, node.tick_group) for node in nodes]
         self._ticks = [one for node, group in groups for one in node.timers if one.callback_group is group]
         streams = [one for node, group in groups for one in node.subscriptions if one.callback_group is group]
-        self._streams = [
-            (one.handle.take_message, one.msg_type, one.raw, one.callback, _arguments(one.callback)) for one in streams
-        ]
+        self._streams = self._subscriptions = [(one, _arguments(one.callback)) for one in streams]
 
 
 def _arguments(callback: Callable[..., None]) -> int:

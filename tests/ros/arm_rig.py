@@ -19,7 +19,7 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
-from q2r2_control.ros.bridge.messages import pose_message, pose_of, stamped_pose
+from q2r2_control.ros.bridge.messages import pose_of, stamped_pose
 from tests.ros.processes import Processes, RosProcess, wait_until
 
 PERIOD = 1.0 / 72.0  # of the hand's messages, as a Quest sends them, and of /tf [s]
@@ -196,7 +196,7 @@ def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStampe
     """Where a frame is in another, as on /tf; the stamp is not set."""
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
-    message.transform.rotation, to = pose_message(pose).orientation, message.transform.translation
+    message.transform.rotation, to = stamped_pose(pose, "", 0.0).pose.orientation, message.transform.translation
     to.x, to.y, to.z = pose.translation.tolist()
     return message
 

@@ -21,7 +21,7 @@ from q2r2_control.recording.messages import WORLD, arm_events, arm_flags, asked_
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.gripper_client import GripperClient
 from q2r2_control.ros.bridge.hand_topics import HandIntake
-from q2r2_control.ros.bridge.messages import pose_message, stamped_pose, time_message
+from q2r2_control.ros.bridge.messages import stamped_pose, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.teleop.arm_states import AT_REST, is_refusal
 from q2r2_control.teleop.hand_motion import with_offset
@@ -58,10 +58,10 @@ class TargetMarkers:
         opacity = 1.0 if engaged else _PAUSED
         in_tool = tool.inverse() * shown
         ball = self._marker("engaged", Marker.SPHERE, self._tool_frame, opacity, now)
-        ball.pose = pose_message(in_tool)
+        ball.pose = stamped_pose(in_tool, self._tool_frame, now).pose
         ball.scale.x = ball.scale.y = ball.scale.z = _BALL
         axes = self._marker("axes", Marker.LINE_LIST, self._tool_frame, opacity, now)
-        axes.pose = pose_message(in_tool)
+        axes.pose = ball.pose
         axes.scale.x = _AXIS_WIDTH
         axes.points = list(chain.from_iterable((Point(), _point(row)) for row in _AXIS_LENGTH * np.eye(3)))
         axes.colors = [ColorRGBA(r=r, g=g, b=b, a=opacity) for r, g, b in _RGB for _ in range(2)]

@@ -31,7 +31,7 @@ from q2r2_control.ros.base_node import LATCHED_QOS, RECORDED_QOS, SENT_COMMAND_Q
 from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers
 from q2r2_control.ros.bridge.gripper_client import wanted_topic
 from q2r2_control.ros.bridge.intakes import TargetIntake
-from q2r2_control.ros.bridge.messages import stamped_pose, time_message
+from q2r2_control.ros.bridge.messages import order_of, stamped_pose, time_message
 from q2r2_control.ros.monitoring import publish_in_time
 from q2r2_control.types import Array, Reference, RobotState, StepStatus
 
@@ -158,10 +158,9 @@ class GripperLimits:
         """Note what a message says of fingers; what it says of other joints is not looked at."""
         if not self._answers or len(message.position) != len(message.name):
             return
-        positions = dict(zip(message.name, message.position, strict=True))
         for arm, (joints, closed, opened) in self._grippers.items():
-            if positions.keys() >= set(joints):
-                position = sum(positions[joint] for joint in joints) / len(joints)
+            if not isinstance(order := order_of(tuple(message.name), tuple(joints)), str):
+                position = sum(message.position[place] for place in order) / len(joints)
                 self._measured[arm] = (position - closed) / (opened - closed), self._node.now
 
     def openings(self, now: float) -> dict[str, float]:

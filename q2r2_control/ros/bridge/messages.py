@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, Vector3
+from geometry_msgs.msg import Pose, PoseStamped, Twist, Vector3
 from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
@@ -53,16 +53,16 @@ def time_message(t: float) -> Time:
     return Time(sec=int(whole), nanosec=min(round(part * 1e9), 999_999_999))
 
 
-def pose_message(pose: pin.SE3) -> Pose:
-    """A pose with a unit quaternion, x y z w."""
-    x, y, z = pose.translation.tolist()
-    qx, qy, qz, qw = pin.Quaternion(pose.rotation).normalized().coeffs().tolist()
-    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
-
-
 def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
-    """A pose in ``frame`` at ``t`` [s]."""
-    message = PoseStamped(pose=pose_message(pose))
+    """A pose in ``frame`` at ``t`` [s], with a unit quaternion x y z w."""
+    return _stamped(pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs(), frame, t)
+
+
+def _stamped(position: Array, quaternion: Array, frame: str, t: float) -> PoseStamped:
+    message = PoseStamped()  # filled as it is, since to make its parts takes twice as long
+    p, o = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = position.tolist()
+    o.x, o.y, o.z, o.w = quaternion.tolist()
     message.header.frame_id, message.header.stamp = frame, time_message(t)
     return message
 
@@ -96,11 +96,7 @@ def hand_pose(message: PoseStamped) -> HandPose:
 
 def hand_pose_message(pose: HandPose, frame: str, t: float) -> PoseStamped:
     """The same as a message in ``frame`` at ``t`` [s], all numbers as they are: the quaternion may be no unit one."""
-    x, y, z = pose.position.tolist()
-    qx, qy, qz, qw = pose.quaternion.tolist()
-    message = PoseStamped(pose=Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw)))
-    message.header.frame_id, message.header.stamp = frame, time_message(t)
-    return message
+    return _stamped(pose.position, pose.quaternion, frame, t)
 
 
 def hand_twist(message: Twist) -> HandTwist:
@@ -133,7 +129,7 @@ def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotSta
 
     Other joints in the message are ignored. Velocities and torques may be missing as a whole and are then zero.
     """
-    order = _order(tuple(message.name), tuple(names))
+    order = order_of(tuple(message.name), tuple(names))
     if isinstance(order, str):
         return order
     values = []
@@ -152,7 +148,7 @@ def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotSta
 
 
 @lru_cache(maxsize=64)  # publishers send the same names again and again
-def _order(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
+def order_of(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
     """Where each of ``names`` is among those that were given; or what is wrong with these, in one line."""
     if len(set(given)) != len(given):
         return "a joint is named twice"

@@ -42,7 +42,7 @@ from q2r2_control.wording import sentence
 _LONGEST_STOP = 3.0  # [s]
 _QUIET = 0.3  # nobody else commands the arms for so long before this node does [s]
 _LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
-_SAFE_TARGET_PERIOD = 0.008  # [s]
+_SAFE_TARGET_PERIOD = 0.012  # [s]
 _ROUTINE = ReasonKind.ACTIVATED, ReasonKind.HOMING_ARRIVED, ReasonKind.NODE_ENDS  # nothing is wrong
 
 
@@ -92,7 +92,7 @@ class CartesianControllerNode(ManagedNode):
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
         self._commanding, self._advances = False, 0  # ticks that have gone by some time
-        # Another controller follows every safe target; arms that listen take a hundred a second.
+        # Another controller follows every safe target; arms that listen tick a hundred times a second.
         every = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._last_tick = self.now
