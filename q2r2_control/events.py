@@ -169,6 +169,18 @@ class ReasonKind(StrEnum):
         "left_behind",
         "{arm}: the tool is {distance:.3f} m and {angle:.2f} rad from where it was led; begins anew where it is",
     )
+    # Cabinets of KUKA's.
+    FRI_SILENT = "fri_silent", "{arm}: no FRI message from {source}"
+    FRI_UNREADABLE = "fri_unreadable", "{arm}: {source}: {text}"
+    FRI_SESSION = (
+        "fri_session",
+        "{arm}: the cabinet is in {session}, connection {quality}, safety {safety}, drives {drives}; "
+        "commands are followed in commanding active",
+    )
+    FRI_COMMAND_MODE = "fri_command_mode", "{arm}: the Sunrise application asks for {asked} commands; allowed: {wanted}"
+    FRI_DROPPED = "fri_dropped", "{arm}: the cabinet ended the session"
+    FRI_BEHIND = "fri_behind", "{arm}: the cabinet asks less often than every {period:g} ms, and is {lag:.2f} s behind"
+    FRI_OVERTAKEN = "fri_overtaken", "the control loop was too late for the cabinets"
     RUN_ENDED = "run_ended", "the run has ended"
     STOP_SERVICE = "stop_service", "the stop service was called"
     ACTIVATED = "activated", "active: the reference starts at the measured posture"

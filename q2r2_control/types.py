@@ -117,6 +117,7 @@ class RobotState:
     tau: Array  # (nv,) measured joint torque [Nm]
     tau_external: Array | None  # (nv,) torque from contacts [Nm]; None where the plant cannot tell
     stamp: float  # [s]
+    held: Array | None = None  # (nv,) where the plant's own drives hold the arms, if it tells [rad]
 
 
 class CommandMode(StrEnum):
@@ -136,6 +137,7 @@ class Command:
     v: Array  # (nv,) [rad/s]
     tau: Array  # (nv,) [Nm]; of torque mode
     grippers: dict[str, float]  # arm -> opening, 0 closed .. 1 fully open
+    deceleration: Array | None = None  # (nv,) of the certified stop from q and v [rad/s^2]; None: none is known
 
 
 class StepStatus(StrEnum):

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ from rich.console import Console
 from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
+from q2r2_control.cli.fri import rehearsal
 from q2r2_control.cli.output import DEMO_CONFIG, ConfigFile, Json, Operator, Task, notes_of, positive, print_report, say
 from q2r2_control.config.cell import load_config
 from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
@@ -26,6 +28,7 @@ from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
+_FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
 
@@ -98,6 +101,9 @@ def run(
 def demo(
     tasks: Annotated[list[str] | None, Argument(metavar=_TASKS, help=f"By default handover stack. {_ABOUT}.")] = None,
     mode: Annotated[CommandMode, Option(help="What the arms get; torque: arms that yield.")] = CommandMode.TORQUE,
+    plant: Annotated[str, Option(metavar="[mujoco|fri]", help="fri: through two KUKA cabinets that are simulated.")] = (
+        "mujoco"
+    ),
     duration: Annotated[float | None, Option(help="Ends earlier [s].")] = None,
     fast: Fast = False,
     viewer: Viewer = False,
@@ -114,12 +120,14 @@ def demo(
     With --record, whether all succeeded is in the recording, of which q2r2 report makes plots.
     """
     _check_times(fast, rt)
+    if plant not in ("mujoco", "fri"):
+        raise ConfigError(f"--plant {plant!r:.40}: allowed: mujoco, fri")
     chosen = tasks_named(tasks or ("handover", "stack"))
     trajectory = "+".join(task.name for task in chosen)
     options = RunOptions(
         name="demo",
         input="scripted",
-        plant="mujoco",
+        plant=plant,
         mode=mode.value,
         duration=positive("--duration", duration) or trajectory_named(trajectory).duration,
         fast=fast,
@@ -131,7 +139,12 @@ def demo(
         record=record,
         notes={"task": "; ".join(task.about for task in chosen)},
     )
-    done = run_cell(load_config(DEMO_CONFIG), options)
+    if plant == "fri":
+        with rehearsal(_FRI_CONFIG, mode, chosen) as results:
+            done = run_cell(load_config(_FRI_CONFIG), options)
+        done = replace(done, tasks=tuple(results))
+    else:
+        done = run_cell(load_config(DEMO_CONFIG), options)
     print_summary(done, json)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)

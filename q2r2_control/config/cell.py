@@ -34,6 +34,7 @@ from q2r2_control.config.control import (
     check_priority,
 )
 from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
+from q2r2_control.config.fri import CabinetConfig
 from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSettings
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.strict import Network, StrictModel, network_of
@@ -139,6 +140,7 @@ class Config(StrictModel):
     teleop: TeleopSettings = TeleopSettings()
     headset: HeadsetConfig = HeadsetConfig()
     mujoco: MujocoConfig = MujocoConfig()
+    fri: dict[Side, CabinetConfig] = Field(default_factory=dict, description="KUKA's cabinet of each arm, of plant fri")
     cameras: dict[CameraName, CameraConfig] = Field(
         default_factory=dict, max_length=16, description="of the simulated cell, or on ROS topics, by name"
     )

@@ -183,6 +183,11 @@ class CartesianController:
         )
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
 
+    def brake(self, dt: float) -> None:
+        """Move the reference by ``dt`` [s] along its certified stop, of which the rest stays certified."""
+        self._observed, _, _ = self._move(self._model_pointer, self._data_pointer, self._solution, False, dt, 0.0)
+        self._apart = self._observed[-1] >= -ROUNDING
+
     def hold_at(self, q: Array | None) -> None:
         """Let arms without a target go to joint positions ``q`` (nv,) [rad] and hold there, within every promise.
 

@@ -89,10 +89,14 @@ class TaskWatch:
 
     def __call__(self, tick: Tick) -> None:
         """See what this tick has made of the parts."""
-        parts = self._touches.look(tick.t)
+        self.look(tick.t, tick.dt)
+
+    def look(self, t: float, dt: float) -> None:
+        """The same at ``t`` [s], ``dt`` [s] after the last time."""
+        parts = self._touches.look(t)
         for judges in self._judges.values():
             for judge in judges:
-                judge.see(tick.dt, parts)
+                judge.see(dt, parts)
 
     def results(self) -> tuple[TaskResult, ...]:
         """Results of all tasks. An arm that touches more than it grasps fails them all."""

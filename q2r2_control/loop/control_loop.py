@@ -92,6 +92,11 @@ class ControlLoop:
         self.supervisor.activate(replace(state, stamp=now), now)
         self._begin(state, {}, now)
 
+    def wait(self, state: RobotState) -> None:
+        """Begin inactive at ``state``, until it is good and at rest; see :class:`Supervisor`."""
+        self.controller.reset(state.q)
+        self.drive.reset(state)
+
     def resume_gripper(
         self, arm: str, wanted: float, commanded: float, openings: Mapping[str, float], now: float
     ) -> None:
@@ -108,8 +113,9 @@ class ControlLoop:
         dt: float,
         grippers: Mapping[str, float],
         openings: Mapping[str, float],
+        braked: float = 0.0,
     ) -> LoopStep:
-        """Move on by ``dt`` [s].
+        """Move on by ``dt`` [s], after ``braked`` [s] of the certified stop, which the plant has begun by itself.
 
         ``state`` is the newest measured one, which was observed; ``targets`` are tool poses in the world frame, None:
         the arm holds. An arm whose targets come as messages is not among them. ``grippers`` are wanted openings,
@@ -122,6 +128,8 @@ class ControlLoop:
             elif refusal := supervisor.update_target(arm, pose, now):
                 refusals[arm] = refusal
         commanded = self.limit_grippers(grippers, openings, now)
+        if braked > 0.0:
+            self.controller.brake(braked)
         was_inactive = supervisor.phase is Phase.INACTIVE
         reference = supervisor.tick(now, dt)
         if was_inactive and supervisor.phase is Phase.ACTIVE and state is not None:
@@ -136,6 +144,7 @@ class ControlLoop:
         if reference is not None and state is not None:
             self._velocity = reference.v
             command = self.drive.command(reference, state, commanded, dt, trusted)
+            command.deceleration = self.controller.stop_deceleration
         return LoopStep(reference, command, commanded, trusted, self.drive.report, refusals)
 
     def limit_grippers(

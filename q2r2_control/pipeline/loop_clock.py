@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 from q2r2_control.summary.run_summary import Histogram
 from q2r2_control.types import RobotState
@@ -68,4 +69,4 @@ class PlantClock:
         passed = state.stamp - self._stamp
         if passed != 0.0:
             self._stamp, self._unanswered = state.stamp, 0.0
-        return RobotState(state.q, state.v, state.tau, state.tau_external, now - self._unanswered), passed
+        return replace(state, stamp=now - self._unanswered), passed

@@ -18,7 +18,7 @@ from q2r2_control.inputs.base import Input
 from q2r2_control.loop.control_loop import ArmConditions
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.gripper_limiter import Grip
-from q2r2_control.supervision.supervisor import Supervisor
+from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.teleop.teleop import Teleop
@@ -126,7 +126,9 @@ class OperatorSide:
         if self._requests:
             self._fulfil(now)
         commanded = {arm: self._controller.tool_pose(arm) for arm in tools}
-        targets = self._teleop.update(samples, tools, now, commanded)
+        # Arms whose plant ended its session wait for the next one, and a press is refused meanwhile.
+        waits = self._supervisor.phase is not Phase.ACTIVE and self._supervisor.fault
+        targets = self._teleop.update(samples, tools, now, commanded, dict.fromkeys(tools, waits) if waits else None)
         self._go_home(now)
         return targets
 

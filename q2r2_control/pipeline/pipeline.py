@@ -22,7 +22,7 @@ from q2r2_control.loop.control_loop import ControlLoop, LoopStep
 from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock
 from q2r2_control.pipeline.operator_side import OperatorSide, PendingRequests
 from q2r2_control.pipeline.run_recorder import RunRecorder
-from q2r2_control.plants.base import Plant, check_mode, make_plant
+from q2r2_control.plants.base import Plant, SessionPlant, check_mode, make_plant
 from q2r2_control.process.scheduling import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
@@ -124,6 +124,8 @@ class Pipeline:
         """
         if duration is not None and not (math.isfinite(duration) and duration > 0.0):
             raise ConfigError(f"duration = {duration!r}: allowed: a positive number of seconds")
+        if isinstance(self.plant, SessionPlant) and self.plant.realtime_only and not realtime:
+            raise ConfigError("simulated time: allowed with a plant that is simulated only")
         self._prepare(realtime)
         try:
             self.input.start()
@@ -161,13 +163,19 @@ class Pipeline:
         self._following = True
         self._targets = {arm: ArmTarget(None, OPEN) for arm in self.robot.arms}
         self._grippers = dict.fromkeys(self.robot.arms, OPEN)  # commanded
+        sessions = self._sessions = self.plant if isinstance(self.plant, SessionPlant) else None
+        if sessions is not None:
+            sessions.begin(self.drive.mode)
         self.plant.reset()
         self._state = self.plant.state()  # the newest one
         self._clock = self.make_clock(realtime)
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)
-        self.loop.activate(self._state, self._clock.now)
-        self.supervisor.events.clear()
+        if sessions is None or sessions.fault() is None:
+            self.loop.activate(self._state, self._clock.now)
+            self.supervisor.events.clear()
+        else:
+            self.loop.wait(self._state)
         self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop)
         self._operator = OperatorSide(self.teleop, self.input, self.supervisor, self.controller, self.requests)
         self.teleop.marks.recorded = self._recorder.keeps_episodes
@@ -177,7 +185,8 @@ class Pipeline:
         try:
             while not (self._clock.after(duration) or self._stopping):
                 self.tick()
-                if self.supervisor.phase is not Phase.ACTIVE:
+                phase = self.supervisor.phase
+                if phase is Phase.STOPPED or (phase is not Phase.ACTIVE and self._sessions is None):
                     fault = self.supervisor.fault
                     raise PlantError("the arms were stopped" if fault is None else sentence(fault))
         except BaseException:
@@ -186,7 +195,7 @@ class Pipeline:
                 self._bring_to_rest()
             raise
         self._bring_to_rest()
-        if fault := self.supervisor.state_fault:
+        if self._sessions is None and (fault := self.supervisor.state_fault):
             raise PlantError(sentence(fault))
         return self._recorder.finish(self._clock, self.loop.pacer)
 
@@ -209,16 +218,18 @@ class Pipeline:
     def tick(self) -> Tick:
         """The way of the data, once: sample -> target -> reference -> command -> state."""
         gap = self._clock.wait()
-        dt, now = self.loop.pace(gap), self._clock.now
+        now = self._clock.now
+        braked, dt = (0.0, self.loop.pace(gap)) if self._sessions is None else self._sessions.due(now)
         began = time.perf_counter()
         samples = self._operator.poll(now) if self._following else []
         state = self._state = self.plant.state()
         seen, passed = self._plant_clock.stamped(state, now)
-        self.loop.observe(seen, now, passed)
+        lost = None if self._sessions is None else self._sessions.fault()
+        self.loop.observe(lost or seen, now, passed)
         openings, tools = self.plant.gripper_openings(), self._measured_tools(state)
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
-        step = self._control(state, openings, now, dt)
+        step = self._control(state, openings, now, dt, braked)
         assert step.reference is not None  # the plant is the loop's own
         assert step.command is not None
         self.plant.apply(step.command)
@@ -233,7 +244,7 @@ class Pipeline:
             start=self._start,
             now=now,
             dt=gap,
-            step=dt,
+            step=braked + dt,
             following=self._following,
             connected=self._operator.connected,
             samples=samples,
@@ -264,11 +275,13 @@ class Pipeline:
         pin.forwardKinematics(model, data, state.q)
         return {name: pin.updateFramePlacement(model, data, arm.frame_id).copy() for name, arm in arms.items()}
 
-    def _control(self, state: RobotState, openings: Mapping[str, float], now: float, dt: float) -> LoopStep:
+    def _control(
+        self, state: RobotState, openings: Mapping[str, float], now: float, dt: float, braked: float
+    ) -> LoopStep:
         """From measurements and targets to a command. While a run ends, the operator asks for nothing."""
         poses = {arm: target.command for arm, target in self._targets.items()} if self._following else {}
         grippers = {arm: target.gripper for arm, target in self._targets.items()}
-        step = self.loop.step(state, poses, now, dt, grippers, openings)
+        step = self.loop.step(state, poses, now, dt, grippers, openings, braked)
         self._grippers = step.grippers
         for refusal in step.refusals.values():
             self.teleop.pause(now, refusal)  # or the operator would think that the arm follows

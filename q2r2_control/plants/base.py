@@ -9,6 +9,7 @@ import numpy as np
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.events import Reason
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
@@ -65,6 +66,29 @@ class WindowedPlant(Protocol):
 
     def viewer_sync(self) -> bool:
         """Show the plant as it is now; False once the window has been closed."""
+
+
+@runtime_checkable
+class SessionPlant(Protocol):
+    """The methods of a plant whose arms follow only during sessions, at times of their own, besides :class:`Plant`'s.
+
+    Its arms start where they stand. A session that ends is no end of the run: the arms of all sessions brake, and are
+    activated anew where they rest, as soon as all are in a session again.
+    """
+
+    realtime_only: bool
+
+    def begin(self, mode: CommandMode) -> None:
+        """Commands of this ``mode`` are to come after the next ``reset``."""
+
+    def due(self, now: float) -> tuple[float, float]:
+        """In a tick at ``now`` [s]: how long the reference follows its certified stop, and moves on then [s].
+
+        The next command is for the end of both.
+        """
+
+    def fault(self) -> Reason | None:
+        """Why the arms cannot be commanded now, or ceased to be since the last call; None: they can."""
 
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:

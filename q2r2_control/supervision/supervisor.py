@@ -253,7 +253,7 @@ class Supervisor:
     def _activate(self) -> None:
         state = self._watch.state
         assert state is not None
-        self._controller.reset(state.q)
+        self._controller.reset(state.q if state.held is None else state.held)
         self._forget_targets()
         if self._external is not None:
             self._external.begin()

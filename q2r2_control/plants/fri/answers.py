@@ -10,71 +10,101 @@ rate, and its rate changes by ``CATCH_UP_RAMP`` a second. With the reference at 
 (1 + CATCH_UP) v and (1 + CATCH_UP)^2 a + CATCH_UP_RAMP v.
 
 **Never beyond what is certified.** Where the newest reference ends before the answer's time, since our loop is late,
-its certified stop follows.
+its certified stop follows. The loop then lets its own reference follow the same stop for as long.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
 from q2r2_control.types import Array
 
-CATCH_UP = 0.02  # of an even time's rate
+CATCH_UP = 0.05  # of an even time's rate
 CATCH_UP_RAMP = 0.4  # of that rate [1/s]
 _SETTLED = 500  # messages over which the arrivals are averaged
-_PIECES = 128  # of the reference that are kept
+_PIECES = 1024  # of the reference that are kept
 _REMEMBERED = 64  # answers of which the time is known
 
 
-class _Piece(NamedTuple):
-    """The reference between two ticks, by the posture and velocity at both."""
+class _Move(NamedTuple):
+    """From one tick's posture and velocity to the next one's."""
 
     start: float  # [s]
     end: float
     q: tuple[Array, Array]  # [rad]
     v: tuple[Array, Array]  # [rad/s]
 
+    def at(self, t: float) -> tuple[Array, Array]:
+        """Posture and velocity by the cubic through both ends: with a constant acceleration it is that parabola."""
+        (q, end), (v, end_v), h = self.q, self.v, self.end - self.start
+        x = min(max((t - self.start) / h, 0.0), 1.0)
+        way = end - q
+        there = q + x * x * (3.0 - 2.0 * x) * way + x * (1.0 - x) * h * ((1.0 - x) * v - x * end_v)
+        speed = 6.0 * x * (1.0 - x) / h * way + (1.0 - x) * (1.0 - 3.0 * x) * v + x * (3.0 * x - 2.0) * end_v
+        return there, speed
+
+
+class _Stop(NamedTuple):
+    """The certified stop from a posture and a velocity."""
+
+    start: float  # [s]
+    q: Array  # [rad]
+    v: Array  # [rad/s]
+    deceleration: Array  # [rad/s^2]
+
+    def at(self, t: float) -> tuple[Array, Array]:
+        ran = np.minimum(max(t - self.start, 0.0), np.abs(self.v) / self.deceleration)
+        lost = np.sign(self.v) * self.deceleration * ran
+        return self.q + (self.v - 0.5 * lost) * ran, self.v - lost
+
+
+_start = attrgetter("start")
+
 
 class ReferencePath:
-    """The reference of the last ticks and the certified stop from the newest. One thread extends it, others read."""
+    """The reference of the last ticks, and the certified stop from the newest."""
 
     def __init__(self, t: float, q: Array) -> None:
-        """At rest at ``q`` (nv,) [rad] until ``t`` [s]."""
-        self._pieces: tuple[_Piece, ...] = (_Piece(-math.inf, t, (q, q), (0.0 * q, 0.0 * q)),)
-        self._stop = np.ones_like(q)
+        """At rest at ``q`` (n,) [rad] from ``t`` [s] on."""
+        self._pieces: tuple[_Move | _Stop, ...] = ()
+        self._stop = _Stop(t, q, np.zeros_like(q), np.ones_like(q))
 
     @property
     def end(self) -> float:
-        """Time up to which there is a reference [s]."""
-        return self._pieces[-1].end
+        """Time from which on there is nothing but the stop [s]."""
+        return self._stop.start
 
-    def extend(self, t: float, q: Array, v: Array, deceleration: Array) -> None:
-        """The reference is at ``q``, ``v`` at the time ``t`` [s]; its certified stop brakes at ``deceleration``."""
-        last = self._pieces[-1]
-        self._stop = deceleration
-        self._pieces = (*self._pieces[1 - _PIECES :], _Piece(last.end, t, (last.q[1], q), (last.v[1], v)))
+    @property
+    def rest(self) -> Array:
+        """Posture (n,) [rad] in which the stop ends."""
+        return self._stop.at(math.inf)[0]
+
+    def extend(self, t: float, q: Array, v: Array, deceleration: Array, start: float = -math.inf) -> None:
+        """The reference is at ``q``, ``v`` at the time ``t`` [s]; its certified stop brakes at ``deceleration``.
+
+        It left the stop of before at ``start`` [s], or at once.
+        """
+        stop, start = self._stop, max(start, self._stop.start)
+        there, speed = stop.at(start)
+        followed = (stop,) if start > stop.start else ()
+        self._pieces = (*self._pieces[-_PIECES:], *followed, _Move(start, t, (there, q), (speed, v)))
+        self._stop = _Stop(t, q, v, deceleration)
 
     def at(self, t: float) -> Array:
-        """Posture (nv,) [rad] at ``t`` [s]."""
-        pieces, stop = self._pieces, self._stop
-        last = pieces[-1]
-        if t >= last.end:
-            v = last.v[1]
-            ran = np.minimum(t - last.end, np.abs(v) / stop)
-            return np.asarray(last.q[1] + v * ran - 0.5 * np.sign(v) * stop * ran**2)
-        piece = next((piece for piece in reversed(pieces) if piece.start <= t), pieces[0])
-        if not math.isfinite(piece.start):
-            return piece.q[0]
-        # The cubic through both ends: with the controller's constant acceleration it is that parabola.
-        h = piece.end - piece.start
-        x = (t - piece.start) / h
-        way = piece.q[1] - piece.q[0]
-        return np.asarray(
-            piece.q[0] + x * x * (3.0 - 2.0 * x) * way + x * (1.0 - x) * h * ((1.0 - x) * piece.v[0] - x * piece.v[1])
-        )
+        """Posture (n,) [rad] at ``t`` [s]."""
+        if t >= self._stop.start or not self._pieces:
+            return self._stop.at(t)[0]
+        return self._pieces[max(bisect_right(self._pieces, t, key=_start) - 1, 0)].at(t)[0]
+
+
+class _Answer(NamedTuple):
+    time: float  # that it is for [s]
+    rate: float  # of that time since the answer before
 
 
 class AnswerTimes:
@@ -85,33 +115,34 @@ class AnswerTimes:
         self._period, self._delay = period, delay
         self._questions = 0
         self._arrival, self._counter = 0.0, 0  # of the newest question, averaged
-        self._rate = 1.0
-        self._times: dict[int, float] = {}  # of our answers by their counter
+        self._answers: dict[int, _Answer] = {}  # by their counter
 
     def restart(self) -> None:
         """The arm stands still at a new path's begin, so that the next answer may be for any time."""
-        self._times, self._rate = {}, 1.0
+        self._answers, self._questions = {}, 0
 
     def at(self, question: int, arrival: float, counter: int, heard: int) -> float:
         """The time that our answer ``counter`` to a ``question`` is for, that came at ``arrival``.
 
         ``heard``: counter of our newest answer that the cabinet knows of.
         """
-        if self._times and question == self._counter:  # it came twice
-            self._times[counter] = time = max(self._times.values())
-            return time
+        newest = max(self._answers.values(), default=None)
+        if newest is not None and question == self._counter:  # it came twice
+            self._answers[counter] = newest
+            return newest.time
         wanted = self._even(question, arrival) - self._delay
-        before = self._times.get(heard, max(self._times.values(), default=wanted - self._period))
-        lag = (wanted - before) / self._period - 1.0  # in answers
+        # From the answer that the cabinet goes on from: what it did not hear was never done.
+        before = self._answers.get(heard, newest) or _Answer(wanted - self._period, 1.0)
+        lag = (wanted - before.time) / self._period - 1.0  # in answers
         ramp = CATCH_UP_RAMP * self._period
         # The greatest excess of rate from which the ramp still comes back to 0 as the lag does.
         excess = math.copysign(math.sqrt(2.0 * ramp * abs(lag) + 0.25 * ramp * ramp) - 0.5 * ramp, lag)
         excess = min(max(excess, -CATCH_UP), CATCH_UP)
-        self._rate = min(max(1.0 + excess, self._rate - ramp), self._rate + ramp)
-        time = before + self._rate * self._period
-        self._times = {known: t for known, t in self._times.items() if known > counter - _REMEMBERED}
-        self._times[counter] = time
-        return time
+        rate = min(max(1.0 + excess, before.rate - ramp), before.rate + ramp)
+        answer = _Answer(before.time + rate * self._period, rate)
+        self._answers = {known: one for known, one in self._answers.items() if known > counter - _REMEMBERED}
+        self._answers[counter] = answer
+        return answer.time
 
     def _even(self, question: int, arrival: float) -> float:
         self._questions += 1

@@ -123,6 +123,8 @@ def read_monitoring(datagram: bytes) -> Monitoring:
     data, connection, ipo, robot = message.data, message.connection, message.ipo, message.robot
     if (q := _joints(data, "q")) is None:
         raise ProtocolError("FRI monitoring message without measured joint positions: allowed: seven of them")
+    if not 1 <= connection.period <= 100:
+        raise ProtocolError(f"FRI send period of {connection.period} ms: allowed: 1 .. 100")
     return Monitoring(
         version=version,
         counter=message.header.counter,

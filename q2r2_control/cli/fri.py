@@ -1,0 +1,160 @@
+"""``q2r2 fri-cabinet``: stands in for the cabinets of a cell, whose arms are simulated."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from json import loads
+from typing import Annotated, Any
+
+from rich.console import Console
+from typer import Option
+
+from q2r2_control.cli.output import ConfigFile, Json, positive, print_report, say
+from q2r2_control.config.cell import load_config
+from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, tasks_named
+from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.plants.fri.cabinet import Cabinet, Trip
+from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
+from q2r2_control.plants.fri.wire import CommandKind, Session
+from q2r2_control.process.scheduling import StopRequest, stop_on_signals
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import CommandMode
+from q2r2_control.viewer.tables import figure_table
+
+_KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
+
+
+class _Pendant:
+    """The operator at the cabinets: starts their overlays, stops one now and then, and reads what they say."""
+
+    def __init__(
+        self, cabinets: dict[str, Cabinet], start_after: float, drop_every: float | None, console: Console
+    ) -> None:
+        self._cabinets, self._start_after, self._drop_every, self._console = cabinets, start_after, drop_every, console
+        self._said: dict[str, str] = {}
+        self._ready_since: dict[str, float | None] = dict.fromkeys(cabinets)
+        self._dropped_at = 0.0
+
+    def look(self, now: float) -> None:
+        for arm, cabinet in self._cabinets.items():
+            since = self._ready_since[arm]
+            if cabinet.session is not Session.MONITORING_READY:
+                self._ready_since[arm] = None
+            elif since is None:
+                self._ready_since[arm] = now
+            elif now - since >= self._start_after:
+                cabinet.start_overlay()
+            line = cabinet.session.name.lower().replace("_", " ")
+            if cabinet.trips and cabinet.session < Session.COMMANDING_WAIT:
+                line += f" ({cabinet.trips[-1]})"
+            if self._said.get(arm) != line:
+                self._said[arm] = line
+                say(f"{now:8.3f} s  {arm}: {line}", self._console)
+        active = all(cabinet.session is Session.COMMANDING_ACTIVE for cabinet in self._cabinets.values())
+        if not active:
+            self._dropped_at = now
+        elif self._drop_every is not None and now - self._dropped_at >= self._drop_every:
+            next(iter(self._cabinets.values())).stop()
+
+
+def fri_cabinet(
+    config: ConfigFile,
+    mode: Annotated[CommandMode, Option(help="What the application lets a client command.")] = CommandMode.POSITION,
+    period: Annotated[float, Option(min=1, max=10, help="Between two messages [ms].")] = 5.0,
+    right_period: Annotated[float | None, Option(min=1, max=10, help="Of the right arm's cabinet [ms].")] = None,
+    fri: Annotated[int, Option(min=1, max=2, help="Version of FRI.")] = 2,
+    start_after: Annotated[float, Option(min=0, help="An overlay is started after so long with a client [s].")] = 0.5,
+    drop_every: Annotated[float | None, Option(help="The pendant ends a session as often as this [s].")] = None,
+    loss: Annotated[float, Option(min=0, max=0.5, help="Share of datagrams that are lost, each way.")] = 0.0,
+    duplicate: Annotated[float, Option(min=0, max=0.5, help="Share of messages that come twice.")] = 0.0,
+    jitter: Annotated[float, Option(min=0, max=20, help="Datagrams are late by up to this [ms].")] = 0.0,
+    seed: Annotated[int, Option(min=0, help="Of what is lost and late.")] = 0,
+    task: Annotated[list[str] | None, Option(help="A task of q2r2 demo to be judged.")] = None,
+    duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
+    json: Json = False,
+) -> None:
+    """Stand in for the Sunrise cabinets of a cell: q2r2 run CONFIG --plant fri, in another terminal, drives its arms.
+
+    Each cabinet goes through the states of a session, guards its arm's limits, and ends the session of a client that
+    breaks one, as a real one does. It is a rehearsal: KUKA's own controller and its safety are not in it.
+    """
+    cell, console, stop = load_config(config), Console(stderr=True), StopRequest()
+    if mode not in _KINDS:
+        raise ConfigError(f"--mode {mode}: allowed: {', '.join(_KINDS)}")
+    robot = Robot.from_config(cell)
+    arms = SimulatedArms(robot, cell)
+    if missing := [arm for arm in robot.arms if arm not in cell.fri]:
+        raise ConfigError(f"{config}: fri.{missing[0]}: missing; allowed: the cabinet of each arm")
+    cabinets, clients = {}, {}
+    for arm, its in cell.fri.items():
+        every = right_period if arm == "right" and right_period is not None else period
+        cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every)
+        clients[str(arm)] = "127.0.0.1", its.port
+    grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if its.gripper is not None}
+    network = Network(loss, duplicate, 1e-3 * jitter)
+    server = CabinetServer(arms, cabinets, clients, grippers, network, seed)
+    pendant = _Pendant(server.cabinets, start_after, drop_every, console)
+    watch = TaskWatch(tasks_named(task), arms.plant, robot, cell) if task else None
+    longest = positive("--duration", duration)
+    last = 0.0
+
+    def look(now: float) -> None:
+        nonlocal last
+        pendant.look(now)
+        if watch is not None and now > last:
+            watch.look(now, now - last)
+            last = now
+
+    began = time.monotonic()
+    with stop_on_signals(stop.ask):
+        server.run(lambda now: stop.asked or (longest is not None and now >= longest), look)
+    data: dict[str, Any] = {"seconds": time.monotonic() - began, "cabinets": {}}
+    rows = []
+    for name, cabinet in server.cabinets.items():
+        ends = [str(trip) for trip in cabinet.trips]
+        state = cabinet.session.name.lower().replace("_", " ")
+        data["cabinets"][name] = {"state": state, "missed": cabinet.missed, "trips": ends}
+        rows.append((name, state, cabinet.missed, ", ".join(sorted(set(ends))) or "-"))
+    if watch is not None:
+        data["tasks"] = watch.results()
+    print_report(data, (figure_table("cabinets", ("arm", "state", "missed [answers]", "ends"), rows),), json)
+
+
+@contextmanager
+def rehearsal(config: str, mode: CommandMode, tasks: Sequence[AssemblyTask]) -> Iterator[list[TaskResult]]:
+    """Cabinets of a cell in a process of their own; at the end, results of the ``tasks`` as they measured them.
+
+    Raises :class:`PlantError` where they ended a session or say nothing.
+    """
+    words = [
+        "fri-cabinet",
+        config,
+        "--mode",
+        mode,
+        "--period",
+        "10",
+        "--json",
+        *(word for task in tasks for word in ("--task", task.name)),
+    ]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "q2r2_control", *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    results: list[TaskResult] = []
+    try:
+        yield results
+    finally:
+        child.send_signal(signal.SIGINT)
+        said, _ = child.communicate()
+    try:
+        told = loads(said)
+    except ValueError:
+        raise PlantError("the cabinets that stand in have failed; q2r2 fri-cabinet says why") from None
+    for arm, cabinet in told["cabinets"].items():
+        if cabinet["trips"][:-1] or cabinet["trips"][-1:] not in ([], [Trip.LATE]):  # the last end is ours
+            raise PlantError(f"{arm}: the cabinet ended the session: {', '.join(cabinet['trips'])}")
+    results += [TaskResult(**result) for result in told["tasks"]]

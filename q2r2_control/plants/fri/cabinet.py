@@ -1,0 +1,251 @@
+"""One Sunrise cabinet that stands in for a real one: its session, its guards and its arm, in a time that is passed in.
+
+It is the test of a client, not a model of KUKA's controller. The states and their conditions follow the public client
+kits; where those are silent, such as in how long a client may miss, it is stricter rather than more lenient.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+from q2r2_control.errors import ProtocolError
+from q2r2_control.plants.fri.wire import (
+    JOINTS,
+    Command,
+    CommandKind,
+    Drives,
+    IoValue,
+    Joints,
+    Monitoring,
+    Operation,
+    Quality,
+    Safety,
+    Session,
+    read_command,
+)
+
+_WINDOW = 50  # answers that the quality is judged by
+_FAIR, _GOOD, _EXCELLENT = 0.5, 0.9, 0.98  # share of them that came in time
+_MISSES = 10  # answers in a row that may be late while the client commands
+_NEAR = 1e-3  # how far the first command may be from the cabinet's own position [rad]
+_ROUNDING = 1e-6  # relative, of the limits
+
+
+class Trip(StrEnum):
+    """Reason why a cabinet ended the client's command."""
+
+    LATE = "answers were late"
+    MALFORMED = "an answer could not be read"
+    VERSION = "an answer was of another FRI version"
+    NO_POSITION = "an answer had no joint positions"
+    NO_TORQUE = "an answer had no torques"
+    POSITION = "a commanded position was beyond its limit"
+    VELOCITY = "commanded positions were too far apart"
+    ACCELERATION = "commanded velocities were too far apart"
+    TORQUE = "a commanded torque was beyond its limit"
+    SAFETY = "safety stop"
+    STOPPED = "stopped at the pendant"
+
+
+class Arm(Protocol):
+    """The arm of a cabinet."""
+
+    @property
+    def q(self) -> Joints:
+        """Measured [rad]."""
+
+    @property
+    def tau(self) -> Joints:
+        """Measured [Nm]."""
+
+    @property
+    def external_tau(self) -> Joints:
+        """By contacts [Nm]."""
+
+    def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
+        """Let ``dt`` [s] pass: the drives move to ``q`` [rad]; ``tau`` [Nm] is added to their impedance."""
+
+
+@dataclass(slots=True)
+class StillArm:
+    """An arm that is where it was commanded to be."""
+
+    q: Joints
+    tau: Joints = (0.0,) * JOINTS
+    external_tau: Joints = (0.0,) * JOINTS
+
+    def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
+        self.q = q
+
+
+@dataclass(frozen=True, slots=True)
+class CabinetSettings:
+    """One cabinet's FRI settings and guards. Joints are A1 .. A7."""
+
+    lower: Joints  # allowed positions [rad]
+    upper: Joints
+    velocity: Joints  # [rad/s]
+    acceleration: Joints  # [rad/s^2]
+    torque: Joints  # of the overlay [Nm]
+    version: int = 2
+    period: float = 0.005  # between two messages [s]
+    multiplier: int = 1  # one answer is due for so many messages
+    command: CommandKind = CommandKind.POSITION
+
+    @property
+    def answer_period(self) -> float:
+        """Between two answers [s]."""
+        return self.period * self.multiplier
+
+
+class Cabinet:
+    """In each period: :meth:`send`, and :meth:`receive` for each datagram that comes before the next."""
+
+    def __init__(self, settings: CabinetSettings, arm: Arm) -> None:
+        self.settings, self.arm = settings, arm
+        self.session, self.safety, self.operation = Session.MONITORING_WAIT, Safety.NORMAL, Operation.AUTOMATIC
+        self.inputs: dict[str, IoValue] = {}  # for the client
+        self.outputs: dict[str, IoValue] = {}  # by the client, whatever the session's state
+        self.trips: list[Trip] = []  # of all sessions, in order
+        self._sent = 0  # messages so far
+        self._heard: int | None = None  # counter of the client's newest message
+        self._answer: Command | None = None  # to the newest message that asked for one
+        self._in_time: deque[bool] = deque(maxlen=_WINDOW)
+        self._misses = self.missed = 0  # in a row, and in all, of those that were due while the client commanded
+        self._overlay = False  # the application asks for the client's command
+        self._commanded: Joints = arm.q  # by the cabinet's own motion, or by the client
+        self._velocity: Joints = (0.0,) * JOINTS
+        self._tau: Joints | None = None
+
+    @property
+    def quality(self) -> Quality:
+        """By the answers that came in time."""
+        if len(self._in_time) < _WINDOW:
+            return Quality.POOR
+        share = sum(self._in_time) / len(self._in_time)
+        return Quality((share >= _FAIR) + (share >= _GOOD) + (share >= _EXCELLENT))
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether the newest message was answered."""
+        return self._answer is not None
+
+    def start_overlay(self) -> None:
+        """The application asks for the client's command, as after a press on the pendant."""
+        self._overlay = True
+
+    def stop(self, trip: Trip = Trip.STOPPED) -> None:
+        """End the client's command: the arm holds. The application has to start the overlay again."""
+        if self.session >= Session.COMMANDING_WAIT:
+            self.trips.append(trip)
+            self.session = Session.MONITORING_READY
+        self._overlay, self._velocity, self._tau = False, (0.0,) * JOINTS, None
+        self._commanded = self.arm.q
+
+    def safety_stop(self, stop: Safety) -> None:
+        """A stop that the safety controller asks for; ``NORMAL`` ends it."""
+        self.safety = stop
+        if stop is not Safety.NORMAL:
+            self.stop(Trip.SAFETY)
+
+    def send(self, stamp: float) -> Monitoring:
+        """Begin a period at ``stamp`` [s]: judge the last answer, move the arm, and say how things are."""
+        if self._sent and self._sent % self.settings.multiplier == 0:
+            self._judge()
+        self.arm.advance(self.settings.period, self._commanded, self._tau)
+        self._sent += 1
+        self.message = Monitoring(
+            version=self.settings.version,
+            counter=self._sent,
+            reflected=self._heard or 0,
+            session=self.session,
+            quality=self.quality,
+            period=self.settings.period,
+            multiplier=self.settings.multiplier,
+            q=self.arm.q,
+            stamp=stamp,
+            tau=self.arm.tau,
+            external_tau=self.arm.external_tau,
+            commanded_q=self._commanded if self.settings.version == 1 else None,
+            ipo_q=self._commanded if self.session >= Session.COMMANDING_WAIT else None,
+            command=self.settings.command if self.session >= Session.COMMANDING_WAIT else CommandKind.NONE,
+            safety=self.safety,
+            operation=self.operation,
+            drives=Drives.ACTIVE if self.session >= Session.COMMANDING_WAIT else Drives.OFF,
+            io=dict(self.inputs),
+        )
+        return self.message
+
+    def receive(self, datagram: bytes) -> None:
+        """An answer. One that repeats an older one, or answers an older message, counts as late."""
+        try:
+            version, command = read_command(datagram)
+        except ProtocolError:
+            self.stop(Trip.MALFORMED)
+            return
+        if version != self.settings.version:
+            self.stop(Trip.VERSION)
+        elif command.reflected == self._sent and (self._heard is None or command.counter != self._heard):
+            self._heard, self._answer = command.counter, command
+            self.outputs |= command.io
+
+    def _judge(self) -> None:
+        answer, self._answer = self._answer, None
+        self._in_time.append(answer is not None)
+        self.missed += answer is None and self.session is Session.COMMANDING_ACTIVE
+        self._misses = 0 if answer is not None else self._misses + 1
+        if self.session is Session.COMMANDING_ACTIVE:
+            if self._misses > _MISSES or self.quality < Quality.GOOD:
+                self.stop(Trip.LATE)
+            elif answer is not None:
+                self._follow(answer)
+        elif self.session is Session.COMMANDING_WAIT:
+            if self.quality < Quality.GOOD:
+                self.stop(Trip.LATE)
+            elif answer is not None and answer.q is not None and _apart(answer.q, self._commanded) <= _NEAR:
+                self.session = Session.COMMANDING_ACTIVE
+                self._follow(answer)
+        else:
+            good = self.quality >= Quality.GOOD
+            self.session = Session.MONITORING_READY if good else Session.MONITORING_WAIT
+            if good and self._overlay and self.safety is Safety.NORMAL:
+                self.session = Session.COMMANDING_WAIT
+
+    def _follow(self, answer: Command) -> None:
+        trip = self._guard(answer)
+        if trip is not None:
+            self.stop(trip)
+            return
+        assert answer.q is not None
+        moved = (new - old for new, old in zip(answer.q, self._commanded, strict=True))
+        self._velocity = tuple(way / self.settings.answer_period for way in moved)
+        self._commanded, self._tau = answer.q, answer.tau
+
+    def _guard(self, answer: Command) -> Trip | None:
+        """The reason why an answer cannot be followed; a missed one before it gives no more time."""
+        limits, period = self.settings, self.settings.answer_period
+        if answer.q is None:
+            return Trip.NO_POSITION
+        if limits.command is CommandKind.TORQUE:
+            if answer.tau is None:
+                return Trip.NO_TORQUE
+            if any(abs(tau) > limit for tau, limit in zip(answer.tau, limits.torque, strict=True)):
+                return Trip.TORQUE
+        if any(not low <= q <= high for q, low, high in zip(answer.q, limits.lower, limits.upper, strict=True)):
+            return Trip.POSITION
+        for new, old, before, velocity, acceleration in zip(
+            answer.q, self._commanded, self._velocity, limits.velocity, limits.acceleration, strict=True
+        ):
+            now = (new - old) / period
+            if abs(now) > velocity * (1.0 + _ROUNDING):
+                return Trip.VELOCITY
+            if abs(now - before) / period > acceleration * (1.0 + _ROUNDING):
+                return Trip.ACCELERATION
+        return None
+
+
+def _apart(one: Joints, other: Joints) -> float:
+    return max(map(abs, (a - b for a, b in zip(one, other, strict=True))))

@@ -1,0 +1,220 @@
+"""Cabinets on real sockets, in real time, with a simulated cell behind them: for a rehearsal at the desk."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import select
+import socket
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config.cell import Config
+from q2r2_control.config.fri import GripperIoConfig
+from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
+from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings
+from q2r2_control.plants.fri.wire import JOINTS, LONGEST, CommandKind, Joints, write_monitoring
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Command, CommandMode
+
+_LONGEST_STALL = 1.0  # of this process; a longer one is the cabinet's [s]
+_LONGEST_CATCH_UP = 0.05  # what it falls behind by more is dropped [s]
+_SAG = 1e-3  # the simulated arm may be this much beyond its limits [rad]
+# A cabinet's joint impedance while no torque overlays it [Nm/rad], [Nm s/rad].
+_STIFFNESS, _DAMPING = 1000.0, 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """Faults of the way between cabinet and client."""
+
+    loss: float = 0.0  # share of the datagrams, each way
+    duplicate: float = 0.0  # share of the messages that come twice
+    jitter: float = 0.0  # each datagram is late by up to this, and may overtake another [s]
+
+
+class SimulatedArm:
+    """One arm of a :class:`SimulatedArms`."""
+
+    def __init__(self, cell: SimulatedArms, arm: str) -> None:
+        self._cell, self._joints = cell, cell.robot.arms[arm].joints
+        start = tuple(cell.robot.home[self._joints].tolist())
+        self._from, self._to, self._began, self._lasts = start, start, 0.0, 1.0
+        self.overlay: Joints | None = None
+
+    @property
+    def q(self) -> Joints:
+        return tuple(self._cell.state.q[self._joints].tolist())
+
+    @property
+    def tau(self) -> Joints:
+        return tuple(self._cell.state.tau[self._joints].tolist())
+
+    @property
+    def external_tau(self) -> Joints:
+        external = self._cell.state.tau_external
+        return (0.0,) * JOINTS if external is None else tuple(external[self._joints].tolist())
+
+    def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
+        """Begin to go to ``q``, which takes ``dt`` [s]; the cell's own time goes on by itself."""
+        self._from, self._to, self._began, self._lasts = self._to, q, self._cell.now, dt
+        self.overlay = tau
+
+    def wanted(self, t: float) -> tuple[Array, Array]:
+        """Where the drives are to be at ``t`` [s], and how fast."""
+        share, way = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
+        if share >= 1.0:
+            return np.array(self._to), np.zeros(JOINTS)
+        return np.add(self._from, max(share, 0.0) * way), way / self._lasts
+
+
+class SimulatedArms:
+    """All arms of a cell in one simulation."""
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        self.robot, self.plant = robot, MujocoPlant(robot, config)
+        self.now, self.openings = 0.0, dict.fromkeys(self.plant.gripper_openings(), 1.0)
+        self.state = self.plant.state()
+        self.arms = {arm: SimulatedArm(self, arm) for arm in robot.arms}
+        self._data = robot.model.createData()
+
+    def advance(self, now: float) -> None:
+        """Let the time until ``now`` [s] pass."""
+        passed = min(now - self.now, _LONGEST_CATCH_UP)
+        self.now = now
+        if passed > 0.0:
+            self.plant.apply(self._command())
+            self.plant.advance(passed)
+            self.state = self.plant.state()
+
+    def _command(self) -> Command:
+        q, v = np.zeros((2, self.robot.model.nv))
+        for name, arm in self.arms.items():
+            joints = self.robot.arms[name].joints
+            q[joints], v[joints] = arm.wanted(self.now)
+        if all(arm.overlay is None for arm in self.arms.values()):
+            return Command(CommandMode.POSITION, q, v, 0.0 * q, self.openings)
+        state = self.plant.state()
+        tau = pin.computeGeneralizedGravity(self.robot.model, self._data, state.q).copy()
+        for name, arm in self.arms.items():
+            joints = self.robot.arms[name].joints
+            held = _STIFFNESS * (q - state.q)[joints] - _DAMPING * state.v[joints]
+            tau[joints] += held if arm.overlay is None else arm.overlay
+        return Command(CommandMode.TORQUE, q, v, tau, self.openings)
+
+
+def settings_of(robot: Robot, arm: str, kind: CommandKind, version: int, period: float) -> CabinetSettings:
+    """A cabinet with the guards of an arm: the limits of the robot, and what catching up adds to its accelerations."""
+    joints = robot.arms[arm].joints
+    acceleration = (1.0 + CATCH_UP) ** 2 * robot.acceleration_limit + CATCH_UP_RAMP * robot.velocity_limit
+    return CabinetSettings(
+        lower=tuple((robot.position_lower[joints] - _SAG).tolist()),
+        upper=tuple((robot.position_upper[joints] + _SAG).tolist()),
+        velocity=tuple(robot.velocity_limit[joints].tolist()),
+        acceleration=tuple(acceleration[joints].tolist()),
+        torque=tuple(robot.torque_limit[joints].tolist()),
+        version=version,
+        period=period,
+        command=kind,
+    )
+
+
+class CabinetServer:
+    """Sends each cabinet's messages to its client's address, and hears the answers."""
+
+    def __init__(
+        self,
+        cell: SimulatedArms,
+        cabinets: Mapping[str, CabinetSettings],
+        clients: Mapping[str, tuple[str, int]],
+        grippers: Mapping[str, GripperIoConfig],
+        network: Network,
+        seed: int = 0,
+    ) -> None:
+        """``clients``: address and port of each arm's. Datagrams go out from loopback where a client is there."""
+        self.cell, self._clients, self._grippers, self._network = cell, dict(clients), dict(grippers), network
+        self.cabinets = {arm: Cabinet(settings, cell.arms[arm]) for arm, settings in cabinets.items()}
+        self._random = np.random.default_rng(seed)
+        self._sockets = {arm: _opened(address) for arm, (address, _) in self._clients.items()}
+        self._queue: list[tuple[float, int, Callable[[], None]]] = []
+        self._serial = 0
+        self._sent_at: dict[str, float] = {}  # the newest message of each arm [s]
+
+    def run(self, until: Callable[[float], bool], tick: Callable[[float], None] = lambda t: None) -> None:
+        """Go on until a function of the time since the begin [s] says so; ``tick`` is called for each message."""
+        self._began, now = time.monotonic(), 0.0
+        for index, (arm, cabinet) in enumerate(self.cabinets.items()):
+            self._at(index * 0.37 * cabinet.settings.period, lambda arm=arm: self._send(arm, 0.0, tick))  # type: ignore[misc]
+        try:
+            while not until(now):
+                rest = max(self._queue[0][0] - (time.monotonic() - self._began), 0.0)
+                select.select(list(self._sockets.values()), (), (), rest)
+                now = time.monotonic() - self._began
+                for arm in self._sockets:
+                    self._hear(arm, now)
+                if self._queue[0][0] <= now:  # one at a time: an answer that has come is heard before the next
+                    heapq.heappop(self._queue)[2]()
+        finally:
+            for opened in self._sockets.values():
+                opened.close()
+
+    def _at(self, t: float, act: Callable[[], None]) -> None:
+        self._serial += 1
+        heapq.heappush(self._queue, (t, self._serial, act))
+
+    def _send(self, arm: str, due: float, tick: Callable[[float], None]) -> None:
+        cabinet, opened, client = self.cabinets[arm], self._sockets[arm], self._clients[arm]
+        # A client is not to have less time because this process was late.
+        enough = self._sent_at.get(arm, -math.inf) + cabinet.settings.period
+        if not cabinet.is_answered and time.monotonic() - self._began < enough:
+            self._at(enough, lambda: self._send(arm, due, tick))
+            return
+        self.cell.advance(due)
+        if (gripper := self._grippers.get(arm)) is not None:
+            if gripper.output in cabinet.outputs:
+                self.cell.openings[arm] = min(max(float(cabinet.outputs[gripper.output]), 0.0), 1.0)
+            if gripper.input is not None:
+                cabinet.inputs[gripper.input] = self.cell.plant.gripper_openings()[arm]
+        datagram = write_monitoring(cabinet.send(due))
+        for late in self._ways(self._network.duplicate):
+            self._at(due + late, lambda: _sent(opened, datagram, client))
+        self._sent_at[arm] = now = time.monotonic() - self._began
+        # The period stays on its grid: messages of a moment in which this process was late follow one another sooner.
+        following = due + cabinet.settings.period if now - due < _LONGEST_STALL else now
+        self._at(following, lambda: self._send(arm, following, tick))
+        tick(due)
+
+    def _hear(self, arm: str, now: float) -> None:
+        while True:
+            try:
+                datagram, source = self._sockets[arm].recvfrom(LONGEST + 1)
+            except OSError:  # no more, or nobody is there yet
+                return
+            if source[:2] == self._clients[arm]:
+                for late in self._ways(0.0):
+                    self._at(now + late, partial(self.cabinets[arm].receive, datagram))
+
+    def _ways(self, duplicate: float) -> Iterable[float]:
+        """How late each copy of a datagram is [s]; none: it is lost."""
+        copies = 0 if self._random.random() < self._network.loss else 1 + (self._random.random() < duplicate)
+        return [float(self._random.uniform(0.0, self._network.jitter)) for _ in range(copies)]
+
+
+def _sent(opened: socket.socket, datagram: bytes, client: tuple[str, int]) -> None:
+    try:
+        opened.sendto(datagram, client)
+    except OSError:  # nobody is there yet
+        return
+
+
+def _opened(client: str) -> socket.socket:
+    opened = socket.socket(socket.AF_INET6 if ":" in client else socket.AF_INET, socket.SOCK_DGRAM)
+    opened.bind((client if client in ("127.0.0.1", "::1") else "", 0))
+    opened.setblocking(False)
+    return opened

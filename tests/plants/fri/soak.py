@@ -1,0 +1,200 @@
+"""Sessions that end in every way there is, one after the other: ``python -m tests.plants.fri.soak --sessions 1000``."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline.loop_clock import LoopClock
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
+from q2r2_control.plants.fri.cabinet import CabinetSettings, Trip
+from q2r2_control.plants.fri.wire import Safety, write_monitoring
+from q2r2_control.robot.robot import Robot
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import SIDES, Array, HandInputs, HandSample
+from tests.plants.fri.virtual_cabinets import VirtualCabinets
+
+ACCELERATION = 4.0  # of the reference [rad/s^2]
+_ALLOWANCE = 0.05  # after the braking time [s]
+_REST = 1e-4  # [rad/s]
+_ENDS = ("pendant", "safety stop", "loop freezes", "computer freezes", "garbage")
+_ASKED = {Trip.STOPPED, Trip.SAFETY}
+_MUTATED = 100  # datagrams with wrong bytes before a session ends so
+
+
+class PressingHands(ScriptedInput):
+    """Hands that go round circles, whose operator presses again a moment after an arm was paused."""
+
+    def __init__(self) -> None:
+        super().__init__("circle", frequency_hz=0.5)
+        self.pipeline: Pipeline | None = None
+        self._since = dict.fromkeys(SIDES, 0.0)
+
+    def poll(self, now: float) -> list[HandSample]:
+        return [replace(sample, inputs=self._buttons(sample.hand, now)) for sample in super().poll(now)]
+
+    def _buttons(self, hand: str, now: float) -> HandInputs:
+        assert self.pipeline is not None
+        if self.pipeline.teleop.engaged[hand]:
+            self._since[hand] = now
+        return HandInputs(button_lower=(now - self._since[hand]) % 0.3 > 0.2)
+
+
+class FreezingClock(LoopClock):
+    """Simulated time in which the loop now and then stands still."""
+
+    freeze = 0.0  # before the next tick [s]
+
+    def wait(self) -> float:
+        gap, self.freeze = self._period + self.freeze, 0.0
+        self.now += gap
+        return gap
+
+
+class FreezingLoop(Pipeline):
+    def make_clock(self, realtime: bool) -> LoopClock:
+        return FreezingClock(1.0 / self.config.loop_rate_hz, realtime)
+
+    def freeze(self, duration: float) -> None:
+        assert isinstance(self._clock, FreezingClock)
+        self._clock.freeze = duration
+
+
+def make_loop(
+    config: Config, periods: tuple[float, float] = (0.005, 0.002), start: Array | None = None, **network: Any
+) -> FreezingLoop:
+    """A loop whose reference leaves the cabinets' limits room for catching up; the arms ``start`` at home."""
+    changes = {"velocity_scale": 1.0 / (1.0 + CATCH_UP), "acceleration_limit": ACCELERATION}
+    config = config.model_copy(update={"control": config.control.model_copy(update=changes)})
+    robot = Robot.from_config(config)
+    settings = {}
+    for (arm, its), period in zip(robot.arms.items(), periods, strict=True):
+        fastest = robot.velocity_limit[its.joints]
+        settings[arm] = CabinetSettings(
+            lower=tuple(robot.model.lowerPositionLimit[its.joints]),
+            upper=tuple(robot.model.upperPositionLimit[its.joints]),
+            velocity=tuple(fastest),
+            acceleration=tuple((1.0 + CATCH_UP) ** 2 * ACCELERATION + CATCH_UP_RAMP * fastest),
+            torque=(20.0,) * 7,
+            period=period,
+        )
+    hands = PressingHands()
+    plant = VirtualCabinets(
+        robot, settings, robot.home if start is None else start, 1.0 / config.loop_rate_hz, **network
+    )
+    hands.pipeline = made = FreezingLoop(config, robot, hands, plant)
+    return made
+
+
+@dataclass
+class Soak:
+    """Starts both overlays, lets the arms move for a while, and ends the session in some way."""
+
+    pipeline: FreezingLoop
+    sessions: int
+    seed: int = 0
+    ended: int = 0
+    moved: float = 0.0  # the fastest joint [rad/s]
+    faults: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        assert isinstance(self.pipeline.plant, VirtualCabinets)
+        self.plant, self.random = self.pipeline.plant, np.random.default_rng(self.seed)
+        self._moving_since: float | None = None
+        self._lasts = 0.3
+        self._rest_by, self._start_at = math.inf, 0.0
+        self._seen, self._end = dict.fromkeys(SIDES, 0), "start"
+        self.pipeline.listeners.append(self.look)
+
+    def run(self) -> Soak:
+        self.pipeline.run(realtime=False)
+        return self
+
+    def look(self, tick: Tick) -> None:
+        """Of each tick of the loop."""
+        cabinets, now = self.plant.cabinets, tick.now
+        for arm, cabinet in cabinets.items():
+            for trip in cabinet.trips[self._seen[arm] :]:
+                if trip not in _ASKED and not (trip is Trip.LATE and self._end == "computer freezes"):
+                    self.faults.append(f"{now:.3f} s, {self._end}: {arm}: {trip}")
+            self._seen[arm] = len(cabinet.trips)
+        speed = float(np.abs(tick.reference.v).max())
+        self.moved = max(self.moved, speed)
+        if now > self._rest_by:
+            self._rest_by = math.inf
+            for arm, heard in self.plant.heard.items() if not any(tick.engaged.values()) else ():
+                way = np.diff(heard[-3:], axis=0)
+                fastest = np.abs(way[np.isfinite(way)]).max(initial=0.0) / cabinets[arm].settings.period
+                if fastest > _REST:
+                    moves = f"{arm} moves at {fastest:.4f} rad/s after the time to brake"
+                    self.faults.append(f"{now:.3f} s, {self._end}: {moves}")
+            self._start_at = now + float(self.random.uniform(0.05, 0.3))
+        if now >= self._start_at:
+            self._start_at, self._moving_since = math.inf, None
+            for cabinet in cabinets.values():
+                cabinet.safety_stop(Safety.NORMAL)
+                cabinet.start_overlay()
+        if all(tick.engaged.values()) and self._moving_since is None and self._rest_by == math.inf:
+            self._moving_since, self._lasts = now, float(self.random.uniform(0.2, 1.2))
+        if self._moving_since is not None and now - self._moving_since >= self._lasts:
+            self._moving_since = None
+            self._end_session(now, tick)
+
+    def _end_session(self, now: float, tick: Tick) -> None:
+        self.ended += 1
+        if self.ended >= self.sessions:
+            self.pipeline.stop()
+        self._end = str(self.random.choice(_ENDS))
+        cabinet = self.plant.cabinets[str(self.random.choice(SIDES))]
+        pause = float(self.random.uniform(0.02, 0.5))
+        if self._end == "pendant":
+            cabinet.stop()
+        elif self._end == "safety stop":
+            cabinet.safety_stop(Safety.STOP_1_ON_PATH)
+        elif self._end == "loop freezes":
+            self.pipeline.freeze(pause)
+            now += pause
+        elif self._end == "computer freezes":
+            self.pipeline.freeze(pause)
+            self.plant.asleep_until = now + pause
+            now += pause
+        else:
+            self._send_garbage()
+            cabinet.stop()
+        braking = np.abs(tick.reference.v) / self.pipeline.controller.stop_deceleration
+        self._rest_by = now + float(braking.max()) + _ALLOWANCE
+
+    def _send_garbage(self) -> None:
+        """Some bytes of each datagram are wrong, or missing."""
+        for arm, cabinet in self.plant.cabinets.items():
+            whole = write_monitoring(cabinet.message)
+            for _ in range(_MUTATED):
+                wrong = bytearray(whole[: self.random.integers(0, len(whole) + 1)])
+                for place in self.random.integers(0, max(len(wrong), 1), 3) if wrong else ():
+                    wrong[place] = self.random.integers(0, 256)
+                if wrong != whole:
+                    self.plant.cell.answer(arm, bytes(wrong), self.plant.now)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sessions", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    pipeline = make_loop(load_config("config/dual_iiwa7.yaml"), jitter=0.0004, drift=200e-6)
+    soak = Soak(pipeline, given.sessions, given.seed)
+    soak.run()
+    print(f"{soak.ended} sessions, fastest joint {soak.moved:.2f} rad/s, {len(soak.faults)} faults")
+    print("\n".join(soak.faults[:20]))
+    raise SystemExit(1 if soak.faults else 0)
+
+
+if __name__ == "__main__":
+    main()

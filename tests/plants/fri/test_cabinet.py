@@ -1,0 +1,145 @@
+"""The stand-in for a cabinet, with a client that is written out here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm, Trip
+from q2r2_control.plants.fri.wire import (
+    Command,
+    CommandKind,
+    Joints,
+    Monitoring,
+    Quality,
+    Safety,
+    Session,
+    write_command,
+)
+
+HOME = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
+SETTINGS = CabinetSettings(
+    lower=(-2.0,) * 7, upper=(2.0,) * 7, velocity=(1.7,) * 7, acceleration=(10.0,) * 7, torque=(20.0,) * 7
+)
+Answer = Callable[[Monitoring], Command | None]
+
+
+class Client:
+    """Mirrors the cabinet's position, as a client has to before it may command."""
+
+    def __init__(self, version: int = 2) -> None:
+        self.version, self.counter = version, -1
+
+    def answer(self, message: Monitoring, q: Joints | None = None, tau: Joints | None = None) -> Command:
+        self.counter += 1
+        return Command(self.counter, message.counter, q or message.ipo_q or message.q, tau)
+
+
+def run(cabinet: Cabinet, periods: int, answer: Answer, version: int = 2) -> Monitoring:
+    """The message after ``periods`` of them, each of which was answered."""
+    for period in range(periods):
+        message = cabinet.send(period * cabinet.settings.period)
+        if (command := answer(message)) is not None:
+            cabinet.receive(write_command(command, version))
+    return cabinet.send(periods * cabinet.settings.period)
+
+
+def commanding(settings: CabinetSettings = SETTINGS) -> tuple[Cabinet, Client]:
+    """A cabinet that has given its command to a client."""
+    cabinet, client = Cabinet(settings, StillArm(HOME)), Client(settings.version)
+    cabinet.start_overlay()
+    run(cabinet, 60 * settings.multiplier, client.answer, settings.version)
+    assert cabinet.session is Session.COMMANDING_ACTIVE
+    return cabinet, client
+
+
+def test_a_client_that_answers_in_time_comes_from_waiting_to_monitoring_and_by_the_overlay_to_commanding() -> None:
+    cabinet, client = Cabinet(SETTINGS, StillArm(HOME)), Client()
+    seen: list[Session] = []
+    for period in range(200):
+        if period == 100:
+            cabinet.start_overlay()
+        message = cabinet.send(0.0)
+        if message.session not in seen[-1:]:
+            seen.append(message.session)
+            assert (message.ipo_q is not None) == (message.session >= Session.COMMANDING_WAIT)
+        cabinet.receive(write_command(client.answer(message), 2))
+    assert seen == list(Session)[1:]
+    assert cabinet.quality is Quality.EXCELLENT
+
+
+def test_a_client_that_answers_every_other_message_is_not_let_command() -> None:
+    cabinet, client = Cabinet(SETTINGS, StillArm(HOME)), Client()
+    cabinet.start_overlay()
+    message = run(cabinet, 300, lambda message: client.answer(message) if message.counter % 2 else None)
+    assert (message.session, message.quality) == (Session.MONITORING_WAIT, Quality.FAIR)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("multiplier", [1, 3])
+def test_the_arm_goes_where_the_client_commands(version: int, multiplier: int) -> None:
+    settings = replace(SETTINGS, version=version, multiplier=multiplier, period=0.002)
+    cabinet, client = commanding(settings)
+    period = settings.answer_period
+
+    def swing(message: Monitoring) -> Command | None:
+        if message.counter % multiplier:
+            return None
+        t = (message.counter // multiplier) * period - begin
+        return client.answer(message, (HOME[0] + 0.2 * (1.0 - math.cos(t)), *HOME[1:]))
+
+    begin = math.ceil((cabinet._sent + 1) / multiplier) * period
+    message = run(cabinet, 600, swing, version)
+    assert cabinet.trips == []
+    assert message.q[0] > HOME[0] + 0.01
+
+
+def moved(by: float) -> Joints:
+    return (HOME[0] + by, *HOME[1:])
+
+
+TORQUE = replace(SETTINGS, command=CommandKind.TORQUE)
+GUARDS: dict[Trip, tuple[CabinetSettings, Callable[[Client, Monitoring], Command | None]]] = {
+    Trip.VELOCITY: (replace(SETTINGS, acceleration=(1e4,) * 7), lambda c, m: c.answer(m, moved(0.01))),
+    Trip.ACCELERATION: (SETTINGS, lambda c, m: c.answer(m, moved(0.001))),
+    Trip.POSITION: (replace(SETTINGS, upper=moved(1e-4)), lambda c, m: c.answer(m, moved(2e-4))),
+    Trip.NO_POSITION: (SETTINGS, lambda c, m: Command(c.answer(m).counter, m.counter)),
+    Trip.NO_TORQUE: (TORQUE, lambda c, m: c.answer(m)),
+    Trip.TORQUE: (TORQUE, lambda c, m: c.answer(m, tau=(21.0,) * 7)),
+    Trip.LATE: (SETTINGS, lambda c, m: None),
+}
+
+
+@pytest.mark.parametrize("trip", list(GUARDS), ids=lambda trip: trip.name)
+def test_an_answer_that_no_cabinet_would_follow_ends_the_command_and_the_arm_holds(trip: Trip) -> None:
+    settings, answer = GUARDS[trip]
+    kept = replace(settings, command=CommandKind.POSITION)
+    cabinet, client = commanding(kept)
+    cabinet.settings = settings
+    message = run(cabinet, 20, lambda message: answer(client, message))
+    assert cabinet.trips == [trip]
+    assert message.session <= Session.MONITORING_READY
+    assert message.q == HOME
+
+
+def test_other_bytes_and_another_version_end_the_command_and_a_late_answer_counts_as_none() -> None:
+    for datagram, trip in ((b"hello", Trip.MALFORMED), (write_command(Command(1, 1, q=HOME), 1), Trip.VERSION)):
+        cabinet, _ = commanding()
+        cabinet.receive(datagram)
+        assert cabinet.trips == [trip]
+    cabinet, client = commanding()
+    run(cabinet, 20, lambda message: client.answer(replace(message, counter=message.counter - 1)))
+    assert cabinet.trips == [Trip.LATE]
+
+
+def test_after_a_stop_the_overlay_has_to_be_started_again_and_the_safety_stop_be_over() -> None:
+    cabinet, client = commanding()
+    cabinet.safety_stop(Safety.STOP_2)
+    cabinet.start_overlay()
+    assert run(cabinet, 100, client.answer).session is Session.MONITORING_READY
+    cabinet.safety_stop(Safety.NORMAL)
+    assert run(cabinet, 100, client.answer).session is Session.COMMANDING_ACTIVE
+    assert cabinet.trips == [Trip.SAFETY]

@@ -1,0 +1,124 @@
+"""The whole loop against two cabinets in virtual time: what each cabinet hears, whatever happens."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control.config.cell import Config
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.events import ReasonKind
+from q2r2_control.plants.fri.answers import ReferencePath
+from q2r2_control.plants.fri.cabinet import Trip
+from q2r2_control.plants.fri.wire import Session
+from q2r2_control.robot.robot import Robot
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import SIDES
+from tests.plants.fri.soak import FreezingLoop, Soak, make_loop
+from tests.plants.fri.virtual_cabinets import VirtualCabinets
+
+
+def started(pipeline: FreezingLoop) -> VirtualCabinets:
+    """The operator has started the overlay on both pendants."""
+    assert isinstance(pipeline.plant, VirtualCabinets)
+    for cabinet in pipeline.plant.cabinets.values():
+        cabinet.start_overlay()
+    return pipeline.plant
+
+
+def trips(plant: VirtualCabinets) -> list[Trip]:
+    return [trip for cabinet in plant.cabinets.values() for trip in cabinet.trips]
+
+
+def test_a_run_waits_for_the_cabinets_and_refuses_presses_until_then(config: Config) -> None:
+    pipeline = make_loop(config)
+    events = pipeline.run(1.0, realtime=False).events
+    assert {event.reason.root.kind for event in events} == {ReasonKind.FRI_SESSION}
+    assert {event.kind for event in events} == {ReasonKind.NOT_ENGAGED}
+
+
+def test_both_arms_follow_the_hands_through_their_cabinets(config: Config) -> None:
+    pipeline = make_loop(config)
+    plant = started(pipeline)
+    summary = pipeline.run(4.0, realtime=False)
+    assert trips(plant) == []
+    for arm in SIDES:
+        assert plant.cabinets[arm].session is Session.COMMANDING_ACTIVE
+        figures = summary.arms[arm]
+        assert figures.engaged_s > 3.0
+        assert figures.position_error_mm_rms is not None
+        assert figures.position_error_mm_rms < 6.0
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        pytest.param({"drift": 200e-6, "jitter": 0.0005}, id="drift"),
+        pytest.param({"drift": -200e-6, "jitter": 0.0005, "loss": 0.005}, id="loss"),
+    ],
+)
+def test_no_guard_trips_through_a_bad_network(config: Config, network: dict[str, Any]) -> None:
+    pipeline = make_loop(config, (0.005, 0.002), **network)
+    plant = started(pipeline)
+    summary = pipeline.run(4.0, realtime=False)
+    assert trips(plant) == []
+    assert all(summary.arms[arm].engaged_s > 3.0 for arm in SIDES)
+
+
+def test_a_loop_that_is_late_brakes_on_the_stop_that_the_cabinets_get(config: Config) -> None:
+    pipeline = make_loop(config)
+    plant = started(pipeline)
+
+    def freeze(tick: Tick) -> None:
+        pipeline.freeze(0.02 if round(1e3 * tick.now) % 100 == 0 else 0.0)
+
+    pipeline.listeners.append(freeze)
+    summary = pipeline.run(4.0, realtime=False)
+    assert trips(plant) == []
+    assert all(summary.arms[arm].engaged_s > 3.0 for arm in SIDES), "and the arms go on"
+
+
+def test_the_reference_brakes_as_the_path_does(robot: Robot) -> None:
+    controller = CartesianController(robot)
+    target = controller.tool_pose("left")
+    target.translation = target.translation + np.array([0.1, 0.1, 0.1])
+    for _ in range(300):
+        reference = controller.step({"left": target}, 0.001)
+    assert np.abs(reference.v).max() > 0.2
+    path = ReferencePath(0.0, reference.q)
+    path.extend(0.001, reference.q, reference.v, controller.stop_deceleration)
+    before = 0.001
+    for t in (0.005, 0.05, 0.4):
+        controller.brake(t - before)
+        before = t
+        np.testing.assert_allclose(controller.step({}, 1e-9).q, path.at(t), atol=1e-7)
+
+
+def test_sessions_end_in_every_way_without_a_jump_and_begin_again(config: Config) -> None:
+    soak = Soak(make_loop(config, jitter=0.0004, drift=200e-6), sessions=6, seed=1).run()
+    assert soak.ended == 6
+    assert soak.moved > 0.3
+    assert soak.faults == []
+
+
+def test_the_first_command_of_a_session_is_where_the_cabinet_holds_its_arm(config: Config) -> None:
+    pipeline = make_loop(config)
+    plant = started(pipeline)
+    assert pipeline.run(0.6, realtime=False).at_rest
+    for arm in SIDES:
+        home = pipeline.robot.home[pipeline.robot.arms[arm].joints]
+        np.testing.assert_allclose(plant.heard[arm][0], home, atol=1e-6)
+
+
+def test_an_arm_that_stands_beyond_its_margin_is_led_back(config: Config, robot: Robot) -> None:
+    margin, start = config.control.position_margin, robot.home.copy()
+    joint = int(robot.arms["left"].joints[6])
+    start[joint] = robot.position_upper[joint] - 0.3 * margin
+    pipeline = make_loop(config, start=start)
+    plant = started(pipeline)
+    pipeline.run(0.6, realtime=False)
+    assert trips(plant) == []
+    assert plant.heard["left"][0][6] == pytest.approx(start[joint], abs=1e-4)
+    assert plant.heard["left"][-1][6] <= robot.position_upper[joint] - margin + 1e-4

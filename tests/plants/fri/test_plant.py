@@ -1,0 +1,120 @@
+"""The plant on real sockets, with a cabinet that sends its next message when the answer to the last one has come."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+import numpy as np
+import pytest
+
+from q2r2_control.config.cell import Config
+from q2r2_control.config.fri import CabinetConfig
+from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.plants.fri.cabinet import Cabinet, StillArm
+from q2r2_control.plants.fri.cabinet_server import settings_of
+from q2r2_control.plants.fri.plant import FriPlant
+from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import SIDES
+
+PATIENCE = 30.0  # [s]
+
+
+def free_ports(count: int) -> list[int]:
+    opened = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    for one in opened:
+        one.bind(("127.0.0.1", 0))
+    ports = [one.getsockname()[1] for one in opened]
+    for one in opened:
+        one.close()
+    return ports
+
+
+@pytest.fixture
+def fri_config(config: Config) -> Config:
+    ports = free_ports(2)
+    cabinets = {arm: CabinetConfig(port=port) for arm, port in zip(SIDES, ports, strict=True)}
+    return config.model_copy(update={"fri": cabinets})
+
+
+@contextmanager
+def cabinets(robot: Robot, config: Config, version: int) -> Iterator[dict[str, Cabinet]]:
+    """One for each arm, in a thread; each has started its overlay."""
+    made, done = {}, threading.Event()
+    for arm in SIDES:
+        settings = settings_of(robot, arm, CommandKind.POSITION, version, 0.005)
+        made[arm] = Cabinet(settings, StillArm(tuple(robot.home[robot.arms[arm].joints])))
+        made[arm].start_overlay()
+
+    def serve(cabinet: Cabinet, port: int) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+            opened.bind(("127.0.0.1", 0))
+            opened.settimeout(0.02)
+            while not done.is_set():
+                opened.sendto(write_monitoring(cabinet.send(0.0)), ("127.0.0.1", port))
+                with suppress(OSError):
+                    cabinet.receive(opened.recv(2000))
+
+    threads = [threading.Thread(target=serve, args=(made[arm], its.port)) for arm, its in config.fri.items()]
+    for thread in threads:
+        thread.start()
+    try:
+        yield made
+    finally:
+        done.set()
+        for thread in threads:
+            thread.join()
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_sessions_of_both_cabinets_come_to_commanding_where_the_arms_are_held(
+    robot: Robot, fri_config: Config, version: int
+) -> None:
+    plant = FriPlant.from_config(robot, fri_config)
+    with cabinets(robot, fri_config, version) as made:
+        plant.reset()
+        try:
+            waited = threading.Event()
+            for _ in range(int(PATIENCE / 0.01)):
+                if all(cabinet.session is Session.COMMANDING_ACTIVE for cabinet in made.values()):
+                    break
+                waited.wait(0.01)
+            assert all(cabinet.session is Session.COMMANDING_ACTIVE for cabinet in made.values())
+            state = plant.state()
+        finally:
+            plant.close()
+    np.testing.assert_allclose(state.q, robot.home)
+    assert state.held is not None
+    np.testing.assert_allclose(state.held, robot.home)
+
+
+def test_without_a_cabinet_the_run_says_which_one_and_where(robot: Robot, fri_config: Config, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr("q2r2_control.plants.fri.plant._WAIT", 0.1)
+    plant = FriPlant.from_config(robot, fri_config)
+    port = fri_config.fri["left"].port
+    with pytest.raises(PlantError, match=f"left: no FRI message from cabinet 127.0.0.1 on port {port}"):
+        plant.reset()
+
+
+def test_a_port_that_is_taken_is_named(robot: Robot, fri_config: Config) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", fri_config.fri["right"].port))
+        with pytest.raises(PlantError, match=r"fri\.right\.port = \d+: cannot be bound"):
+            FriPlant.from_config(robot, fri_config).reset()
+
+
+def test_an_arm_without_a_cabinet_is_named(robot: Robot, config: Config) -> None:
+    with pytest.raises(ConfigError, match=r"fri\.left: missing"):
+        FriPlant.from_config(robot, config)
+
+
+def test_simulated_time_is_refused(robot: Robot, fri_config: Config) -> None:
+    from q2r2_control.inputs.scripted import ScriptedInput
+    from q2r2_control.pipeline.pipeline import Pipeline
+
+    pipeline = Pipeline(fri_config, robot, ScriptedInput("circle"), FriPlant.from_config(robot, fri_config))
+    with pytest.raises(ConfigError, match="simulated time"):
+        pipeline.run(1.0, realtime=False)

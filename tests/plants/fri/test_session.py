@@ -1,0 +1,153 @@
+"""One cabinet's session: what is answered, and what is not believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from q2r2_control.events import ReasonKind
+from q2r2_control.plants.fri.session import ArmSession
+from q2r2_control.plants.fri.wire import (
+    Command,
+    CommandKind,
+    Monitoring,
+    Quality,
+    Session,
+    read_command,
+    write_monitoring,
+)
+
+Q = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
+IPO = (0.0, 0.501, 0.0, -1.2, 0.0, 1.0, 0.0)
+MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.005, 1, Q)
+WAITING = replace(MONITORING, session=Session.COMMANDING_WAIT, command=CommandKind.POSITION, ipo_q=IPO)
+ACTIVE = replace(WAITING, session=Session.COMMANDING_ACTIVE)
+
+
+class Cabinet:
+    """Sends messages 5 ms apart to a session, and reads the answers."""
+
+    def __init__(self, session: ArmSession | None = None) -> None:
+        self.session, self.sent = session or ArmSession("left", "cabinet"), 0
+
+    @property
+    def now(self) -> float:
+        return 0.005 * self.sent
+
+    def ask(self, message: Monitoring) -> Command | None:
+        self.sent += 1
+        answer = self.session.answer(write_monitoring(replace(message, counter=self.sent)), self.now)
+        return None if answer is None else read_command(answer)[1]
+
+
+def test_an_idle_cabinet_gets_no_answer_and_one_that_monitors_gets_no_position() -> None:
+    cabinet = Cabinet()
+    assert cabinet.ask(replace(MONITORING, session=Session.IDLE)) is None
+    assert cabinet.ask(MONITORING) == Command(0, 2)
+
+
+def test_fri_1_gets_the_commanded_position_mirrored() -> None:
+    cabinet = Cabinet()
+    answer = cabinet.ask(replace(MONITORING, version=1, commanded_q=IPO))
+    assert answer is not None
+    assert answer.q == IPO
+
+
+@pytest.mark.parametrize("message", [WAITING, ACTIVE])
+def test_the_first_command_is_the_cabinets_own_position(message: Monitoring) -> None:
+    cabinet = Cabinet()
+    cabinet.ask(MONITORING)
+    answer = cabinet.ask(message)
+    assert answer is not None
+    assert answer.q == pytest.approx(IPO, abs=1e-15)
+
+
+def test_every_multiplier_th_message_is_answered() -> None:
+    cabinet = Cabinet()
+    answers = [cabinet.ask(replace(MONITORING, multiplier=3)) for _ in range(6)]
+    assert [answer is None for answer in answers] == [True, True, False, True, True, False]
+
+
+def test_torque_without_a_newer_one_ends() -> None:
+    cabinet = Cabinet()
+    cabinet.session.wanted = CommandKind.TORQUE
+    active = replace(ACTIVE, command=CommandKind.TORQUE)
+    for message in (replace(WAITING, command=CommandKind.TORQUE), active):
+        answer = cabinet.ask(message)
+        assert answer is not None
+        assert answer.tau == (0.0,) * 7
+    cabinet.session.following, cabinet.session.tau, cabinet.session.tau_came = True, (1.0,) * 7, cabinet.now
+    torques = [answer.tau for answer in (cabinet.ask(active) for _ in range(6)) if answer is not None]
+    assert torques == [(1.0,) * 7] * 4 + [(0.0,) * 7] * 2
+
+
+def test_a_drop_is_told_and_the_arm_follows_no_more() -> None:
+    cabinet = Cabinet()
+    cabinet.ask(WAITING)
+    cabinet.ask(ACTIVE)
+    cabinet.session.following = True
+    assert cabinet.session.fault(cabinet.now) is None
+    cabinet.ask(MONITORING)
+    assert cabinet.session.dropped
+    assert not cabinet.session.following
+    fault = cabinet.session.fault(cabinet.now)
+    assert fault is not None
+    assert fault.kind is ReasonKind.FRI_SESSION
+    assert fault.detail["session"] == "monitoring ready"
+
+
+def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> None:
+    cabinet = Cabinet()
+    kinds = []
+    for now in (0.0, 0.3):
+        fault = cabinet.session.fault(now)
+        kinds.append(None if fault is None else fault.kind)
+        cabinet.ask(replace(ACTIVE, command=CommandKind.TORQUE))
+    fault = cabinet.session.fault(cabinet.now)
+    assert kinds == [ReasonKind.FRI_SILENT, ReasonKind.FRI_SILENT]
+    assert fault is not None
+    assert fault.kind is ReasonKind.FRI_COMMAND_MODE
+
+
+def test_an_older_message_is_not_answered_and_lost_ones_are_counted() -> None:
+    cabinet = Cabinet()
+    for _ in range(3):
+        cabinet.ask(MONITORING)
+    cabinet.sent = 0
+    assert cabinet.ask(MONITORING) is None
+    cabinet.sent = 6
+    assert cabinet.ask(MONITORING) is not None
+    assert cabinet.session.lost == 3
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        pytest.param(write_monitoring(MONITORING)[:-1], id="cut"),
+        pytest.param(write_monitoring(replace(MONITORING, counter=400)), id="counter far ahead"),
+        pytest.param(write_monitoring(replace(MONITORING, counter=2, version=1)), id="other version"),
+        pytest.param(write_monitoring(replace(MONITORING, counter=2, period=0.0)), id="no period"),
+        pytest.param(b"", id="empty"),
+    ],
+)
+def test_a_message_that_cannot_be_the_cabinets_changes_nothing(wrong: bytes) -> None:
+    cabinet = Cabinet()
+    cabinet.ask(MONITORING)
+    before = cabinet.session.newest
+    assert cabinet.session.answer(wrong, cabinet.now + 0.005) is None
+    assert cabinet.session.newest is before
+    assert cabinet.session.unreadable == 1
+
+
+def test_a_hundred_thousand_wrong_datagrams_raise_nothing() -> None:
+    random = np.random.default_rng(0)
+    session = ArmSession("left", "cabinet")
+    whole = [write_monitoring(replace(message, version=version)) for message in (WAITING, ACTIVE) for version in (1, 2)]
+    for index in range(100_000):
+        wrong = bytearray(whole[index % 4])
+        for place in random.integers(0, len(wrong), 1 + index % 3):
+            wrong[place] = random.integers(0, 256)
+        session.answer(bytes(wrong[: None if index % 5 else random.integers(0, len(wrong))]), 1e-3 * index)
+    assert session.unreadable > 50_000

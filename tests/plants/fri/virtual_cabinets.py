@@ -1,0 +1,115 @@
+"""Cabinets that stand in for KUKA's, in the virtual time of a loop: drift, jitter, loss, and a pendant."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+
+import numpy as np
+
+from q2r2_control.events import Reason
+from q2r2_control.plants.base import check_command
+from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
+from q2r2_control.plants.fri.cell import FriCell
+from q2r2_control.plants.fri.session import ArmSession
+from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Command, CommandMode, RobotState
+
+_KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
+
+
+class VirtualCabinets:
+    """A plant. Every message and every answer takes its time, and some are lost."""
+
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
+    realtime_only = False
+
+    def __init__(
+        self,
+        robot: Robot,
+        settings: dict[str, CabinetSettings],
+        start: Array,
+        period: float,
+        *,
+        drift: float = 0.0,
+        jitter: float = 0.0,
+        loss: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        """``period`` of the loop, cabinets' clocks ``drift`` apart, up to ``jitter`` late [s]."""
+        self._robot, self._period, self._random = robot, period, np.random.default_rng(seed)
+        self._jitter, self._loss = jitter, loss
+        self.cabinets = {
+            arm: Cabinet(its, StillArm(tuple(start[robot.arms[arm].joints]))) for arm, its in settings.items()
+        }
+        rates = np.linspace(1.0 - 0.5 * drift, 1.0 + 0.5 * drift, len(settings))
+        self._rates = dict(zip(settings, rates, strict=True))
+        self.on_message: Callable[[str, float], None] = lambda arm, t: None
+        self.asleep_until = -1.0  # nothing of this computer's is done before [s]
+        self._mode = CommandMode.POSITION
+
+    def begin(self, mode: CommandMode) -> None:
+        self._mode = mode
+
+    def reset(self, q: Array | None = None) -> None:
+        sessions = {arm: ArmSession(arm, "cabinet", None) for arm in self.cabinets}
+        for session in sessions.values():
+            session.wanted = _KINDS[self._mode]
+        self.cell = FriCell(self._robot, sessions, self._period)
+        self.now, self._serial = -0.1, 0  # the loop begins at 0
+        self._events: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
+        self.heard: dict[str, list[Array]] = {arm: [] for arm in self.cabinets}  # positions that a cabinet follows
+        for arm in self.cabinets:
+            self._at(self.now, self._send, arm)
+        self.due(0.0)
+
+    def due(self, now: float) -> tuple[float, float]:
+        while self._events and self._events[0][0] <= now:
+            self.now, _, act, arguments = heapq.heappop(self._events)
+            act(*arguments)
+        self.now = now
+        return self.cell.due(now)
+
+    def fault(self) -> Reason | None:
+        return self.cell.fault()
+
+    def apply(self, command: Command) -> None:
+        check_command(command, self._robot, self.modes)
+        self.cell.apply(command)
+
+    def advance(self, dt: float) -> None:
+        """Time passes by itself, until the next tick."""
+
+    def state(self) -> RobotState:
+        return self.cell.state()
+
+    def gripper_openings(self) -> dict[str, float]:
+        return {}
+
+    def close(self) -> None:
+        pass
+
+    def _at(self, t: float, act: Callable[..., None], *arguments: object) -> None:
+        self._serial += 1
+        heapq.heappush(self._events, (t, self._serial, act, arguments))
+
+    def _late(self) -> float:
+        return float(self._random.uniform(1e-4, 1e-4 + self._jitter))
+
+    def _send(self, arm: str) -> None:
+        cabinet = self.cabinets[arm]
+        self.on_message(arm, self.now)
+        message = cabinet.send(self.now)
+        if cabinet.session is Session.COMMANDING_ACTIVE:
+            self.heard[arm].append(np.array(message.ipo_q))
+        elif self.heard[arm] and self.heard[arm][-1] is not None:
+            self.heard[arm].append(np.full(7, np.nan))
+        self._at(self.now + cabinet.settings.period * self._rates[arm], self._send, arm)
+        if self._random.random() >= self._loss:
+            self._at(max(self.now + self._late(), self.asleep_until), self._receive, arm, write_monitoring(message))
+
+    def _receive(self, arm: str, datagram: bytes) -> None:
+        answer = self.cell.answer(arm, datagram, self.now)
+        if answer is not None and self._random.random() >= self._loss:
+            self._at(self.now + self._late(), self.cabinets[arm].receive, answer)
