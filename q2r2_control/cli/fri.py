@@ -21,7 +21,7 @@ from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
 from q2r2_control.plants.fri.wire import CommandKind, Session
-from q2r2_control.process.scheduling import StopRequest, stop_on_signals
+from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
@@ -65,7 +65,7 @@ class _Pendant:
 def fri_cabinet(
     config: ConfigFile,
     mode: Annotated[CommandMode, Option(help="What the application lets a client command.")] = CommandMode.POSITION,
-    period: Annotated[float, Option(min=1, max=10, help="Between two messages [ms].")] = 5.0,
+    period: Annotated[float, Option(min=1, max=10, help="Between two messages [ms].")] = 10.0,
     right_period: Annotated[float | None, Option(min=1, max=10, help="Of the right arm's cabinet [ms].")] = None,
     fri: Annotated[int, Option(min=1, max=2, help="Version of FRI.")] = 2,
     start_after: Annotated[float, Option(min=0, help="An overlay is started after so long with a client [s].")] = 0.5,
@@ -111,7 +111,7 @@ def fri_cabinet(
             last = now
 
     began = time.monotonic()
-    with stop_on_signals(stop.ask):
+    with stop_on_signals(stop.ask), few_garbage_collections():
         server.run(lambda now: stop.asked or (longest is not None and now >= longest), look)
     data: dict[str, Any] = {"seconds": time.monotonic() - began, "cabinets": {}}
     rows = []
@@ -136,8 +136,6 @@ def rehearsal(config: str, mode: CommandMode, tasks: Sequence[AssemblyTask]) -> 
         config,
         "--mode",
         mode,
-        "--period",
-        "10",
         "--json",
         *(word for task in tasks for word in ("--task", task.name)),
     ]

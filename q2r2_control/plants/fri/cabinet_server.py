@@ -18,7 +18,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings
-from q2r2_control.plants.fri.wire import JOINTS, LONGEST, CommandKind, Joints, write_monitoring
+from q2r2_control.plants.fri.wire import JOINTS, LONGEST, CommandKind, Joints, Session, write_monitoring
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
@@ -170,9 +170,10 @@ class CabinetServer:
 
     def _send(self, arm: str, due: float, tick: Callable[[float], None]) -> None:
         cabinet, opened, client = self.cabinets[arm], self._sockets[arm], self._clients[arm]
-        # A client is not to have less time because this process was late.
+        # A client that commands is not to have less time because this process was late.
+        commands = cabinet.session >= Session.COMMANDING_WAIT
         enough = self._sent_at.get(arm, -math.inf) + cabinet.settings.period
-        if not cabinet.is_answered and time.monotonic() - self._began < enough:
+        if commands and not cabinet.is_answered and time.monotonic() - self._began < enough:
             self._at(enough, lambda: self._send(arm, due, tick))
             return
         self.cell.advance(due)
@@ -186,7 +187,7 @@ class CabinetServer:
             self._at(due + late, lambda: _sent(opened, datagram, client))
         self._sent_at[arm] = now = time.monotonic() - self._began
         # The period stays on its grid: messages of a moment in which this process was late follow one another sooner.
-        following = due + cabinet.settings.period if now - due < _LONGEST_STALL else now
+        following = max(due + cabinet.settings.period, now - (_LONGEST_STALL if commands else 0.0))
         self._at(following, lambda: self._send(arm, following, tick))
         tick(due)
 
