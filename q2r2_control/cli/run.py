@@ -100,7 +100,10 @@ def run(
 
 def demo(
     tasks: Annotated[list[str] | None, Argument(metavar=_TASKS, help=f"By default handover stack. {_ABOUT}.")] = None,
-    mode: Annotated[CommandMode, Option(help="What the arms get; torque: arms that yield.")] = CommandMode.TORQUE,
+    mode: Annotated[
+        CommandMode | None,
+        Option(help="What the arms get; by default torque, for arms that yield, and position by FRI."),
+    ] = None,
     plant: Annotated[str, Option(metavar="[mujoco|fri]", help="fri: through two KUKA cabinets that are simulated.")] = (
         "mujoco"
     ),
@@ -122,6 +125,7 @@ def demo(
     _check_times(fast, rt)
     if plant not in ("mujoco", "fri"):
         raise ConfigError(f"--plant {plant!r:.40}: allowed: mujoco, fri")
+    mode = mode or (CommandMode.POSITION if plant == "fri" else CommandMode.TORQUE)
     chosen = tasks_named(tasks or ("handover", "stack"))
     trajectory = "+".join(task.name for task in chosen)
     options = RunOptions(
