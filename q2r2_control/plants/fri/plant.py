@@ -34,13 +34,14 @@ _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: Comman
 class FriPlant:
     """The arms start where they stand, and again after each session that a cabinet ended."""
 
-    modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
+    # Torques are not among them: in the rehearsal the cabinets ended their sessions for torques beyond the limit.
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
     realtime_only = True
 
     def __init__(self, robot: Robot, config: Config) -> None:
         """Raises :class:`ConfigError` unless every arm has a cabinet and seven joints, or a port cannot be had."""
         for arm, its in robot.arms.items():
-            if arm not in [*config.fri]:
+            if arm not in set(config.fri):
                 raise ConfigError(f"fri.{arm}: missing; allowed: the cabinet of each arm, as {{port: 30200}}")
             if len(its.joints) != JOINTS:
                 raise ConfigError(f"fri.{arm}: the arm has {len(its.joints)} joints; allowed: {JOINTS}")
