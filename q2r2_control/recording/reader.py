@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import struct
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -185,13 +186,20 @@ class Recording:
             return None
 
     def _records(self, start: int = 0) -> Iterator[McapRecord]:
-        """All from the beginning, or from a record that starts at ``start``."""
+        """All from the beginning, or from a record that starts at ``start``.
+
+        Records that are written meanwhile are left out: a reader that is slower than the writer would never end.
+        """
         try:
             with self.file.open("rb") as stream:
+                size = os.fstat(stream.fileno()).st_size
                 stream.seek(start)
                 # Not wrapped, so that a file that changes meanwhile is not read twice.
                 reader = StreamReader(stream, start > 0, emit_chunks=True, record_size_limit=_LARGEST)
-                yield from reader.records
+                for record in reader.records:
+                    yield record
+                    if stream.tell() >= size:
+                        return
         except OSError as error:
             raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
 

@@ -13,8 +13,11 @@ from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event, Reason
 from q2r2_control.events import ReasonKind as K
 from q2r2_control.recording import messages
-from q2r2_control.recording.reader import recordings_in, spans_of
+from q2r2_control.recording.about import About
+from q2r2_control.recording.bag import BagWriter
+from q2r2_control.recording.reader import Recording, recordings_in, spans_of
 from q2r2_control.recording.tick_rows import numbers_in, tick_labels, tick_type
+from tests.recording.runs import pipeline
 
 BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
 SUCCEEDED, FAILED = K.EPISODE_SUCCEEDED, K.EPISODE_FAILED
@@ -74,6 +77,26 @@ def test_folders_are_searched_by_name_and_nothing_is_taken_twice(tmp_path: Path)
     for path, what in ((tmp_path / "empty", "no file .mcap in it"), (tmp_path / "missing", "no such file or folder")):
         with pytest.raises(RecordingError, match=f"{path.name}: {what}"):
             recordings_in([path])
+
+
+def test_a_reader_that_is_slower_than_the_writer_ends(tmp_path: Path) -> None:
+    """A verdict is made of a file that goes on growing; what is written meanwhile is for the next reading."""
+    about = About.of(pipeline(), realtime=True, notes={}, cameras=())
+    topic = messages.Topic(1, messages.STATE, messages.TEXT)
+    with BagWriter(tmp_path / "growing.mcap", [topic], about) as bag:
+
+        def write(number: int) -> None:
+            bag.write([messages.Message(1, number, about.epoch + number, 0, b"")])
+            bag.flush()
+
+        for number in range(3):
+            write(number)
+        found: list[int] = []
+        for several in Recording(tmp_path / "growing.mcap").messages():
+            found += [message.number for message in several]
+            assert len(found) <= 3
+            write(len(found) + 2)
+        assert found == [0, 1, 2]
 
 
 ARMS, NAMES = ("left", "right"), ("left_A1", "left_A2", "right_A1_with_a_longer_name")

@@ -29,7 +29,7 @@ _STREAMS: _Table = (
     ("engage_angle", "engage_angle", "and turned from it by no more [rad]", 0.0, 1.5),
 )
 _WATCH: _Table = (
-    ("timeout", "joint_state_timeout", "without joint states for this long the arms brake [s]", 0.01, 1.0),
+    ("timeout", "joint_state_timeout", "without joint states, or a tick, for this long the arms brake [s]", 0.01, 1.0),
     ("settle_time", "settle_time", "joint states have to be good and at rest before activation [s]", 0.02, 10.0),
     ("deviation", "max_deviation", "of a joint from its reference [rad]", 0.01, 3.0),
     ("deviation_time", "deviation_time", "for this long stops the arms [s]", 0.05, 10.0),

@@ -70,6 +70,7 @@ class CartesianControllerNode(ManagedNode):
         # A message with a bad number among good ones is another publisher's: no reason to bridge it.
         watch.unusable_time = 0.0
         make_watching_live(self, streams, watch, external)
+        self._watch = watch
         if isinstance(self._output.drive, TorqueDrive):
             make_impedance_live(self, self._output.drive.impedance)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
@@ -119,7 +120,7 @@ class CartesianControllerNode(ManagedNode):
         # A late tick is no jump; a clock that was set back moves nothing.
         gap = now - self._last_tick
         dt = self._loop.pace(gap)
-        if gap > LONGEST_DT:
+        if gap > max(LONGEST_DT, self._watch.timeout):  # as long without a tick as arms may be without joint states
             self._supervisor.stalled(gap, now)
         self._last_tick = now
         self.ticked += 1
