@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-lerobot lint bench docs picture soak soak-ros clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak test-lerobot lint bench docs picture soak clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -30,7 +30,7 @@ test: setup
 
 # Tests that play minutes of motion, or whole runs again and again.
 test-slow: setup
-	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot -m slow
+	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot -m 'slow and not soak'
 
 # Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
 test-ros: setup
@@ -42,8 +42,8 @@ test-ros-slow: setup
 	$(BIN)/python -m pytest tests/ros -m 'slow and not soak'
 
 # Tests that .ci/run leaves out.
-soak-ros: setup
-	$(BIN)/python -m pytest tests/ros -m soak
+test-soak: setup
+	$(BIN)/python -m pytest --ignore tests/lerobot -m soak
 
 # q2r2 export lerobot with the package that it needs. That takes some gigabytes, so it has an environment of its own.
 # All in one call of pip, which chooses the torch and torchvision that lerobot allows.

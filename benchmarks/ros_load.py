@@ -5,21 +5,22 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
 import rclpy
 import typer
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import Q2R2Error
-from q2r2_control.ros.base_node import STREAM_QOS
+from q2r2_control.ros.executor import TickExecutor, TickGroup
 from q2r2_control.ros.launch.processes import NodeProcess, nodes_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table
@@ -29,6 +30,7 @@ _START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
 _SETTLE = 3.0  # after the nodes have begun, and after the hands have [s]
 _JITTER = 0.002  # of a headset's samples: each comes later by up to this [s]
 _TREND = 0.15  # a slower motion is the hand's own, a faster one is ripple [s]
+_RATED = "mujoco_robot", "cartesian_controller"
 _SCRIPT = NodeProcess("SimulationInput", {"jitter": _JITTER})
 
 
@@ -75,9 +77,15 @@ def speed_ripple(times: Array, q: Array) -> float:
     return float(np.sqrt((ripple**2).sum() / (trend**2).sum()))
 
 
-def measure_load(config: str, duration: float) -> LoadReport:
-    """Measure for ``duration`` [s] at rest, and as long with both arms moving. Raises :class:`LoadError`."""
+def measure_load(config: str, duration: float, rate: float) -> LoadReport:
+    """Measure for ``duration`` [s] at rest, and as long with both arms moving. Raises :class:`LoadError`.
+
+    ``rate`` of robot and controller [Hz].
+    """
     nodes, arms = nodes_of(config, "none"), len(load_config(config).arms)
+    nodes = [
+        replace(node, parameters={**node.parameters, "rate": rate}) if node.name in _RATED else node for node in nodes
+    ]
     with private_domain(), _Watcher() as watcher, started(nodes) as processes:
         print_progress("waiting for all nodes")
         watcher.wait(lambda: watcher.active and len(watcher.engaged) == arms, "the nodes")
@@ -89,11 +97,11 @@ def measure_load(config: str, duration: float) -> LoadReport:
             watcher.wait(lambda: all(watcher.engaged.values()), "the arms to follow")
             watcher.spin(_SETTLE)
             print_progress(f"moving: {duration:g} s")
-            watcher.commands.clear()
+            watcher.forget_commands()
             moving = watcher.shares(processes | script, duration)
     if not all(watcher.engaged.values()):
         raise LoadError(f"an arm was paused within {duration:g} s: {watcher.last_event}")
-    times, q = np.array([at for at, _ in watcher.commands]), np.array([q for _, q in watcher.commands])
+    times, q = watcher.commands()
     rows = tuple(NodeLoad(name, idle.get(name, 0.0), moving[name]) for name in moving)
     return LoadReport(duration, _JITTER, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
 
@@ -105,15 +113,21 @@ class _Watcher:
         self.active = False  # the controller
         self.engaged: dict[str, bool] = {}  # by arm
         self.last_event: dict[str, str] = {}  # by arm
-        self.commands: list[tuple[float, list[float]]] = []  # time [s] and positions [rad]
+        self._commands: list[tuple[int, bytes]] = []  # time [ns] and message
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("load_watcher", context=self._context)
+        # Read after the run: a watcher that reads while it listens takes as much time as a node.
         listen: Any = self._on_command  # rclpy's types know callbacks without the message's stamps only
-        self._node.create_subscription(JointTrajectory, "/joint_trajectory", listen, STREAM_QOS)
+        qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+        node: Any = self._node
+        node.tick_group = TickGroup()
+        node.create_subscription(
+            JointTrajectory, "/joint_trajectory", listen, qos, raw=True, callback_group=node.tick_group
+        )
         for name in ("cartesian_controller", "left_q2r2_arm_controller", "right_q2r2_arm_controller"):
             self._node.create_subscription(String, f"/{name}/state", partial(self._on_state, name), 10)
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = TickExecutor(context=self._context)
         self._executor.add_node(self._node)
 
     def __enter__(self) -> _Watcher:
@@ -145,8 +159,17 @@ class _Watcher:
         passed = time.monotonic() - began
         return {name: 100.0 * (processor_time(pid) - before[name]) / passed for name, pid in processes.items()}
 
-    def _on_command(self, message: JointTrajectory, info: dict[str, int]) -> None:
-        self.commands.append((1e-9 * info["source_timestamp"], list(message.points[0].positions)))
+    def forget_commands(self) -> None:
+        self._commands.clear()
+
+    def commands(self) -> tuple[Array, Array]:
+        """Times (n,) [s] and positions (n, nv) [rad] of those that were heard."""
+        messages = [deserialize_message(payload, JointTrajectory) for _, payload in self._commands]
+        times = 1e-9 * np.array([at for at, _ in self._commands], dtype=float)
+        return times, np.array([message.points[0].positions for message in messages])
+
+    def _on_command(self, payload: bytes, info: dict[str, int]) -> None:
+        self._commands.append((info["source_timestamp"], payload))
 
     def _on_state(self, name: str, message: String) -> None:
         state = json.loads(message.data)
@@ -170,12 +193,13 @@ def times_of_a_robot(times: Array) -> Array:
 
 def main(
     duration: Annotated[float, typer.Option(min=1, max=3600, help="At rest, and again moving [s].")] = 30.0,
+    rate: Annotated[float, typer.Option(min=20, max=1000, help="Of robot and controller [Hz].")] = 250.0,
     json: Json = False,
 ) -> None:
     """Print what each node takes of the processors, and how much the commanded speeds ripple."""
-    report = measure_load(DEMO_CONFIG, duration)
+    report = measure_load(DEMO_CONFIG, duration, rate)
     table = figure_table(
-        f"the nodes of q2r2 ros up at their default rates, {duration:g} s each",
+        f"the nodes of q2r2 ros up with the loops at {rate:g} Hz, {duration:g} s each",
         ("node", "idle [% of a core]", "moving [% of a core]"),
         ((row.node, row.idle, row.moving) for row in (*report.rows, report.total)),
         (

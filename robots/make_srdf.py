@@ -90,7 +90,7 @@ def _disabled(config: Config, hidden: tuple[str, ...], samples: int) -> list[Dis
     exclusions = [ET.Element("disable_default_collisions", link=prefix + link) for link in hidden]
     robot = Robot(parse_urdf(cell.urdf, cell.name), exclusions, cell.tool_frames, cell.home, cell.name, cell.parts)
     reasons = {frozenset(map(link_of, pair)): "Always" for pair in robot.ignored_pairs}
-    for pair in nearest_approaches(robot, samples, 0):
+    for pair in nearest_approaches(robot, samples, 0, CLEARANCE):
         reasons[frozenset((pair.link_a, pair.link_b))] = "Never" if pair.nearest > CLEARANCE else "watched"
     links = dict.fromkeys(link_of(item.name) for item in robot.collision_model.geometryObjects)
     found = [

@@ -148,7 +148,8 @@ class TestSession:
             assert target is not None
             assert np.linalg.norm(target.translation - tick.tools[arm].translation) < 1e-6
             # Nothing jumps afterwards either: the hands still rest.
-            before, after = tick.tools[arm], session.watch.ticks[index + 100].tools[arm]
+            rested = np.searchsorted(session.server.times, session.server.times[index] + 0.1) - 1
+            before, after = tick.tools[arm], session.watch.ticks[rested].tools[arm]
             assert np.linalg.norm(after.translation - before.translation) < 1e-3
             assert np.linalg.norm(pin.log3(before.rotation.T @ after.rotation)) < np.radians(0.5)
 

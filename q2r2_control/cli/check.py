@@ -28,7 +28,7 @@ class PairsWritten:
     samples: int
     clearance: float
     never: tuple[PairReach, ...]  # farther apart than the clearance, farthest last
-    watched: tuple[PairReach, ...]  # the others, nearest first
+    watched: tuple[PairReach, ...]  # the others, nearest found first
 
 
 def write_pairs(
@@ -42,7 +42,7 @@ def write_pairs(
     if file.exists():
         raise ConfigError(f"{file}: exists; give the name of a new file")
     robot = Robot.from_config(config)
-    found = nearest_approaches(robot, samples, 0, progress)
+    found = nearest_approaches(robot, samples, 0, clearance, progress)
     _write({file: srdf_of(robot, found, clearance, samples)})
     never = tuple(pair for pair in found if pair.nearest > clearance)
     return PairsWritten(str(file), samples, clearance, never, tuple(pair for pair in found if pair not in never))

@@ -193,3 +193,23 @@ def keep_pairs(geometry: pin.GeometryModel, wanted: Callable[[str, str], bool]) 
     for pair, (a, b) in zip(pairs, names, strict=True):
         if wanted(a, b):
             geometry.addCollisionPair(pair)
+
+
+def distance_gradient(
+    model: pin.Model, data: pin.Data, geometries: pin.GeometryModel, geometry_data: pin.GeometryData, pair: int
+) -> Array:
+    """(nv,) of a pair's distance with respect to the joints [m/rad]: its normal times what moves its nearest points.
+
+    Joint Jacobians, geometry placements and the pair's distance are those that the data hold.
+    """
+    result, bodies = geometry_data.distanceResults[pair], geometries.collisionPairs[pair]
+    points = result.getNearestPoint1(), result.getNearestPoint2()
+    normal = points[1] - points[0]
+    normal = normal / max(float(np.linalg.norm(normal)), 1e-12) * (1.0 if result.min_distance >= 0.0 else -1.0)
+    gradient = np.zeros(model.nv)
+    for side, body, point in ((-1.0, bodies.first, points[0]), (1.0, bodies.second, points[1])):
+        joint = geometries.geometryObjects[body].parentJoint
+        jacobian = pin.getJointJacobian(model, data, joint, pin.LOCAL_WORLD_ALIGNED)
+        lever = point - data.oMi[joint].translation
+        gradient += side * normal @ (jacobian[:3] - pin.skew(lever) @ jacobian[3:])
+    return gradient

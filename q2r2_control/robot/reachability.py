@@ -1,6 +1,6 @@
 """Which monitored pairs can meet at all inside the joint limits, found by sampling, and the SRDF that says so.
 
-A sample shows that two bodies can come near, never that they cannot. The nearest postures found of each pair are
+A sample shows that two bodies can come near, never that they cannot. Where none does, the nearest postures found are
 followed downhill. A pair is out of reach only if it stays farther apart than a clearance well above what is kept.
 """
 
@@ -16,7 +16,7 @@ import pinocchio as pin
 from scipy.optimize import minimize
 
 from q2r2_control.errors import RobotError
-from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.pairs import distance_gradient, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -36,10 +36,13 @@ class PairReach:
     nearest: float  # least distance found [m]
 
 
-def nearest_approaches(robot: Robot, samples: int, seed: int, progress: Progress | None = None) -> list[PairReach]:
+def nearest_approaches(
+    robot: Robot, samples: int, seed: int, clearance: float, progress: Progress | None = None
+) -> list[PairReach]:
     """Least distance found of every monitored pair of links, nearest first; ``samples`` postures are looked at.
 
-    ``progress`` is called often. Raises :class:`RobotError` for fewer than 100 samples.
+    The search for a pair ends where it is no more than ``clearance`` [m]. ``progress`` is called often. Raises
+    :class:`RobotError` for fewer than 100 samples.
     """
     if samples < 100:
         raise RobotError(f"samples = {samples}: allowed: 100 or more")
@@ -55,8 +58,10 @@ def nearest_approaches(robot: Robot, samples: int, seed: int, progress: Progress
     for p, (a, b) in enumerate(names):
         starts = np.argsort(distances[:, p])[:_STARTS]
         least = float(distances[starts[0], p])
-        if least > 0.0:
-            least = min(_downhill(robot, p, postures[i]) for i in starts)
+        for i in starts:
+            if least <= clearance:
+                break
+            least = min(least, _downhill(robot, p, postures[i]))
         links = (link_of(a), link_of(b))
         nearest[links] = min(nearest.get(links, np.inf), least)
         if progress is not None:
@@ -92,9 +97,13 @@ def _downhill(robot: Robot, p: int, q: Array) -> float:
     """Least distance of pair ``p`` going downhill from ``q`` inside the limits."""
     data, geometry_data = robot.model.createData(), robot.collision_model.createData()
 
-    def distance(posture: Array) -> float:
-        pin.updateGeometryPlacements(robot.model, data, robot.collision_model, geometry_data, posture)
-        return float(pin.computeDistance(robot.collision_model, geometry_data, p).min_distance)
+    def distance(posture: Array) -> tuple[float, Array]:
+        pin.computeJointJacobians(robot.model, data, posture)
+        pin.updateGeometryPlacements(robot.model, data, robot.collision_model, geometry_data)
+        found = pin.computeDistance(robot.collision_model, geometry_data, p)
+        gradient = distance_gradient(robot.model, data, robot.collision_model, geometry_data, p)
+        return float(found.min_distance), gradient
 
     bounds = list(zip(robot.position_lower, robot.position_upper, strict=True))
-    return float(minimize(distance, q, method="L-BFGS-B", bounds=bounds, options={"maxiter": _STEPS}).fun)
+    options = {"maxiter": _STEPS}
+    return float(minimize(distance, q, method="L-BFGS-B", jac=True, bounds=bounds, options=options).fun)

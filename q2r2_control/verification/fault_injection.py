@@ -13,6 +13,7 @@ import pinocchio as pin
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ContactPair
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver
+from q2r2_control.robot.pairs import distance_gradient
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.adversary import Adversary, Stream
@@ -62,17 +63,7 @@ class WorstSolver:
         results = self._geometry.distanceResults
         margins = np.array([result.min_distance for result in results]) - kept
         nearest = int(np.argsort(margins)[min(self._rank, len(margins) - 1, _CANDIDATES - 1)])
-        result, pair = results[nearest], geometries.collisionPairs[nearest]
-        points = result.getNearestPoint1(), result.getNearestPoint2()
-        normal = points[1] - points[0]
-        normal = normal / max(float(np.linalg.norm(normal)), 1e-12) * (1.0 if result.min_distance >= 0.0 else -1.0)
-        gradient = np.zeros(model.nv)
-        for side, geometry, point in ((-1.0, pair.first, points[0]), (1.0, pair.second, points[1])):
-            joint = geometries.geometryObjects[geometry].parentJoint
-            jacobian = pin.getJointJacobian(model, data, joint, pin.LOCAL_WORLD_ALIGNED)
-            lever = point - data.oMi[joint].translation
-            gradient += side * normal @ (jacobian[:3] - pin.skew(lever) @ jacobian[3:])
-        return gradient
+        return distance_gradient(model, data, geometries, self._geometry, nearest)
 
 
 # Solver failures after which the certified stop is due. A solution of absurd numbers is cut to the limits instead.

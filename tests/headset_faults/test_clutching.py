@@ -17,6 +17,7 @@ pytestmark = pytest.mark.slow
 
 ANEW = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(120.0)])), np.array([0.4, 0.0, 0.0]))
 STILL = 5e-4  # [m]
+again_and_again = pytest.mark.parametrize("times", [20, pytest.param(100, marks=pytest.mark.soak)])
 
 
 def aligned(op: Operator, shift: float, samples: int) -> Iterator[float]:
@@ -61,7 +62,8 @@ def test_an_alignment_by_one_hand_moves_no_arm_and_no_gripper(
     assert {arm for arm, state in run.ticks[-1].states.items() if state == "engaged"} == set(engaged)
 
 
-def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resumes_a_hundred_times() -> None:
+@again_and_again
+def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resumes_again_and_again(times: int) -> None:
     def script(op: Operator) -> Iterator[float]:
         op.noise = 1e-9
         yield from op.engage()
@@ -73,7 +75,7 @@ def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resum
         yield 2.0  # until the arm rests on its spring
         marks.append(op.now)
         yield from op.press(*SIDES)
-        for _ in range(200):  # a pause, and an engagement
+        for _ in range(2 * times):  # a pause, and an engagement
             op.lower |= set(SIDES)
             yield 0.03
             op.lower -= set(SIDES)
@@ -82,7 +84,7 @@ def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resum
     marks: list[float] = []
     run = InStepRun(script, mode=CommandMode.TORQUE)
     assert run.reasons("lost") == []
-    assert len(run.watch.engagements("left")) == 102
+    assert len(run.watch.engagements("left")) == times + 2
     resumed = [tick for tick in run.ticks if tick.t >= marks[0]]
     commanded = [run.loop.robot.tool_pose(tick.reference.q, "left").translation for tick in resumed]
     measured = np.array([tick.tools["left"].translation for tick in resumed])
@@ -94,6 +96,7 @@ def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resum
     assert np.linalg.norm(measured - measured[0], axis=1).max() < 5e-6
 
 
+@again_and_again
 @pytest.mark.parametrize(
     ("mode", "mujoco", "load", "off"),
     [
@@ -103,8 +106,8 @@ def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resum
     ],
     ids=["on the spring of torque mode", "of soft joints"],
 )
-def test_an_arm_that_hangs_by_2_cm_and_is_engaged_in_full_motion_a_hundred_times_has_no_lag_in_its_sag(
-    mode: CommandMode, mujoco: dict[str, object], load: float, off: float
+def test_an_arm_that_hangs_by_2_cm_and_is_engaged_in_full_motion_again_and_again_has_no_lag_in_its_sag(
+    mode: CommandMode, mujoco: dict[str, object], load: float, off: float, times: int
 ) -> None:
     """The hand goes to and fro at up to 0.6 m/s, and lets go for one sample where the tool is fastest, either way."""
     turns, sampled = 30, 0.014  # samples of a cycle, and their time [s]
@@ -116,7 +119,7 @@ def test_an_arm_that_hangs_by_2_cm_and_is_engaged_in_full_motion_a_hundred_times
         op.grip.add("left")
         yield 0.5 * turns * sampled
         start = op.hands["left"]
-        for index in range(51 * turns + 1):
+        for index in range((times // 2 + 1) * turns + 1):
             way = 0.04 * math.sin(2.0 * math.pi * index / turns)
             op.hands["left"] = pin.SE3(start.rotation, start.translation + np.array([0.0, way, 0.0]))
             (op.grip.discard if index > turns and index % (turns // 2) == 4 else op.grip.add)("left")
@@ -127,7 +130,7 @@ def test_an_arm_that_hangs_by_2_cm_and_is_engaged_in_full_motion_a_hundred_times
     run = InStepRun(script, mujoco, mode, bindings={"lower": "none", "grip": "dead_man"})
     assert run.reasons("lost") == []
     begins = run.watch.engagements("left")
-    assert len(begins) == 101
+    assert len(begins) == times + 1
     references = [run.loop.robot.tool_pose(tick.reference.q, "left").translation for tick in run.watch.ticks]
     for index in begins:
         way = math.dist(references[index - 1], references[index - 2])

@@ -22,7 +22,6 @@ from tests.supervision.conftest import CONFIG, STRICT
 from tests.support.reasons import kinds
 
 DT = 0.004  # [s]
-POSTURES, REACHED = 50, 48
 LONGEST = 60.0  # [s]
 
 
@@ -78,15 +77,18 @@ def postures(robot: Robot, controller: CartesianController, count: int, seed: in
 
 
 @pytest.mark.slow
-def test_from_48_of_50_random_postures_all_joints_come_home(robot: Robot, controller: CartesianController) -> None:
+@pytest.mark.parametrize(("reached", "count"), [(14, 15), pytest.param(48, 50, marks=pytest.mark.soak)])
+def test_from_nearly_all_random_postures_all_joints_come_home(
+    robot: Robot, controller: CartesianController, reached: int, count: int
+) -> None:
     ends = []
-    for q in postures(robot, controller, POSTURES, seed=0):
+    for q in postures(robot, controller, count, seed=0):
         world = World(robot, controller, q)
         ends.append(world.go_home())
         if ends[-1] == "homing_arrived":
             assert np.abs(world.state.q - robot.home).max() < 0.004
         assert world.fastest < 0.45
-    assert ends.count("homing_arrived") >= REACHED, ends
+    assert ends.count("homing_arrived") >= reached, ends
 
 
 def test_the_contract_holds_at_every_tick_of_the_way(robot: Robot, controller: CartesianController) -> None:
