@@ -20,7 +20,7 @@ from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
-from q2r2_control.plants.fri.wire import CommandKind, Session
+from q2r2_control.plants.fri.wire import CommandKind, Operation, Session
 from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
@@ -70,9 +70,17 @@ def fri_cabinet(
     fri: Annotated[int, Option(min=1, max=2, help="Version of FRI.")] = 2,
     start_after: Annotated[float, Option(min=0, help="An overlay is started after so long with a client [s].")] = 0.5,
     drop_every: Annotated[float | None, Option(help="The pendant ends a session as often as this [s].")] = None,
+    t1: Annotated[
+        bool, Option("--t1", help="Operation mode T1: a tool is not commanded faster than 250 mm/s.")
+    ] = False,
+    wrong_load: Annotated[
+        bool, Option("--wrong-load", help="Load data do not fit the tool: no client is let command.")
+    ] = False,
     loss: Annotated[float, Option(min=0, max=0.5, help="Share of datagrams that are lost, each way.")] = 0.0,
     duplicate: Annotated[float, Option(min=0, max=0.5, help="Share of messages that come twice.")] = 0.0,
-    jitter: Annotated[float, Option(min=0, max=20, help="Datagrams are late by up to this [ms].")] = 0.0,
+    jitter: Annotated[
+        float, Option(min=0, max=20, help="Datagrams are late by up to this, and overtake others [ms].")
+    ] = 0.0,
     seed: Annotated[int, Option(min=0, help="Of what is lost and late.")] = 0,
     task: Annotated[list[str] | None, Option(help="A task of q2r2 demo to be judged.")] = None,
     duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
@@ -98,6 +106,9 @@ def fri_cabinet(
     grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if its.gripper is not None}
     network = Network(loss, duplicate, 1e-3 * jitter)
     server = CabinetServer(arms, cabinets, clients, grippers, network, seed)
+    for cabinet in server.cabinets.values():
+        cabinet.load_fits = not wrong_load
+        cabinet.operation = Operation.T1 if t1 else Operation.AUTOMATIC
     pendant = _Pendant(server.cabinets, start_after, drop_every, console)
     watch = TaskWatch(tasks_named(task), arms.plant, robot, cell) if task else None
     longest = positive("--duration", duration)

@@ -201,13 +201,26 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
         check_models(config.robot, config.arms)
         check_priority(config.control.priority, config.arms)
         check_external(config.controller, config.external, config.arms)
-        return config
+        return _within_driver_limits(config)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     except ValidationError as error:
         raise ConfigError(f"{path}: {_first_fault(error)}") from error
     except (ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
+
+
+# A KUKA driver's joints end a degree before the model's, and its soft limits 5 degrees before that [rad]. Beyond them
+# lbr_fri_ros2_stack shuts the connection, and a cabinet ends its session.
+_DRIVER_MARGIN = 0.105
+
+
+def _within_driver_limits(config: Config) -> Config:
+    driven = bool(config.fri) or (config.external is not None and config.external.preset.startswith("lbr_"))
+    if not driven or config.control.limits == "model" or config.control.position_margin >= _DRIVER_MARGIN:
+        return config
+    narrower = config.control.model_copy(update={"position_margin": _DRIVER_MARGIN})
+    return config.model_copy(update={"control": narrower})
 
 
 class _Loader(yaml.SafeLoader):

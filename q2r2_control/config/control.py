@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
@@ -76,6 +76,9 @@ class ControllerSettings(StrictModel):
     acceleration_limit: float = Field(10.0, gt=0, le=100, description="cap of every joint's own limit [rad/s^2]")
     velocity_scale: float = Field(1.0, gt=0, le=1, description="fraction of the robot's velocity limits")
     position_margin: float = Field(0.01, ge=0, le=0.5, description="distance kept from position limits [rad]")
+    limits: Literal["driver", "model"] = Field(
+        "driver", description="driver: with plant fri or a preset lbr_*, position_margin is 0.105 rad at least"
+    )
     recovery_velocity: float = Field(0.2, gt=0, le=1, description="inward speed when outside a limit [rad/s]")
 
     min_distance: Annotated[Distance, _LIVE] = Field(

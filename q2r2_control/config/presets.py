@@ -92,6 +92,16 @@ _ALL = (
         output="lbr_position",
     ),
     Preset(
+        "lbr_torque",
+        "the first command has the measured positions; the Sunrise application asks for TORQUE, every 5 ms or less",
+        topic="{robot}/command/lbr_torque_command",
+        message="lbr_fri_idl/msg/LBRTorqueCommand",
+        rate=500.0,
+        lowest_rate=200.0,
+        guard=_WIDE,
+        output="lbr_torque",
+    ),
+    Preset(
         "forward_position",
         "the first command equals the measured positions; one value a joint",
         topic="{ctrl}/commands",

@@ -100,6 +100,7 @@ def test_a_picture_shows_where_things_are(tmp_path: Path) -> None:
     assert columns.max() < 60
 
 
+@pytest.mark.soak
 def test_pictures_that_are_not_taken_in_time_are_lost_and_counted(tmp_path: Path) -> None:
     needs_opengl()
     taken: list[int] = []

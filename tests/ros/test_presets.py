@@ -53,7 +53,7 @@ NAMES = {
     **{"mayr": "reference_pose", "crisp": "target_pose", "moveit_servo": "pose_target_cmds"},
     **{"forward_position": "commands", "jtc": "joint_trajectory"},
 }
-JOINTS = ("lbr_position", "forward_position", "jtc")
+JOINTS = ("lbr_position", "lbr_torque", "forward_position", "jtc")
 
 
 class Theirs:
@@ -222,7 +222,7 @@ def test_the_presets_have_the_topics_of_their_controllers() -> None:
     assert lbr("/left/lbr_joint_position_command_controller") == "/left/command/lbr_joint_position_command"
     assert lbr("/lbr_joint_position_command_controller") == "/command/lbr_joint_position_command"
     assert lbr("/{arm}/lbr_joint_position_command_controller") == KINDS["lbr_position"].topic
-    assert PRESETS.keys() == {*NAMES, "lbr_position"}
+    assert PRESETS.keys() == {*NAMES, "lbr_position", "lbr_torque"}
     assert {name for name, preset in PRESETS.items() if not preset.takes_poses} == set(JOINTS)
     for name, preset in PRESETS.items():
         if name in NAMES:

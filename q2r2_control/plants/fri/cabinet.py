@@ -32,6 +32,7 @@ _FAIR, _GOOD, _EXCELLENT = 0.5, 0.9, 0.98  # share of them that came in time
 _MISSES = 10  # answers in a row that may be late while the client commands
 _NEAR = 1e-3  # how far the first command may be from the cabinet's own position [rad]
 _ROUNDING = 1e-6  # relative, of the limits
+_T1_SPEED = 0.25  # of a tool, in T1 [m/s]
 
 
 class Trip(StrEnum):
@@ -46,6 +47,7 @@ class Trip(StrEnum):
     VELOCITY = "commanded positions were too far apart"
     ACCELERATION = "commanded velocities were too far apart"
     TORQUE = "a commanded torque was beyond its limit"
+    T1 = "the tool was commanded faster than 250 mm/s, in T1"
     SAFETY = "safety stop"
     STOPPED = "stopped at the pendant"
 
@@ -68,6 +70,9 @@ class Arm(Protocol):
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
         """Let ``dt`` [s] pass: the drives move to ``q`` [rad]; ``tau`` [Nm] is added to their impedance."""
 
+    def tool_way(self, start: Joints, end: Joints) -> float:
+        """How far the tool is between two postures [m]."""
+
 
 @dataclass(slots=True)
 class StillArm:
@@ -79,6 +84,10 @@ class StillArm:
 
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
         self.q = q
+
+    def tool_way(self, start: Joints, end: Joints) -> float:
+        """Of a tool that is a metre from each axis."""
+        return _apart(start, end)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +116,7 @@ class Cabinet:
     def __init__(self, settings: CabinetSettings, arm: Arm) -> None:
         self.settings, self.arm = settings, arm
         self.session, self.safety, self.operation = Session.MONITORING_WAIT, Safety.NORMAL, Operation.AUTOMATIC
+        self.load_fits = True  # the load data are those of the tool, without which no client may command
         self.inputs: dict[str, IoValue] = {}  # for the client
         self.outputs: dict[str, IoValue] = {}  # by the client, whatever the session's state
         self.trips: list[Trip] = []  # of all sessions, in order
@@ -205,7 +215,9 @@ class Cabinet:
         elif self.session is Session.COMMANDING_WAIT:
             if self.quality < Quality.GOOD:
                 self.stop(Trip.LATE)
-            elif answer is not None and answer.q is not None and _apart(answer.q, self._commanded) <= _NEAR:
+            elif not self.load_fits or answer is None or answer.q is None:
+                return
+            elif _apart(answer.q, self._commanded) <= _NEAR:
                 self.session = Session.COMMANDING_ACTIVE
                 self._follow(answer)
         else:
@@ -236,6 +248,10 @@ class Cabinet:
                 return Trip.TORQUE
         if any(not low <= q <= high for q, low, high in zip(answer.q, limits.lower, limits.upper, strict=True)):
             return Trip.POSITION
+        if self.operation is Operation.T1:
+            longest = _T1_SPEED * period * (1.0 + _ROUNDING)
+            if self.arm.tool_way(self._commanded, answer.q) > longest:
+                return Trip.T1
         for new, old, before, velocity, acceleration in zip(
             answer.q, self._commanded, self._velocity, limits.velocity, limits.acceleration, strict=True
         ):

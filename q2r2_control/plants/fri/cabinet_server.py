@@ -43,7 +43,7 @@ class SimulatedArm:
     """One arm of a :class:`SimulatedArms`."""
 
     def __init__(self, cell: SimulatedArms, arm: str) -> None:
-        self._cell, self._joints = cell, cell.robot.arms[arm].joints
+        self._cell, self._name, self._joints = cell, arm, cell.robot.arms[arm].joints
         start = tuple(cell.robot.home[self._joints].tolist())
         self._from, self._to, self._began, self._lasts = start, start, 0.0, 1.0
         self.overlay: Joints | None = None
@@ -65,6 +65,14 @@ class SimulatedArm:
         """Begin to go to ``q``, which takes ``dt`` [s]; the cell's own time goes on by itself."""
         self._from, self._to, self._began, self._lasts = self._to, q, self._cell.now, dt
         self.overlay = tau
+
+    def tool_way(self, start: Joints, end: Joints) -> float:
+        tools = []
+        for joints in (start, end):
+            q = self._cell.robot.home.copy()
+            q[self._joints] = joints
+            tools.append(self._cell.robot.tool_pose(q, self._name).translation)
+        return float(np.linalg.norm(tools[1] - tools[0]))
 
     def wanted(self, t: float) -> tuple[Array, Array]:
         """Where the drives are to be at ``t`` [s], and how fast."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -21,7 +21,15 @@ from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.joint_outputs import joints_of
-from q2r2_control.ros.bridge.messages import age, delay, ended_topic, nanoseconds, pose_of, robot_state
+from q2r2_control.ros.bridge.messages import (
+    age,
+    called_otherwise,
+    delay,
+    ended_topic,
+    nanoseconds,
+    pose_of,
+    robot_state,
+)
 from q2r2_control.ros.monitoring import Publishers
 from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import Array, RobotState
@@ -126,8 +134,13 @@ def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
 class JointIntake:
     """Makes one state of all arms from joint states on one topic or several; it is as old as its oldest part."""
 
-    def __init__(self, node: BaseNode, robot: Robot, needs_external_torque: bool = False) -> None:
-        """``needs_external_torque``: no state is good without it. Raises :class:`ConfigError` without its topic."""
+    def __init__(
+        self, node: BaseNode, robot: Robot, needs_external_torque: bool = False, told_by_drivers: bool = False
+    ) -> None:
+        """``needs_external_torque``: no state is good without it.
+
+        Raises :class:`ConfigError` without its topic, unless it is ``told_by_drivers``.
+        """
         self._node, self._needs_external_torque = node, needs_external_torque
         self._topics: dict[str, list[str]] = {}  # the arms whose joints each topic carries
         for arm in robot.arms:
@@ -138,7 +151,7 @@ class JointIntake:
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
         what = 'external torques of all joints, for admittance and vibrations: effort of a JointState; "": none'
         self._external_topic = node.parameter("external_torque_topic", "", what)
-        if needs_external_torque and not self._external_topic:
+        if needs_external_torque and not self._external_topic and not told_by_drivers:
             raise ConfigError("admittance.enabled = true: set the parameter external_torque_topic, which it needs")
         self._external: Array | None = None  # newest (nv,) [Nm]
         self._external_stamp = -math.inf
@@ -146,6 +159,8 @@ class JointIntake:
         self._publishers = Publishers(node, self._topics)
         self._values = np.zeros((3, len(robot.joint_names)))
         self.state: RobotState | None = None  # the newest of all arms
+        self.theirs: dict[str, str] = {}  # names of joints that an arm's driver calls otherwise, by ours
+        self.driver_fault: Callable[[], Reason | None] = lambda: None  # why arms do not follow, as a driver says
 
     def subscribe(self, take: TakeState, look: Callable[[JointState], None]) -> None:
         """Pass states of all arms, or what is wrong, to ``take`` with the time [s], and each message to ``look``."""
@@ -164,7 +179,7 @@ class JointIntake:
     def _on_message(self, take: TakeState, look: Callable[[JointState], None], topic: str, message: JointState) -> None:
         look(message)
         names = self._names[topic]
-        if set(names).isdisjoint(message.name):
+        if set(names).isdisjoint(message.name) and not (names := self._named_otherwise(topic, message.name)):
             return  # of a gripper or another robot
         now = self._node.now
         part = robot_state(message, names, now)
@@ -183,7 +198,23 @@ class JointIntake:
         if silent and self._needs_external_torque:
             take(Reason.of(ReasonKind.NO_EXTERNAL_TORQUES, topic=self._external_topic), now)
         else:
-            take(self.state, now)
+            take(self.driver_fault() or self.state, now)
+
+    def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
+        """What the sender calls an arm's joints, where that can be known; told once."""
+        names = self._names[topic]
+        if len(self._topics[topic]) > 1:
+            return []
+        theirs = called_otherwise(tuple(names), tuple(given))
+        if theirs and not theirs.items() <= self.theirs.items():
+            self.theirs |= theirs
+            pairs = ", ".join(f"{name} is {its}" for name, its in theirs.items())
+            self._node.get_logger().info(f"{topic}: {pairs}")
+        return list(theirs.values())
+
+    def take_external(self, torques: Array) -> None:
+        """External torques of all joints, (nv,) [Nm]."""
+        self._external, self._external_stamp = torques, self._node.now
 
     def _on_external(self, message: JointState) -> None:
         if not set(message.name) >= set(self._joint_names):
@@ -191,6 +222,6 @@ class JointIntake:
         effort = dict(zip(message.name, message.effort, strict=False))
         torques = np.array([effort.get(name, math.nan) for name in self._joint_names])
         if len(message.effort) == len(message.name) and np.isfinite(torques).all():
-            self._external, self._external_stamp = torques, self._node.now
+            self.take_external(torques)
         else:
             self._node.drop(self._external_topic, f"{list(message.effort)!s:.60}")

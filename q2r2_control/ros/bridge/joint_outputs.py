@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from typing import Any, ClassVar, NamedTuple
 
@@ -33,6 +33,7 @@ class Kind(ABC):
     """One kind of message. Made with the control loop's period [s] and the robot."""
 
     topic: ClassVar[str]  # where no other is asked for
+    older: str | None = None  # last part of the topic in older releases of the receiver, which gets it too
     mode = CommandMode.POSITION  # of the drive whose commands it carries
     joints_each: int | None = None  # that a message has to have; None: any number
     message: Any  # its type
@@ -91,7 +92,7 @@ class JointStates(Kind):
 class LbrPosition(Kind):
     """LBRJointPositionCommand of lbr_fri_idl, one topic an arm."""
 
-    topic, joints_each = "/{arm}/command/lbr_joint_position_command", 7
+    topic, joints_each, older = "/{arm}/command/lbr_joint_position_command", 7, "joint_position"
     type_name = "LBRJointPositionCommand"
 
     def __init__(self, period: float, robot: Robot) -> None:
@@ -108,7 +109,8 @@ class LbrTorque(LbrPosition):
     Each carries the measured position, since the driver ignores torques beside a position that is NaN.
     """
 
-    topic, mode, type_name = "/{arm}/command/lbr_torque_command", CommandMode.TORQUE, "LBRTorqueCommand"
+    topic, mode, older = "/{arm}/command/lbr_torque_command", CommandMode.TORQUE, "torque"
+    type_name = "LBRTorqueCommand"
 
     def __init__(self, period: float, robot: Robot) -> None:
         super().__init__(period, robot)
@@ -146,6 +148,7 @@ class Channel(NamedTuple):
     names: list[str]
     joints: np.ndarray  # velocity indices in the robot's order
     publisher: WatchedPublisher
+    optional: bool = False  # nothing is sent as long as nobody listens
 
 
 class JointOutput:
@@ -153,6 +156,7 @@ class JointOutput:
 
     def __init__(self, drive: Drive, kind: Kind, channels: list[Channel]) -> None:
         self.drive, self._kind, self._channels, self._listeners = drive, kind, channels, 0
+        self.theirs: Mapping[str, str] = {}  # names of joints that the receiver calls otherwise, by ours
 
     def watch(self, node: BaseNode) -> CommandWatch:
         return CommandWatch(node, self._kind.message, [channel.publisher.topic_name for channel in self._channels])
@@ -160,7 +164,10 @@ class JointOutput:
     def send(self, command: Command, state: RobotState, t: float, decided: float) -> None:
         """Send a command of the tick at ``t`` [s] of the node's clock; ``decided``: see :func:`publish_in_time`."""
         for channel in self._channels:
-            message = self._kind.encode(command, state, t, channel.names, channel.joints)
+            if channel.optional and not channel.publisher.listeners:
+                continue
+            names = [self.theirs.get(name, name) for name in channel.names]
+            message = self._kind.encode(command, state, t, names, channel.joints)
             channel.publisher.publish(message, decided)
 
     @property
@@ -172,6 +179,16 @@ class JointOutput:
         command = self.drive.last_command(state, {})
         if command is not None and command.mode is self.drive.mode:
             self.send(command, state, t, time.monotonic())
+
+    def driver_namespaces(self, robot: Robot) -> dict[str, str]:
+        """Where the driver of each arm is in ROS, of drivers that a topic's name tells: <namespace>/command/<topic>."""
+        found = {}
+        for channel in self._channels:
+            namespace, command, _ = channel.publisher.topic_name.rpartition("/command/")
+            for arm, its in robot.arms.items():
+                if self._kind.older is not None and command and np.array_equal(channel.joints, np.sort(its.joints)):
+                    found[arm] = namespace
+        return found
 
     def waits(self) -> bool:
         """Whether nothing should be sent in this tick, so that the last command can be acknowledged.
@@ -221,6 +238,10 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
                 "needs a topic of its own"
             )
         channels.append(Channel(names, joints, WatchedPublisher(node, kind.message, topic, timeout)))
+        place, _, last = topic.rpartition("/")
+        if kind.older is not None and last == kind.topic.rpartition("/")[2]:
+            older = WatchedPublisher(node, kind.message, f"{place}/{kind.older}", timeout)
+            channels.append(Channel(names, joints, older, optional=True))
     return JointOutput(drive, kind, channels)
 
 

@@ -147,6 +147,17 @@ def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotSta
     return RobotState(q=values[0], v=values[1], tau=values[2], tau_external=None, stamp=t)
 
 
+@lru_cache(maxsize=64)
+def called_otherwise(names: tuple[str, ...], given: tuple[str, ...]) -> dict[str, str]:
+    """By each of an arm's joints the one of the ``given`` names that differs in its beginning; {} unless all have one.
+
+    A joint left_A1 may be lbr_A1 or A1 elsewhere: its last part tells, where it tells one only.
+    """
+    ends = {name: name.partition("_")[2] or name for name in names}
+    found = {name: [one for one in given if one == end or one.endswith(f"_{end}")] for name, end in ends.items()}
+    return {name: ones[0] for name, ones in found.items()} if all(len(ones) == 1 for ones in found.values()) else {}
+
+
 @lru_cache(maxsize=64)  # publishers send the same names again and again
 def order_of(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
     """Where each of ``names`` is among those that were given; or what is wrong with these, in one line."""

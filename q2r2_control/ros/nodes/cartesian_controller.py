@@ -25,6 +25,7 @@ from q2r2_control.ros.base_node import ERROR, OK, WARN, ManagedNode
 from q2r2_control.ros.bridge.controller_feedback import GRIPPER_DELAY, ControllerFeedback, GripperLimits
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import KINDS, NONE, make_output
+from q2r2_control.ros.bridge.lbr_driver import LbrDrivers
 from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live, make_watching_live
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.supervision.joint_watch import (
@@ -64,7 +65,12 @@ class CartesianControllerNode(ManagedNode):
         self._output = make_output(output, self, robot, config, self._period)
         self._targets = TargetIntake(self, robot, self.report_health)
         feels = config.admittance.enabled and not self._output.drive.yields
-        self._joints = JointIntake(self, robot, needs_external_torque=feels)
+        drivers = self._output.driver_namespaces(robot)
+        self._joints = JointIntake(self, robot, needs_external_torque=feels, told_by_drivers=bool(drivers))
+        self._output.theirs = self._joints.theirs
+        if drivers:
+            told = LbrDrivers(self, robot, drivers, self._output.drive.mode, self._joints.take_external)
+            self._joints.driver_fault = told.fault
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
         # A message with a bad number among good ones is another publisher's: no reason to bridge it.

@@ -37,6 +37,11 @@ _CURES = {
     ReasonKind.NO_TRANSFORM: "start what publishes that frame; parameters base_frame_id, world_frame_id",
     **dict.fromkeys((ReasonKind.HAND_SILENT, ReasonKind.HAND_UNKNOWN), _START_HANDS),
     **dict.fromkeys((ReasonKind.SEVERAL_PUBLISHERS, ReasonKind.FRAME_DISPUTED), _ONE),
+    **dict.fromkeys(
+        (ReasonKind.FRI_SESSION, ReasonKind.FRI_SILENT, ReasonKind.FRI_COMMAND_MODE),
+        "start the application on the pendant; then let the driver begin anew: ros2 control "
+        "set_hardware_component_state COMPONENT inactive, and active",
+    ),
     **dict.fromkeys(_BAD_STATES, "look at the robot's driver, and at joint_states_topic of cartesian_controller"),
 }
 # Whose sentences say what helps, as those of a stopped arm do.

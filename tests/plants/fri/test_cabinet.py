@@ -14,6 +14,7 @@ from q2r2_control.plants.fri.wire import (
     CommandKind,
     Joints,
     Monitoring,
+    Operation,
     Quality,
     Safety,
     Session,
@@ -69,6 +70,30 @@ def test_a_client_that_answers_in_time_comes_from_waiting_to_monitoring_and_by_t
         cabinet.receive(write_command(client.answer(message), 2))
     assert seen == list(Session)[1:]
     assert cabinet.quality is Quality.EXCELLENT
+
+
+def test_with_load_data_that_do_not_fit_no_client_is_let_command() -> None:
+    cabinet, client = Cabinet(SETTINGS, StillArm(HOME)), Client()
+    cabinet.load_fits = False
+    cabinet.start_overlay()
+    assert run(cabinet, 300, client.answer).session is Session.COMMANDING_WAIT
+    cabinet.load_fits = True
+    assert run(cabinet, 2, client.answer).session is Session.COMMANDING_ACTIVE
+
+
+@pytest.mark.parametrize(("speed", "trips"), [(0.24, []), (0.26, [Trip.T1])])
+def test_in_t1_a_tool_that_is_commanded_faster_than_250_mm_s_ends_the_command(speed: float, trips: list[Trip]) -> None:
+    cabinet, client = commanding(replace(SETTINGS, acceleration=(1e3,) * 7))
+    cabinet.operation = Operation.T1
+
+    def answer(message: Monitoring) -> Command:
+        assert message.ipo_q is not None
+        return client.answer(message, tuple(q + speed * SETTINGS.period for q in message.ipo_q))
+
+    for _ in range(5):
+        if cabinet.session is Session.COMMANDING_ACTIVE:
+            run(cabinet, 1, answer)
+    assert cabinet.trips[:1] == trips
 
 
 def test_a_client_that_answers_every_other_message_is_not_let_command() -> None:

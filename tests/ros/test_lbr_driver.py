@@ -1,0 +1,169 @@
+"""Two arms behind lbr_fri_ros2_stack, as its releases name things: sessions that begin and end, and its guards."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.testing import assert_allclose
+
+from q2r2_control import Robot
+from q2r2_control.config.cell import load_config, parse_config
+from q2r2_control.config.resources import find_resource
+from q2r2_control.plants.fri.wire import CommandKind, Session
+from q2r2_control.robot.compose import WORLD
+from q2r2_control.ros.bridge.messages import called_otherwise
+from q2r2_control.types import SIDES, Array
+from tests.ros.cell import PATIENT, RATE, start_controller
+from tests.ros.conftest import need_ros
+from tests.ros.processes import CONFIG, Processes, States
+from tests.ros.test_processes import external_cell
+
+need_ros()
+
+from geometry_msgs.msg import PoseStamped
+from lbr_fri_idl.msg import LBRJointPositionCommand, LBRState
+from sensor_msgs.msg import JointState
+
+from q2r2_control.ros.base_node import COMMAND_QOS
+from q2r2_control.ros.bridge.messages import stamped_pose
+from q2r2_control.ros.launch.processes import nodes_of
+
+PERIOD = 0.01  # of the driver, by default [s]
+TAU = 0.04  # of its filter of positions, by default [s]
+NARROWER = math.radians(1.0)  # than the model's limits are the driver's [rad]
+SAME = 1e-3  # of a first command and the cabinet's own position [rad]
+TOPICS = {"for Jazzy": ("lbr_joint_position_command", "lbr_state"), "of 2024": ("joint_position", "state")}
+
+
+class FakeDriver:
+    """One arm; what would shut the connection to its cabinet is in ``trips``."""
+
+    def __init__(self, node: Any, robot: Robot, arm: str, release: str) -> None:
+        joints = robot.arms[arm].joints
+        self.q, self.session, self.trips = robot.home[joints].copy(), Session.MONITORING_READY, list[str]()
+        self.torque = 0.0
+        self._wanted: Array | None = None
+        self._lower, self._upper = robot.position_lower[joints] + NARROWER, robot.position_upper[joints] - NARROWER
+        self._fastest = robot.velocity_limit[joints]
+        command, state = TOPICS[release]
+        node.create_subscription(LBRJointPositionCommand, f"/{arm}/command/{command}", self._on_command, 1)
+        self._states = node.create_publisher(LBRState, f"/{arm}/{state}", 10)
+        self._joints = node.create_publisher(JointState, f"/{arm}/joint_states", 10)
+        self._timer = node.create_timer(PERIOD, self._tick)
+
+    def begin(self) -> None:
+        self._wanted, self.session = None, Session.COMMANDING_ACTIVE
+
+    def drop(self) -> None:
+        self.session = Session.MONITORING_READY
+
+    def _on_command(self, message: Any) -> None:
+        q = np.array(message.joint_position)
+        if self.session is not Session.COMMANDING_ACTIVE:
+            return
+        if not ((self._lower <= q) & (q <= self._upper)).all():
+            self.trips.append(f"position {q}")
+        if self._wanted is None and np.abs(q - self.q).max() > SAME:
+            self.trips.append(f"first command {q}, and the arm is at {self.q}")
+        self._wanted = q
+
+    def _tick(self) -> None:
+        step = np.zeros(len(self.q))
+        if self._wanted is not None and self.session is Session.COMMANDING_ACTIVE:
+            step = (1.0 - math.exp(-PERIOD / TAU)) * (self._wanted - self.q)
+        if (np.abs(step) > self._fastest * PERIOD).any():
+            self.trips.append(f"velocity {step / PERIOD}")
+        self.q = self.q + step
+        quality, mode = {"connection_quality": 3, "drive_state": 2}, {"client_command_mode": int(CommandKind.POSITION)}
+        torques = np.full(len(self.q), self.torque)
+        self._states.publish(LBRState(session_state=int(self.session), external_torque=torques, **quality, **mode))
+        names = [f"lbr_A{number}" for number in (3, 1, 2, 4, 5, 7, 6)]
+        order = [2, 0, 1, 3, 4, 6, 5]
+        velocity = (step / PERIOD)[order].tolist()
+        self._joints.publish(JointState(name=names, position=self.q[order].tolist(), velocity=velocity))
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("release", TOPICS)
+def test_both_arms_move_in_commanding_active_only_and_trip_no_guard_of_their_driver(
+    release: str, node: Any, processes: Processes, robot: Robot, tmp_path: Path
+) -> None:
+    drivers = {arm: FakeDriver(node, robot, arm, release) for arm in SIDES}
+    publishers = {arm: node.create_publisher(PoseStamped, f"/q2r2/{arm}/target_frame", COMMAND_QOS) for arm in SIDES}
+    states = States(node, "cartesian_controller")
+    arms = {
+        arm: {
+            **{"ctrl_prefix": f"/{arm}/lbr_joint_position_command_controller", "base_frame": f"{arm}_link_0"},
+            "joint_states_topic": f"/{arm}/joint_states",
+        }
+        for arm in SIDES
+    }
+    cell = external_cell(tmp_path, "lbr_position", "filtered", arms=arms, world_frame=WORLD)
+    given = [
+        f"{name}:={value}" for name, value in nodes_of(cell)[0].parameters.items() if name not in ("config", "rate")
+    ]
+    controller = start_controller(processes, *PATIENT, *given, config=cell)
+
+    def tool(arm: str) -> pin.SE3:
+        return robot.tool_pose(np.concatenate([drivers[side].q for side in SIDES]), arm)
+
+    def move(by: tuple[float, float, float], duration: float, longest: float = math.inf, turn: float = 0.0) -> None:
+        """Both hands, as streams that begin at the tools; ``turn`` about the tool's axis [rad]."""
+        starts, began = {arm: tool(arm) for arm in SIDES}, time.monotonic()
+        while (passed := time.monotonic() - began) < min(duration + 1.0, longest):
+            share = min(passed / duration, 1.0)
+            for arm, start in starts.items():
+                turned = start.rotation @ pin.exp3(np.array([0.0, 0.0, share * turn]))
+                goal = pin.SE3(turned, start.translation + share * np.array(by))
+                publishers[arm].publish(stamped_pose(goal, WORLD, 0.0))
+            time.sleep(1.0 / RATE)
+
+    states.wait_for(phase="inactive", kind="fri_session")
+    controller.wait_for("left_A1 is lbr_A1")
+    drivers["left"].begin()
+    states.wait_for(phase="inactive", kind="fri_session")
+    drivers["right"].begin()
+    states.wait_for(phase="active")
+    before = {arm: tool(arm).translation for arm in SIDES}
+    move((0.0, 0.0, 0.05), 1.0)
+    for arm in SIDES:
+        assert_allclose(tool(arm).translation - before[arm], (0.0, 0.0, 0.05), atol=3e-3)
+    move((0.0, 0.1, 0.0), 1.0, longest=0.5)
+    drivers["left"].drop()
+    states.wait_for(phase="inactive", kind="fri_session")
+    stopped = drivers["right"].q.copy()
+    move((0.1, 0.0, 0.0), 0.3)
+    assert_allclose(drivers["right"].q, stopped, atol=0.02, err_msg="it brakes, and follows no target")
+    drivers["left"].begin()
+    states.wait_for(phase="active")
+    before = {arm: tool(arm).translation for arm in SIDES}
+    move((0.0, 0.0, -0.05), 1.0)
+    for arm in SIDES:
+        assert_allclose(tool(arm).translation - before[arm], (0.0, 0.0, -0.05), atol=3e-3)
+    move((2.0, 0.5, 0.5), 2.0)  # far out of reach
+    move((0.0, 0.0, 0.0), 4.0, turn=1.9 * math.pi)  # to the end of the last joint
+    farthest = [abs(driver.q[6]) for driver in drivers.values()]
+    assert max(farthest) > math.radians(165.0)
+    assert {arm: driver.trips for arm, driver in drivers.items()} == {"left": [], "right": []}
+
+
+def test_names_are_told_apart_by_their_last_part_where_that_tells_one() -> None:
+    ours = ("left_A1", "left_A2")
+    assert called_otherwise(ours, ("lbr_A2", "lbr_A1", "gripper")) == {"left_A1": "lbr_A1", "left_A2": "lbr_A2"}
+    assert called_otherwise(ours, ("A1", "A2")) == {"left_A1": "A1", "left_A2": "A2"}
+    assert called_otherwise(ours, ("one_A1", "two_A1", "one_A2", "two_A2")) == {}
+    assert called_otherwise(ours, ("lbr_A1",)) == {}
+
+
+def test_a_cell_of_their_driver_keeps_its_limits_unless_told_otherwise() -> None:
+    text = find_resource("config/dual_iiwa7_fri.yaml").read_text()
+    assert load_config(CONFIG).control.position_margin == 0.01
+    assert parse_config(text, "cell.yaml").control.position_margin == 0.105
+    model = text.replace("limits: driver", "limits: model")
+    assert parse_config(model, "cell.yaml").control.position_margin == 0.01
