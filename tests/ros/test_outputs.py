@@ -8,7 +8,6 @@ import sys
 import time
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -118,9 +117,10 @@ def test_arms_with_a_topic_each_get_their_own_joints_there(node: Any, robot: Rob
 
 
 def test_torques_for_an_lbr_are_without_gravity(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError, match="lbr_fri_idl cannot be imported"):
-        joint_outputs.LbrTorque(0.004, robot)
-    monkeypatch.setattr(joint_outputs, "_lbr_message", lambda name: SimpleNamespace)
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "lbr_fri_idl.msg", None)
+        with pytest.raises(ConfigError, match="lbr_fri_idl cannot be imported"):
+            joint_outputs.LbrTorque(0.004, robot)
     q, zero = robot.home + 0.1, np.zeros_like(robot.home)
     gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
     command = Command(CommandMode.TORQUE, robot.home, zero, gravity + 1.0, {})

@@ -201,7 +201,7 @@ class JointIntake:
             take(self.driver_fault() or self.state, now)
 
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
-        """What the sender calls an arm's joints, where that can be known; told once."""
+        """The sender's names of an arm's joints, where they can be known; told once."""
         names = self._names[topic]
         if len(self._topics[topic]) > 1:
             return []

@@ -1,4 +1,4 @@
-"""What lbr_fri_ros2_stack says of its arms: the state of each FRI session, and the external torques."""
+"""The arms as lbr_fri_ros2_stack tells of them: the state of each FRI session, and the external torques."""
 
 from __future__ import annotations
 
