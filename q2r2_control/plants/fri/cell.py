@@ -18,7 +18,7 @@ from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.plants.fri.answers import ReferencePath
 from q2r2_control.plants.fri.session import DELAY, ArmSession
-from q2r2_control.plants.fri.wire import JOINTS
+from q2r2_control.plants.fri.wire import JOINTS, Monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
@@ -117,6 +117,13 @@ class FriCell:
             if newest is not None and gripper.input in newest.io:
                 found[arm] = min(max(float(newest.io[gripper.input]), 0.0), 1.0)
         return found
+
+    def newest(self, arm: str) -> tuple[Monitoring, float]:
+        """The newest message of a cabinet that was heard, and when it came [s]."""
+        with self._lock:
+            session = self.sessions[arm]
+            assert session.newest is not None
+            return session.newest, session.arrival
 
     @property
     def is_heard(self) -> bool:

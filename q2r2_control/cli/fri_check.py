@@ -1,0 +1,139 @@
+"""``q2r2 fri-check``: listens to the cabinets of a cell for some seconds, and moves nothing."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from rich.console import Console
+from typer import Exit, Option
+
+from q2r2_control.cli.output import ConfigFile, Json, print_report, say
+from q2r2_control.config.cell import load_config
+from q2r2_control.plants.fri.plant import FriPlant
+from q2r2_control.plants.fri.wire import Monitoring
+from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, real_time, stop_on_signals
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import CommandMode
+from q2r2_control.viewer.tables import record_table
+from q2r2_control.wording import sentence
+
+_LOOKS = 2e-4  # between two looks at whether a message came [s]
+_LARGE_JITTER = 0.5  # of a period
+
+
+@dataclass(frozen=True, slots=True)
+class CabinetReport:
+    """One cabinet's messages, and the newest of them in words."""
+
+    arm: str
+    fri_version: int
+    period_ms: float
+    messages: int
+    lost: int
+    jitter_ms_p99: float  # of the time between two messages, about the cabinet's period
+    jitter_ms_max: float
+    session: str
+    quality: str
+    safety: str
+    operation: str
+    drives: str
+    joints_deg: list[float]  # measured
+    external_torque_nm: float | None  # the greatest of a joint
+
+
+def cabinet_report(arm: str, heard: Sequence[tuple[Monitoring, float]], lost: int) -> CabinetReport:
+    """Of at least one message, each with when it came [s], in the order of their counters."""
+    newest = heard[-1][0]
+    counters = np.array([message.counter for message, _ in heard])
+    late = np.abs(np.diff([came for _, came in heard]) - np.diff(counters) * newest.period)
+    return CabinetReport(
+        arm=arm,
+        fri_version=newest.version,
+        period_ms=1e3 * newest.period,
+        messages=len(heard),
+        lost=lost,
+        jitter_ms_p99=1e3 * float(np.quantile(late, 0.99)) if len(late) else 0.0,
+        jitter_ms_max=1e3 * float(late.max(initial=0.0)),
+        session=_word(newest.session),
+        quality=_word(newest.quality),
+        safety=_word(newest.safety),
+        operation=_word(newest.operation),
+        drives=_word(newest.drives),
+        joints_deg=np.degrees(newest.q).round(2).tolist(),
+        external_torque_nm=None if newest.external_tau is None else max(map(abs, newest.external_tau)),
+    )
+
+
+def _word(state: IntEnum) -> str:
+    return state.name.lower().replace("_", " ")
+
+
+def machine_notes() -> list[str]:
+    """Reasons why this computer may answer late, each with what helps."""
+    notes = []
+    with real_time() as refused:
+        if refused:
+            notes.append(refused)
+    if sys.platform == "linux" and _text("/sys/kernel/realtime") != "1":
+        notes.append("the kernel has no PREEMPT_RT: answers may be late by milliseconds; install a real-time kernel")
+    governor = _text("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    if governor not in ("", "performance"):
+        notes.append(f"the processors' governor is {governor}; cpupower frequency-set -g performance")
+    return notes
+
+
+def _text(file: str) -> str:
+    return Path(file).read_text().strip() if Path(file).exists() else ""
+
+
+def fri_check(
+    config: ConfigFile,
+    duration: Annotated[float, Option(min=1, max=3600, help="[s].")] = 10.0,
+    json: Json = False,
+) -> None:
+    """Listen to the cabinets of a cell and say what they send; exit 1 where an arm could not be commanded.
+
+    Messages are answered, so the connection becomes good. Where an application starts its overlay meanwhile, the arm is
+    held where it is. Move an arm by hand guiding, and see which numbers change.
+    """
+    cell, stop = load_config(config), StopRequest()
+    plant = FriPlant(Robot.from_config(cell), cell)
+    plant.begin(CommandMode.POSITION)
+    say("waits for the cabinets", Console(stderr=True))
+    with stop_on_signals(stop.ask), real_time(), few_garbage_collections():
+        try:
+            plant.reset()
+            heard: dict[str, list[tuple[Monitoring, float]]] = {arm: [] for arm in plant.cell.sessions}
+            end = time.monotonic() + duration
+            while (now := time.monotonic()) < end and not stop.asked:
+                for arm, messages in heard.items():
+                    newest = plant.cell.newest(arm)
+                    if not messages or newest[0] is not messages[-1][0]:
+                        messages.append(newest)
+                time.sleep(_LOOKS)
+            plant.due(now)
+            fault, answers = plant.fault(), np.array(plant.answer_times)
+            lost = {arm: session.lost for arm, session in plant.cell.sessions.items()}
+        finally:
+            plant.close()
+    reports = [cabinet_report(arm, messages, lost[arm]) for arm, messages in heard.items()]
+    notes = machine_notes()
+    for its in reports:
+        if its.jitter_ms_p99 > _LARGE_JITTER * its.period_ms:
+            notes.append(f"{its.arm}: messages come uneven by over half a period: the network, or a busy computer")
+    if fault is not None:
+        notes.append(sentence(fault))
+    if len(answers):
+        median, late = 1e3 * np.quantile(answers, (0.5, 0.99))
+        notes.insert(0, f"answered after {median:.2f} ms, median, and {late:.2f} ms, p99")
+    table = record_table(f"cabinets, for {duration:g} s", reports, notes)
+    data = {"cabinets": [asdict(report) for report in reports], "answers_s": answers.tolist(), "notes": notes}
+    print_report(data, (table,), json)
+    raise Exit(0 if fault is None else 1)
