@@ -22,7 +22,7 @@ need_ros()
 
 
 SITE_PACKAGES = Path("lib", f"python{sys.version_info.major}.{sys.version_info.minor}", "site-packages")
-NAMES = ["control_msgs", "quest2ros", "tf2_msgs"]
+NAMES = ["control_msgs", "lbr_fri_idl", "quest2ros", "tf2_msgs"]
 
 
 def build_interfaces(
