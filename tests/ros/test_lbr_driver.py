@@ -153,12 +153,23 @@ def test_both_arms_move_in_commanding_active_only_and_trip_no_guard_of_their_dri
     assert {arm: driver.trips for arm, driver in drivers.items()} == {"left": [], "right": []}
 
 
-def test_names_are_told_apart_by_their_last_part_where_that_tells_one() -> None:
+@pytest.mark.parametrize(
+    ("given", "theirs"),
+    [
+        (("lbr_A2", "lbr_A1", "gripper"), ["lbr_A1", "lbr_A2"]),
+        (("A1", "A2"), ["A1", "A2"]),
+        (("left_lbr_A1", "left_lbr_A2"), ["left_lbr_A1", "left_lbr_A2"]),
+        (("one_A1", "two_A1", "one_A2", "two_A2"), []),
+        (("lbr_A1",), []),
+        (("right_A1", "right_A2"), []),
+        (("right_lbr_A1", "right_lbr_A2"), []),
+    ],
+)
+def test_names_are_told_apart_by_their_last_part_where_that_tells_one_of_this_arm(
+    given: tuple[str, ...], theirs: list[str]
+) -> None:
     ours = ("left_A1", "left_A2")
-    assert called_otherwise(ours, ("lbr_A2", "lbr_A1", "gripper")) == {"left_A1": "lbr_A1", "left_A2": "lbr_A2"}
-    assert called_otherwise(ours, ("A1", "A2")) == {"left_A1": "A1", "left_A2": "A2"}
-    assert called_otherwise(ours, ("one_A1", "two_A1", "one_A2", "two_A2")) == {}
-    assert called_otherwise(ours, ("lbr_A1",)) == {}
+    assert called_otherwise(ours, given, ("right",)) == dict(zip(ours, theirs, strict=False))
 
 
 def test_a_cell_of_their_driver_keeps_its_limits_unless_told_otherwise() -> None:

@@ -147,6 +147,7 @@ class JointIntake:
             topic = node.parameter(f"{arm}.joint_states_topic", "joint_states", "carries all joints of this arm")
             self._topics.setdefault(topic, []).append(arm)
         self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
+        self._others = {topic: tuple(set(robot.arms).difference(its)) for topic, its in self._topics.items()}
         self._stamps = dict.fromkeys(self._topics, -math.inf)
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
         what = 'external torques of all joints, for admittance and vibrations: effort of a JointState; "": none'
@@ -205,7 +206,7 @@ class JointIntake:
         names = self._names[topic]
         if len(self._topics[topic]) > 1:
             return []
-        theirs = called_otherwise(tuple(names), tuple(given))
+        theirs = called_otherwise(tuple(names), tuple(given), self._others[topic])
         if theirs and not theirs.items() <= self.theirs.items():
             self.theirs |= theirs
             pairs = ", ".join(f"{name} is {its}" for name, its in theirs.items())

@@ -148,11 +148,14 @@ def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotSta
 
 
 @lru_cache(maxsize=64)
-def called_otherwise(names: tuple[str, ...], given: tuple[str, ...]) -> dict[str, str]:
+def called_otherwise(names: tuple[str, ...], given: tuple[str, ...], others: tuple[str, ...]) -> dict[str, str]:
     """By each of an arm's joints the one of the ``given`` names that differs in its beginning; {} unless all have one.
 
-    A joint left_A1 may be lbr_A1 or A1 elsewhere: its last part tells, where it tells one only.
+    A joint left_A1 may be lbr_A1 or A1 elsewhere: its last part tells, where it tells one only. Names that begin with
+    one of ``others``, the other arms, are those of the wrong arm, and none is taken then.
     """
+    if any(name.startswith(f"{other}_") for name in given for other in others):
+        return {}
     ends = {name: name.partition("_")[2] or name for name in names}
     found = {name: [one for one in given if one == end or one.endswith(f"_{end}")] for name, end in ends.items()}
     return {name: ones[0] for name, ones in found.items()} if all(len(ones) == 1 for ones in found.values()) else {}
