@@ -17,8 +17,8 @@ CELL = "config/dual_iiwa7.yaml"
 FAST = ("run", CELL, "--plant", "kinematic", "--fast", "--json", "--headless")
 
 
-def q2r2(*arguments: str) -> Result:
-    return CliRunner().invoke(app, arguments)
+def q2r2(*arguments: str, typed: str | None = None) -> Result:
+    return CliRunner().invoke(app, arguments, input=typed)
 
 
 def one_object(text: str) -> dict[str, Any]:

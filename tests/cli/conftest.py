@@ -1,6 +1,12 @@
-"""The output of commands does not depend on how busy the machine is."""
+"""The output of commands does not depend on how busy the machine is; cabinets that stand in for KUKA's."""
 
 from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -9,3 +15,27 @@ import pytest
 def _no_notice_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
     """It comes after seconds, whatever they are spent on."""
     monkeypatch.setattr("q2r2_control.cli.output._NOTICE_AFTER", 3600.0)
+
+
+@pytest.fixture
+def fri_cell(tmp_path: Path) -> str:
+    """The shipped cell on ports that are free."""
+    text = Path("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
+    for port in ("30200", "30201"):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            text = text.replace(f"port: {port}", f"port: {free.getsockname()[1]}")
+    (file := tmp_path / "cell.yaml").write_text(text, encoding="utf-8")
+    return str(file)
+
+
+@pytest.fixture
+def cabinets(fri_cell: str) -> Iterator[None]:
+    """Those of ``fri_cell`` that stand in, in a process of their own."""
+    command = (sys.executable, "-m", "q2r2_control", "fri-cabinet", fri_cell)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    assert "monitoring wait" in process.stderr.readline()
+    yield
+    process.terminate()
+    process.communicate()

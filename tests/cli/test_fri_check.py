@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
-import subprocess
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -15,31 +10,7 @@ from q2r2_control.cli.fri_check import cabinet_report
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
 from tests.cli.command import q2r2
 
-CELL = Path("config/dual_iiwa7_fri.yaml")
 WIDE = (10.0,) * 7
-COMMAND = (sys.executable, "-m", "q2r2_control", "fri-cabinet")
-
-
-@pytest.fixture
-def cell(tmp_path: Path) -> str:
-    """The shipped cell on ports that are free."""
-    text = CELL.read_text(encoding="utf-8")
-    for port in ("30200", "30201"):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-            free.bind(("127.0.0.1", 0))
-            text = text.replace(f"port: {port}", f"port: {free.getsockname()[1]}")
-    (file := tmp_path / "cell.yaml").write_text(text, encoding="utf-8")
-    return str(file)
-
-
-@pytest.fixture
-def cabinets(cell: str) -> Iterator[None]:
-    process = subprocess.Popen([*COMMAND, cell], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    assert "monitoring wait" in process.stderr.readline()
-    yield
-    process.terminate()
-    process.communicate()
 
 
 def test_jitter_is_about_the_cabinets_own_period_also_where_messages_are_missing() -> None:
@@ -55,8 +26,8 @@ def test_jitter_is_about_the_cabinets_own_period_also_where_messages_are_missing
 
 
 @pytest.mark.usefixtures("cabinets")
-def test_what_both_cabinets_send_is_said_and_where_one_does_not_command_the_exit_code_is_1(cell: str) -> None:
-    done = q2r2("fri-check", cell, "--duration", "1", "--json")
+def test_what_both_cabinets_send_is_said_and_where_one_does_not_command_the_exit_code_is_1(fri_cell: str) -> None:
+    done = q2r2("fri-check", fri_cell, "--duration", "1", "--json")
     told = json.loads(done.stdout)
     assert [cabinet["arm"] for cabinet in told["cabinets"]] == ["left", "right"]
     for cabinet in told["cabinets"]:
@@ -67,8 +38,8 @@ def test_what_both_cabinets_send_is_said_and_where_one_does_not_command_the_exit
     assert done.exit_code == (0 if active else 1)
 
 
-def test_a_cabinet_that_says_nothing_is_one_line(cell: str) -> None:
-    done = q2r2("fri-check", cell)
+def test_a_cabinet_that_says_nothing_is_one_line(fri_cell: str) -> None:
+    done = q2r2("fri-check", fri_cell)
     assert done.exit_code == 2
     assert "left: no FRI message from cabinet 127.0.0.1 on port" in done.stderr.splitlines()[-1]
 

@@ -1,0 +1,108 @@
+"""``q2r2 fri-mounts``: where the right arm's base is, from points that both tips touch."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import asdict, dataclass
+from typing import Annotated
+
+import numpy as np
+import pinocchio as pin
+from rich.console import Console
+from typer import Option
+
+from q2r2_control.cli.output import ConfigFile, Json, print_report, say
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.plants.fri.plant import FriPlant
+from q2r2_control.robot.mounts import fit_move
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import SIDES, Array, CommandMode
+from q2r2_control.viewer.tables import figure_table
+from q2r2_control.wording import sentence
+
+_STILL, _LISTENS = 2e-3, 0.5  # joints at rest move less than this [rad] for so long [s]
+
+
+@dataclass(frozen=True, slots=True)
+class MountReport:
+    """The right arm's mount that fits, and how well it does."""
+
+    position: list[float]  # [m]
+    rpy: list[float]  # [rad]
+    moved_mm: float  # from where the cell has it
+    turned_deg: float
+    off_mm: list[float]  # of each point
+
+
+def mount_report(config: Config, points: Array, touched: Array) -> MountReport:
+    """``points`` (n, 3) of the left tip and ``touched`` (n, 3) of the right one, in the world of the cell [m]."""
+    move, off = fit_move(points, touched)
+    before = next(arm.mount for side, arm in config.arms.items() if side == SIDES[1])
+    mount = pin.SE3(pin.rpy.rpyToMatrix(*before.rpy), np.array(before.position))
+    after = move * mount
+    return MountReport(
+        position=after.translation.round(5).tolist(),
+        rpy=pin.rpy.matrixToRpy(after.rotation).round(5).tolist(),
+        moved_mm=1e3 * float(np.linalg.norm(after.translation - mount.translation)),
+        turned_deg=float(np.degrees(np.linalg.norm(pin.log3(move.rotation)))),
+        off_mm=(1e3 * off).round(2).tolist(),
+    )
+
+
+def fri_mounts(
+    config: ConfigFile,
+    points: Annotated[int, Option(min=3, max=20, help="That both tips touch, far apart and not on a line.")] = 3,
+    tip: Annotated[tuple[float, float, float], Option(help="In the tool frame of either arm [m].")] = (0.0, 0.0, 0.0),
+    json: Json = False,
+) -> None:
+    """Find where the right arm's base is: guide both tips by hand to the same points, one after the other.
+
+    The left arm's mount is taken as it is in the cell. Lines for the YAML are printed; nothing is written.
+    """
+    cell, console = load_config(config), Console(stderr=True)
+    robot = Robot.from_config(cell)
+    if set(robot.arms) != set(SIDES):
+        raise ConfigError(f"{config}: arms: {', '.join(robot.arms)}; allowed: left and right")
+    plant = FriPlant(robot, cell)
+    plant.begin(CommandMode.POSITION)
+    say("waits for the cabinets", console)
+    tips: dict[str, list[Array]] = {arm: [] for arm in SIDES}
+    try:
+        plant.reset()
+        for number in range(1, points + 1):
+            for arm in SIDES:
+                say(f"point {number} of {points}: guide the {arm} tip there, hold it still, and press Enter", console)
+                tips[arm].append(robot.tool_pose(_resting(plant, arm, robot, console), arm).act(np.array(tip)))
+    finally:
+        plant.close()
+    report = mount_report(cell, *(np.array(tips[arm]) for arm in SIDES))
+    rows = [(f"point {number}", off) for number, off in enumerate(report.off_mm, 1)]
+    notes = [
+        f"the right arm's base is {report.moved_mm:.1f} mm and {report.turned_deg:.2f} deg from where the cell has it",
+        "arms.right.mount:",
+        f"  position: {report.position}",
+        f"  rpy: {report.rpy}",
+    ]
+    print_report(asdict(report), (figure_table("tips, after the fit", ("", "apart [mm]"), rows, notes),), json)
+
+
+def _resting(plant: FriPlant, arm: str, robot: Robot, console: Console) -> Array:
+    """The mean posture (nv,) [rad] of arms of which this one rests, once Enter was pressed."""
+    while True:
+        if not sys.stdin.readline():
+            raise ConfigError("no more input; allowed: Enter for each point")
+        seen, end = [], time.monotonic() + _LISTENS
+        while time.monotonic() < end:
+            plant.due(time.monotonic())
+            seen.append(plant.state().q)
+            time.sleep(0.01)
+        heard = min(session.arrival for session in plant.cell.sessions.values())
+        if time.monotonic() - heard > _LISTENS:
+            fault = plant.fault()
+            raise PlantError("a cabinet is silent" if fault is None else sentence(fault))
+        moved = np.ptp(np.array(seen), axis=0)[robot.arms[arm].joints].max()
+        if moved <= _STILL:
+            return np.asarray(np.mean(seen, axis=0))
+        say(f"the {arm} arm moved by {moved:.4f} rad in {_LISTENS:g} s: hold it still, and press Enter again", console)
