@@ -134,6 +134,35 @@ def test_joint_states_of_an_arm_each_are_merged_and_need_all_joints(context: Any
     node.destroy_node()
 
 
+def test_joints_that_a_driver_calls_otherwise_are_taken_on_an_arms_own_topic_until_its_own_names_come(
+    context: Any, robot: Robot
+) -> None:
+    given = as_arguments("left.joint_states_topic:=/left/joint_states", "right.joint_states_topic:=joint_states")
+    node = BaseNode("intake", context=context, cli_args=given)
+    intake = JointIntake(node, robot)
+    intake.subscribe(lambda state, now: None, lambda message: None)
+
+    def send(topic: str, prefix: str, at: float) -> None:
+        names = [f"{prefix}_A{number}" for number in range(1, 8)]
+        Arrivals(node, topic).arrive(JointState(name=names, position=[at] * 7))
+
+    left = robot.arms["left"].joints
+    send("/joint_states", "right", 0.2)
+    send("/left/joint_states", "lbr", 0.1)
+    assert intake.state is not None
+    np.testing.assert_allclose(intake.state.q[left], 0.1)
+    assert intake.theirs["left_A3"] == "lbr_A3"
+    for topic, prefix in (("/left/joint_states", "other"), ("/left/joint_states", "right"), ("/joint_states", "lbr")):
+        send(topic, prefix, 0.3)  # other robots
+        np.testing.assert_allclose(intake.state.q, np.where(np.isin(np.arange(14), left), 0.1, 0.2))
+    send("/left/joint_states", "left", 0.4)
+    np.testing.assert_allclose(intake.state.q[left], 0.4)
+    assert intake.theirs == {}
+    send("/left/joint_states", "lbr", 0.5)
+    np.testing.assert_allclose(intake.state.q[left], 0.4)
+    node.destroy_node()
+
+
 def test_an_admittance_has_no_good_state_without_external_torques(context: Any, robot: Robot) -> None:
     node = BaseNode("intake", context=context)
     with pytest.raises(ConfigError, match=r"admittance.enabled = true: set the parameter external_torque_topic"):

@@ -35,6 +35,7 @@ from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import Array, RobotState
 from q2r2_control.wording import sentence
 
+_SHARED = "joint_states"  # where no other topic is asked for
 _LATEST = 0.02  # that a target is received, later than others after the time of its stamp, for that to say anything [s]
 _WARNING_TIME = 1.0  # refused targets are reported for this long [s]
 # Takes an arm's target in the world frame, or None if it is no pose, the time [s], the message's number, and when the
@@ -144,7 +145,7 @@ class JointIntake:
         self._node, self._needs_external_torque = node, needs_external_torque
         self._topics: dict[str, list[str]] = {}  # the arms whose joints each topic carries
         for arm in robot.arms:
-            topic = node.parameter(f"{arm}.joint_states_topic", "joint_states", "carries all joints of this arm")
+            topic = node.parameter(f"{arm}.joint_states_topic", _SHARED, "carries all joints of this arm")
             self._topics.setdefault(topic, []).append(arm)
         self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
         self._others = {topic: tuple(set(robot.arms).difference(its)) for topic, its in self._topics.items()}
@@ -160,6 +161,7 @@ class JointIntake:
         self._publishers = Publishers(node, self._topics)
         self._values = np.zeros((3, len(robot.joint_names)))
         self.state: RobotState | None = None  # the newest of all arms
+        self._own_names: set[str] = set()  # topics on which the arms' own names have come
         self.theirs: dict[str, str] = {}  # names of joints that an arm's driver calls otherwise, by ours
         self.driver_fault: Callable[[], Reason | None] = lambda: None  # why arms do not follow, as a driver says
 
@@ -180,7 +182,12 @@ class JointIntake:
     def _on_message(self, take: TakeState, look: Callable[[JointState], None], topic: str, message: JointState) -> None:
         look(message)
         names = self._names[topic]
-        if set(names).isdisjoint(message.name) and not (names := self._named_otherwise(topic, message.name)):
+        if not set(names).isdisjoint(message.name):
+            if topic not in self._own_names:
+                self._own_names.add(topic)
+                for name in names:
+                    self.theirs.pop(name, None)
+        elif not (names := self._named_otherwise(topic, message.name)):
             return  # of a gripper or another robot
         now = self._node.now
         part = robot_state(message, names, now)
@@ -204,14 +211,15 @@ class JointIntake:
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
         """The sender's names of an arm's joints, where they can be known; told once."""
         names = self._names[topic]
-        if len(self._topics[topic]) > 1:
+        # Any robot may publish on the usual topic, and one that has sent the arm's own names means no others.
+        if topic == _SHARED or len(self._topics[topic]) > 1 or topic in self._own_names:
             return []
         theirs = called_otherwise(tuple(names), tuple(given), self._others[topic])
-        if theirs and not theirs.items() <= self.theirs.items():
+        if theirs and names[0] not in self.theirs:
             self.theirs |= theirs
             pairs = ", ".join(f"{name} is {its}" for name, its in theirs.items())
             self._node.get_logger().info(f"{topic}: {pairs}")
-        return list(theirs.values())
+        return list(theirs.values()) if theirs.items() <= self.theirs.items() else []
 
     def take_external(self, torques: Array) -> None:
         """External torques of all joints, (nv,) [Nm]."""
