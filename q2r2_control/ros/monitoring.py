@@ -89,7 +89,8 @@ class WatchedPublisher:
     The graph lists such a subscriber for seconds. Meanwhile the targets move on, and a subscriber that is started in
     its place would begin with a jump. A stream of which nothing was ever acknowledged is not judged, because the
     remains of a subscriber that ended earlier do not acknowledge either. Best-effort subscribers never acknowledge and
-    do not count. All times are real time, also where a simulation has its own.
+    do not count. Middlewares without acknowledgements, on Zenoh, affirm all, and ``q2r2 ros doctor`` says so. All times
+    are real time, also where a simulation has its own.
     """
 
     def __init__(self, node: Node, kind: type, topic: str, timeout: float) -> None:

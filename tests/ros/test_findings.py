@@ -149,3 +149,11 @@ def test_it_says_whom_nodes_find(variables: dict[str, str], reaches: str) -> Non
     facts, findings = examine_environment(variables | {"ROS_DOMAIN_ID": "-1"})  # so that no node is tried
     assert facts["reaches"].startswith(reaches)
     assert any("ROS_DOMAIN_ID is '-1'" in finding.what and finding.stops_arms for finding in findings)
+
+
+@pytest.mark.parametrize(("name", "told"), [("rmw_zenoh_cpp", True), ("rmw_fastrtps_cpp", False)])
+def test_it_says_of_a_middleware_without_acknowledgements_that_a_receiver_that_hangs_is_not_noticed(
+    name: str, told: bool
+) -> None:
+    _, findings = examine_environment({"RMW_IMPLEMENTATION": name, "ROS_DOMAIN_ID": "-1"})
+    assert told == any("has no acknowledgements" in one.what and not one.stops_arms for one in findings)

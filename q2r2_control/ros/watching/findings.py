@@ -196,6 +196,10 @@ def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str],
             findings.append(answer)
         else:
             facts["middleware"], lacking = answer["middleware"], answer["lacking"]
+    # Implementations on Zenoh answer yes to whether all was acknowledged, whoever hangs: it has no acknowledgements.
+    if "zenoh" in facts["middleware"]:
+        what = f"{facts['middleware']} has no acknowledgements: a receiver that hangs is not noticed by that"
+        findings.append(Finding(False, what, "export RMW_IMPLEMENTATION=rmw_fastrtps_cpp or rmw_cyclonedds_cpp"))
     if lacking:
         what = f"the messages of {', '.join(lacking)} cannot be imported"
         findings.append(error(what, "q2r2 ros build-interfaces"))
