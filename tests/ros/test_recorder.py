@@ -28,7 +28,7 @@ from q2r2_control.errors import RecordingError
 from q2r2_control.judging.episode import read_episode
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording.bag import METADATA_FILE
-from q2r2_control.recording.messages import RECORDER_EVENTS
+from q2r2_control.recording.messages import RECORDER_EVENTS, arm_events
 from q2r2_control.recording.reader import Recording, read_spans
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
@@ -95,6 +95,10 @@ def test_messages_are_in_the_file_to_the_byte_without_ros(recorder: RunningRecor
     qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # as deep as the recorder's
     node.create_subscription(PoseStamped, HAND, heard.append, qos, raw=True)
     before = time.time_ns()
+    strange = node.create_publisher(String, arm_events("left"), RECORDED_QOS)
+    wait_until(strange.get_subscription_count, "the recorder listens to events")
+    for text in ("{", "[]", '{"kind": "none"}'):
+        strange.publish(String(data=text))
     last = record_poses(recorder, node, 100)
     wait_until(lambda: heard and heard[-1].startswith(last), "the test's node has heard the last one too")
     assert recorder.state()["lost_messages"] == 0

@@ -119,7 +119,12 @@ class RecorderNode(BaseNode):
         number, sent = info["publication_sequence_number"] or 0, info["source_timestamp"]
         self._waiting.append(Message(topic.channel, number, received, max(sent, 0), bytes(payload)))
         if told:
-            event = Event.from_json(json.loads(deserialize_message(payload, String).data))
+            text = deserialize_message(payload, String).data
+            try:
+                event = Event.from_json(json.loads(text))
+            except (ValueError, TypeError, KeyError):  # it is in the file, and tells of no episode
+                self.drop(topic.name, f"{text!r:.60}")
+                return
             self._marks.follow(event.kind)
             self._judge.record_event(self._event(event.reason))
             self.report_health()
