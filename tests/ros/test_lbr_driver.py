@@ -37,7 +37,8 @@ from q2r2_control.ros.launch.processes import nodes_of
 PERIOD = 0.01  # of the driver, by default [s]
 TAU = 0.04  # of its filter of positions, by default [s]
 NARROWER = math.radians(1.0)  # than the model's limits are the driver's [rad]
-SAME = 1e-3  # of a first command and the cabinet's own position [rad]
+SAME = 1e-4  # of a first command and the cabinet's own position [rad]
+SAG = 2e-3  # of the measured joints below it [rad]
 TOPICS = {"for Jazzy": ("lbr_joint_position_command", "lbr_state"), "of 2024": ("joint_position", "state")}
 
 
@@ -82,11 +83,15 @@ class FakeDriver:
         self.q = self.q + step
         quality, mode = {"connection_quality": 3, "drive_state": 2}, {"client_command_mode": int(CommandKind.POSITION)}
         torques = np.full(len(self.q), self.torque)
-        self._states.publish(LBRState(session_state=int(self.session), external_torque=torques, **quality, **mode))
+        self._states.publish(
+            LBRState(
+                session_state=int(self.session), external_torque=torques, ipo_joint_position=self.q, **quality, **mode
+            )
+        )
         names = [f"lbr_A{number}" for number in (3, 1, 2, 4, 5, 7, 6)]
         order = [2, 0, 1, 3, 4, 6, 5]
         velocity = (step / PERIOD)[order].tolist()
-        self._joints.publish(JointState(name=names, position=self.q[order].tolist(), velocity=velocity))
+        self._joints.publish(JointState(name=names, position=(self.q - SAG)[order].tolist(), velocity=velocity))
 
 
 @pytest.mark.alone

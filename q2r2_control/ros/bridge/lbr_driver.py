@@ -36,6 +36,7 @@ class LbrDrivers:
         """``namespaces`` of the drivers, by arm. ``on_torques`` gets external torques (nv,) [Nm] of all arms."""
         self._robot, self._namespaces, self._wanted = robot, dict(namespaces), _WANTED[mode]
         self._on_torques, self._torques = on_torques, np.zeros(robot.model.nv)
+        self._held = np.full(robot.model.nv, np.nan)  # by the cabinets' own interpolation [rad]
         self._newest: dict[str, tuple[Any, float]] = {}  # of each arm, and when it came [s]
         kind = import_module("lbr_fri_idl.msg").LBRState
         for arm, namespace in self._namespaces.items():
@@ -62,8 +63,13 @@ class LbrDrivers:
                 return Reason.of(ReasonKind.FRI_COMMAND_MODE, arm=arm, asked=asked, wanted=wanted)
         return None
 
+    def held(self) -> Array | None:
+        """Where the cabinets hold the arms, (nv,) [rad], which the first command has to equal; None: not known."""
+        return self._held.copy() if np.isfinite(self._held).all() else None
+
     def _on_state(self, arm: str, state: Any) -> None:
         self._newest[arm] = state, time.monotonic()
+        self._held[self._robot.arms[arm].joints] = state.ipo_joint_position
         torques = np.asarray(state.external_torque)
         if np.isfinite(torques).all():
             self._torques[self._robot.arms[arm].joints] = torques

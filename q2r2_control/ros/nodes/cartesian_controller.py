@@ -70,7 +70,7 @@ class CartesianControllerNode(ManagedNode):
         self._output.theirs = self._joints.theirs
         if drivers:
             told = LbrDrivers(self, robot, drivers, self._output.drive.mode, self._joints.take_external)
-            self._joints.driver_fault = told.fault
+            self._joints.driver_fault, self._joints.driver_held = told.fault, told.held
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
         # A message with a bad number among good ones is another publisher's: no reason to bridge it.
