@@ -20,7 +20,7 @@ from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
-from q2r2_control.plants.fri.wire import CommandKind, Operation, Session
+from q2r2_control.plants.fri.wire import CommandKind, Operation, Session, in_words
 from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
@@ -49,7 +49,7 @@ class _Pendant:
                 self._ready_since[arm] = now
             elif now - since >= self._start_after:
                 cabinet.start_overlay()
-            line = cabinet.session.name.lower().replace("_", " ")
+            line = in_words(cabinet.session)
             if cabinet.trips and cabinet.session < Session.COMMANDING_WAIT:
                 line += f" ({cabinet.trips[-1]})"
             if self._said.get(arm) != line:
@@ -128,7 +128,7 @@ def fri_cabinet(
     rows = []
     for name, cabinet in server.cabinets.items():
         ends = [str(trip) for trip in cabinet.trips]
-        state = cabinet.session.name.lower().replace("_", " ")
+        state = in_words(cabinet.session)
         data["cabinets"][name] = {"state": state, "missed": cabinet.missed, "trips": ends}
         rows.append((name, state, cabinet.missed, ", ".join(sorted(set(ends))) or "-"))
     if watch is not None:

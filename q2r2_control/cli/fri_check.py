@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from enum import IntEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +16,7 @@ from typer import Exit, Option
 from q2r2_control.cli.output import ConfigFile, Json, print_report, say
 from q2r2_control.config.cell import load_config
 from q2r2_control.plants.fri.plant import FriPlant
-from q2r2_control.plants.fri.wire import Monitoring
+from q2r2_control.plants.fri.wire import Monitoring, in_words
 from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, real_time, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
@@ -61,18 +60,14 @@ def cabinet_report(arm: str, heard: Sequence[tuple[Monitoring, float]], lost: in
         lost=lost,
         jitter_ms_p99=1e3 * float(np.quantile(late, 0.99)) if len(late) else 0.0,
         jitter_ms_max=1e3 * float(late.max(initial=0.0)),
-        session=_word(newest.session),
-        quality=_word(newest.quality),
-        safety=_word(newest.safety),
-        operation=_word(newest.operation),
-        drives=_word(newest.drives),
+        session=in_words(newest.session),
+        quality=in_words(newest.quality),
+        safety=in_words(newest.safety),
+        operation=in_words(newest.operation),
+        drives=in_words(newest.drives),
         joints_deg=np.degrees(newest.q).round(2).tolist(),
         external_torque_nm=None if newest.external_tau is None else max(map(abs, newest.external_tau)),
     )
-
-
-def _word(state: IntEnum) -> str:
-    return state.name.lower().replace("_", " ")
 
 
 def machine_notes() -> list[str]:

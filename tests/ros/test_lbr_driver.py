@@ -18,7 +18,7 @@ from q2r2_control.config.resources import find_resource
 from q2r2_control.plants.fri.wire import CommandKind, Session
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.bridge.messages import called_otherwise
-from q2r2_control.types import SIDES, Array
+from q2r2_control.types import SIDES, Array, CommandMode
 from tests.ros.cell import PATIENT, RATE, start_controller
 from tests.ros.conftest import need_ros
 from tests.ros.processes import CONFIG, Processes, States
@@ -31,8 +31,10 @@ from lbr_fri_idl.msg import LBRJointPositionCommand, LBRState
 from sensor_msgs.msg import JointState
 
 from q2r2_control.ros.base_node import COMMAND_QOS
+from q2r2_control.ros.bridge.lbr_driver import LbrDrivers
 from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.launch.processes import nodes_of
+from tests.ros.test_intakes import Arrivals
 
 PERIOD = 0.01  # of the driver, by default [s]
 TAU = 0.04  # of its filter of positions, by default [s]
@@ -48,7 +50,6 @@ class FakeDriver:
     def __init__(self, node: Any, robot: Robot, arm: str, release: str) -> None:
         joints = robot.arms[arm].joints
         self.q, self.session, self.trips = robot.home[joints].copy(), Session.MONITORING_READY, list[str]()
-        self.torque = 0.0
         self._wanted: Array | None = None
         self._lower, self._upper = robot.position_lower[joints] + NARROWER, robot.position_upper[joints] - NARROWER
         self._fastest = robot.velocity_limit[joints]
@@ -82,12 +83,7 @@ class FakeDriver:
             self.trips.append(f"velocity {step / PERIOD}")
         self.q = self.q + step
         quality, mode = {"connection_quality": 3, "drive_state": 2}, {"client_command_mode": int(CommandKind.POSITION)}
-        torques = np.full(len(self.q), self.torque)
-        self._states.publish(
-            LBRState(
-                session_state=int(self.session), external_torque=torques, ipo_joint_position=self.q, **quality, **mode
-            )
-        )
+        self._states.publish(LBRState(session_state=int(self.session), ipo_joint_position=self.q, **quality, **mode))
         names = [f"lbr_A{number}" for number in (3, 1, 2, 4, 5, 7, 6)]
         order = [2, 0, 1, 3, 4, 6, 5]
         velocity = (step / PERIOD)[order].tolist()
@@ -156,6 +152,16 @@ def test_both_arms_move_in_commanding_active_only_and_trip_no_guard_of_their_dri
     farthest = [abs(driver.q[6]) for driver in drivers.values()]
     assert max(farthest) > math.radians(165.0)
     assert {arm: driver.trips for arm, driver in drivers.items()} == {"left": [], "right": []}
+
+
+def test_external_torques_are_told_once_both_drivers_have_and_none_that_are_no_numbers(node: Any, robot: Robot) -> None:
+    told: list[Array] = []
+    LbrDrivers(node, robot, {arm: f"/{arm}" for arm in SIDES}, CommandMode.POSITION, told.append)
+    for arm, torque in (("left", 1.0), ("right", 2.0), ("right", math.nan), ("left", 3.0)):
+        Arrivals(node, f"/{arm}/lbr_state").arrive(LBRState(external_torque=np.full(7, torque)))
+    assert len(told) == 2
+    for arm, torque in (("left", 3.0), ("right", 2.0)):
+        np.testing.assert_array_equal(told[-1][robot.arms[arm].joints], torque)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from q2r2_control.plants.fri.wire import (
     Joints,
     Monitoring,
     Session,
+    in_words,
     read_monitoring,
     write_command,
 )
@@ -64,8 +65,8 @@ class ArmSession:
                 return Reason.of(ReasonKind.FRI_UNREADABLE, arm=self._arm, source=self._source, text=str(self._problem))
             return Reason.of(ReasonKind.FRI_SILENT, arm=self._arm, source=self._source)
         if newest.session is not Session.COMMANDING_ACTIVE:
-            doing, quality = newest.session.name.lower().replace("_", " "), newest.quality.name.lower()
-            safety, drives = newest.safety.name.lower().replace("_", " "), newest.drives.name.lower()
+            states = newest.session, newest.quality, newest.safety, newest.drives
+            doing, quality, safety, drives = map(in_words, states)
             return Reason.of(
                 ReasonKind.FRI_SESSION, arm=self._arm, session=doing, quality=quality, safety=safety, drives=drives
             )

@@ -72,6 +72,10 @@ class Drives(IntEnum):
     ACTIVE = 2
 
 
+def in_words(state: IntEnum) -> str:
+    return state.name.lower().replace("_", " ")
+
+
 class CommandKind(IntEnum):
     """The commands that the Sunrise application lets a client overlay."""
 

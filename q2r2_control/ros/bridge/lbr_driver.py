@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.plants.fri.wire import CommandKind, Drives, Quality, Safety, Session
+from q2r2_control.plants.fri.wire import CommandKind, Drives, Quality, Safety, Session, in_words
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.types import Array, CommandMode
@@ -79,4 +79,4 @@ class LbrDrivers:
 
 def _word(kind: type[IntEnum], value: int) -> str:
     """In words; a number that a later version of FRI may have stays one."""
-    return kind(value).name.lower().replace("_", " ") if value in list(kind) else str(value)
+    return in_words(kind(value)) if value in list(kind) else str(value)
