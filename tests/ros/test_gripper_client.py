@@ -37,7 +37,10 @@ class Bench:
         self.refuses = False
         self.answers = self.far.create_publisher(Float64MultiArray, "/controller/opening/left", LATCHED_QOS)
         self.far.create_subscription(
-            Float64MultiArray, "/targets/wanted_opening", lambda message: self.asked.append(list(message.data)), 10
+            Float64MultiArray,
+            "/targets/wanted_opening",
+            lambda message: self.asked.append(list(message.data)),
+            LATCHED_QOS,
         )
         self.far.create_subscription(
             Float64MultiArray, "/fingers", lambda message: self.goals.put(1.0 - message.data[0] / _CLOSED), 10
@@ -161,3 +164,11 @@ def test_a_gripper_behind_a_topic_waits_too_and_two_presses_before_an_answer_are
         bench.grant(1.0, 1.0)
         bench.wait(lambda: bench.openings() == [0.6, 1.0], "and to the end")
         assert bench.client.state == "open"
+
+
+def test_a_press_on_a_gripper_s_topic_that_nobody_reads_says_so(domain: int) -> None:
+    with spun_node(domain, "alone") as node:
+        settings = GripperSettings(action_type=GripperType.FLOAT64_MULTI_ARRAY, closed_position=_CLOSED)
+        client = GripperClient(node, "/nobody", settings)
+        client.command(True, 0.0)
+        assert (client.problem, client.state) == ("no gripper server at /nobody", "open")

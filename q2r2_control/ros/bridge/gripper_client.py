@@ -162,7 +162,9 @@ class GripperClient:
             self._command(granted, now)
 
     def _has_server(self) -> bool:
-        return self._client is None or self._client.server_is_ready()
+        if self._publisher is not None:
+            return bool(self._publisher.get_subscription_count())
+        return bool(self._client and self._client.server_is_ready())
 
     def _give_up(self, why: str) -> None:
         self._end(f"{self._name} goes no farther: {why}")
