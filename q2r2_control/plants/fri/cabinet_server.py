@@ -25,6 +25,8 @@ from q2r2_control.types import Array, Command, CommandMode
 
 _LONGEST_STALL = 1.0  # of this process; a longer one is the cabinet's [s]
 _LONGEST_CATCH_UP = 0.05  # what it falls behind by more is dropped [s]
+_LOOK_AGAIN = 2e-4  # whether the answer has come that a message waits for, which is late already [s]
+_ROUNDING = 1e-6
 _SAG = 1e-3  # the simulated arm may be this much beyond its limits [rad]
 # A cabinet's joint impedance while no torque overlays it [Nm/rad], [Nm s/rad].
 _STIFFNESS, _DAMPING = 1000.0, 60.0
@@ -77,7 +79,7 @@ class SimulatedArm:
     def wanted(self, t: float) -> tuple[Array, Array]:
         """Where the drives are to be at ``t`` [s], and how fast."""
         share, way = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
-        if share >= 1.0:
+        if share > 1.0 + _ROUNDING:  # at the end itself, which every message comes at, they still move
             return np.array(self._to), np.zeros(JOINTS)
         return np.add(self._from, max(share, 0.0) * way), way / self._lasts
 
@@ -180,9 +182,9 @@ class CabinetServer:
         cabinet, opened, client = self.cabinets[arm], self._sockets[arm], self._clients[arm]
         # A client that commands is not to have less time because this process was late.
         commands = cabinet.session >= Session.COMMANDING_WAIT
-        enough = self._sent_at.get(arm, -math.inf) + cabinet.settings.period
-        if commands and not cabinet.is_answered and time.monotonic() - self._began < enough:
-            self._at(enough, lambda: self._send(arm, due, tick))
+        enough, now = self._sent_at.get(arm, -math.inf) + cabinet.settings.period, time.monotonic() - self._began
+        if commands and not cabinet.is_answered and now < enough:
+            self._at(min(enough, now + _LOOK_AGAIN), lambda: self._send(arm, due, tick))
             return
         self.cell.advance(due)
         if (gripper := self._grippers.get(arm)) is not None:
