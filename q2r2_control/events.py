@@ -178,6 +178,10 @@ class ReasonKind(StrEnum):
         "commands are followed in commanding active",
     )
     FRI_COMMAND_MODE = "fri_command_mode", "{arm}: the Sunrise application asks for {asked} commands; allowed: {wanted}"
+    FRI_TOO_SELDOM = (
+        "fri_too_seldom",
+        "{arm}: the cabinet asks every {period:g} ms; allowed for torques: {allowed:g} at most",
+    )
     FRI_DROPPED = "fri_dropped", "{arm}: the cabinet ended the session"
     FRI_BEHIND = "fri_behind", "{arm}: the cabinet asks less often than every {period:g} ms, and is {lag:.2f} s behind"
     FRI_OVERTAKEN = "fri_overtaken", "the control loop was too late for the cabinets"

@@ -147,6 +147,8 @@ def rehearsal(config: str, mode: CommandMode, tasks: Sequence[AssemblyTask]) -> 
         config,
         "--mode",
         mode,
+        "--period",
+        "5" if mode is CommandMode.TORQUE else "10",
         "--json",
         *(word for task in tasks for word in ("--task", task.name)),
     ]

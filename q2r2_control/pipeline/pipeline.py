@@ -54,7 +54,9 @@ class Pipeline:
     ) -> None:
         config.teleop.bindings.check_device(input.controls)
         self.config, self.robot, self.input, self.plant = config, robot, input, plant
-        self.drive = make_drive(check_mode(mode, plant), robot, config, CommandMode.POSITION in plant.modes)
+        # A session is of one mode: its arms follow no positions while torques are not safe.
+        has_servos = CommandMode.POSITION in plant.modes and not isinstance(plant, SessionPlant)
+        self.drive = make_drive(check_mode(mode, plant), robot, config, has_servos)
         self.controller = CartesianController(robot, permitted(config.control, self.drive))
         self._data = robot.model.createData()
         self.listeners: list[Callable[[Tick], None]] = []
@@ -225,7 +227,7 @@ class Pipeline:
         state = self._state = self.plant.state()
         seen, passed = self._plant_clock.stamped(state, now)
         lost = None if self._sessions is None else self._sessions.fault()
-        self.loop.observe(lost or seen, now, passed)
+        self.loop.observe(seen, now, passed, lost)
         openings, tools = self.plant.gripper_openings(), self._measured_tools(state)
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)

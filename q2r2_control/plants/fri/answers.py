@@ -115,18 +115,20 @@ class AnswerTimes:
         self._period, self._delay = period, delay
         self._questions = 0
         self._arrival, self._counter = 0.0, 0  # of the newest question, averaged
-        self._answers: dict[int, _Answer] = {}  # by their counter
+        self._answers: dict[int, _Answer] = {}  # the last ones by their counter
+        self._newest: _Answer | None = None  # that is for the latest time
 
     def restart(self) -> None:
         """The arm stands still at a new path's begin, so that the next answer may be for any time."""
-        self._answers, self._questions = {}, 0
+        self._answers, self._newest, self._questions = {}, None, 0
 
     def at(self, question: int, arrival: float, counter: int, heard: int) -> float:
         """The time that our answer ``counter`` to a ``question`` is for, that came at ``arrival``.
 
         ``heard``: counter of our newest answer that the cabinet knows of.
         """
-        newest = max(self._answers.values(), default=None)
+        newest = self._newest
+        self._answers.pop(counter - _REMEMBERED, None)
         if newest is not None and question == self._counter:  # it came twice
             self._answers[counter] = newest
             return newest.time
@@ -140,8 +142,8 @@ class AnswerTimes:
         excess = min(max(excess, -CATCH_UP), CATCH_UP)
         rate = min(max(1.0 + excess, before.rate - ramp), before.rate + ramp)
         answer = _Answer(before.time + rate * self._period, rate)
-        self._answers = {known: one for known, one in self._answers.items() if known > counter - _REMEMBERED}
         self._answers[counter] = answer
+        self._newest = answer if newest is None else max(newest, answer)
         return answer.time
 
     def _even(self, question: int, arrival: float) -> float:

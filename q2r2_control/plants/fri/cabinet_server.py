@@ -28,8 +28,7 @@ _LONGEST_CATCH_UP = 0.05  # what it falls behind by more is dropped [s]
 _LOOK_AGAIN = 2e-4  # whether the answer has come that a message waits for, which is late already [s]
 _ROUNDING = 1e-6
 _SAG = 1e-3  # the simulated arm may be this much beyond its limits [rad]
-# A cabinet's joint impedance while no torque overlays it [Nm/rad], [Nm s/rad].
-_STIFFNESS, _DAMPING = 1000.0, 60.0
+_HOLDING = 0.02  # time constant by which a cabinet holds an arm that no torque overlays, critically damped [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +111,11 @@ class SimulatedArms:
             return Command(CommandMode.POSITION, q, v, 0.0 * q, self.openings)
         state = self.plant.state()
         tau = pin.computeGeneralizedGravity(self.robot.model, self._data, state.q).copy()
+        inertia = pin.crba(self.robot.model, self._data, state.q).diagonal()
+        back = inertia / _HOLDING * ((q - state.q) / (4.0 * _HOLDING) - state.v)
         for name, arm in self.arms.items():
             joints = self.robot.arms[name].joints
-            held = _STIFFNESS * (q - state.q)[joints] - _DAMPING * state.v[joints]
-            tau[joints] += held if arm.overlay is None else arm.overlay
+            tau[joints] += back[joints] if arm.overlay is None else arm.overlay
         return Command(CommandMode.TORQUE, q, v, tau, self.openings)
 
 

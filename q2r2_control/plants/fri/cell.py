@@ -18,13 +18,16 @@ from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.plants.fri.answers import ReferencePath
 from q2r2_control.plants.fri.session import DELAY, ArmSession
-from q2r2_control.plants.fri.wire import JOINTS, Monitoring
+from q2r2_control.plants.fri.wire import JOINTS, CommandKind, Monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
 # From the decision how far the reference goes until the path has it [s].
 _MARGIN = 0.004
-_SAME = 1e-6  # of a reference that begins where its arm is held [rad]
+# In which an arm loses most of its speed where no overlay comes: several periods of a cabinet [s].
+_BRAKING_TIME = 0.03
+# Of a reference that begins where its arm is held, or, with torques, where it is measured [rad].
+_SAME, _NEAR = 1e-6, 0.02
 _FROM_REST = 20.0  # more than a joint's acceleration in the first tick [rad/s^2]
 
 
@@ -42,6 +45,8 @@ class FriCell:
         self.sessions, self._robot, self._period = dict(sessions), robot, period
         self._grippers = dict(grippers or {})
         self._joints = {arm: robot.arms[arm].joints for arm in sessions}
+        for arm, session in sessions.items():
+            session.torque_limit = robot.torque_limit[self._joints[arm]]
         self._data = robot.model.createData()
         self._lock = Lock()
         self._now = self._start = self._end = -math.inf  # of the newest tick, and of its piece of the path [s]
@@ -72,9 +77,9 @@ class FriCell:
         deceleration = command.deceleration
         overlay = None
         if command.mode is CommandMode.TORQUE:
-            # The cabinet bears the weight by itself.
-            gravity = pin.computeGeneralizedGravity(self._robot.model, self._data, self.state().q)
-            overlay = command.tau - gravity
+            model, data, measured = self._robot.model, self._data, self.state().q
+            overlay = command.tau - pin.computeGeneralizedGravity(model, data, measured)  # which the cabinet bears
+            damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         with self._lock:
             for arm, session in self.sessions.items():
                 joints = self._joints[arm]
@@ -82,7 +87,7 @@ class FriCell:
                 stop = np.ones(JOINTS) if deceleration is None else deceleration[joints]  # one at rest needs none
                 if session.following and session.answered > self._start:
                     session.following, self._overtaken = False, True  # its stop goes on to the end
-                elif not session.following and self._begins(q - session.path.rest, v):
+                elif not session.following and self._begins(session, q, v):
                     session.following = session.fault(self._now) is None
                     session.path = ReferencePath(self._start, session.path.rest)
                 if session.following and self._end > session.path.end:  # a second command in a tick is no motion
@@ -91,12 +96,15 @@ class FriCell:
                 if gripper is not None and opening is not None:
                     session.outputs = {gripper.output: opening >= 0.5 if gripper.digital else float(opening)}
                 if overlay is not None:
-                    session.tau, session.tau_came = tuple(overlay[joints].tolist()), self._now
+                    session.tau, session.tau_came = overlay[joints], self._now
+                    session.damping = damping[joints]
 
-    def _begins(self, way: Array, v: Array) -> bool:
-        """Whether a reference that is now a ``way`` off, and goes on at ``v``, was at rest there a tick ago."""
-        step = self._end - self._start
-        return bool((np.abs(v) <= _FROM_REST * step).all() and (np.abs(way) <= np.abs(v) * step + _SAME).all())
+    def _begins(self, session: ArmSession, q: Array, v: Array) -> bool:
+        """Whether a reference that is now at ``q``, and goes on at ``v``, was at rest a tick ago where the arm is."""
+        torques, step = session.wanted is CommandKind.TORQUE and session.newest, self._end - self._start
+        there, allowed = (np.array(torques.q), _NEAR) if torques else (session.path.rest, _SAME)
+        way = np.abs(q - there)
+        return bool((np.abs(v) <= _FROM_REST * step).all() and (way <= np.abs(v) * step + allowed).all())
 
     def fault(self) -> Reason | None:
         """Why the arms cannot be commanded at the newest tick, or ceased to be since the one before; None: they can."""
@@ -142,6 +150,7 @@ class FriCell:
                 tau[joints] = newest.tau or 0.0
                 knows_external &= newest.external_tau is not None
                 external[joints] = newest.external_tau or 0.0
-                held[joints] = session.path.rest if session.fault(self._now) is None else newest.q
+                is_held = session.wanted is CommandKind.POSITION and session.fault(self._now) is None
+                held[joints] = session.path.rest if is_held else newest.q
             stamp = min(session.arrival for session in self.sessions.values())
         return RobotState(q, v, tau, external if knows_external else None, stamp, held)

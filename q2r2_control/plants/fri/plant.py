@@ -34,8 +34,7 @@ _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: Comman
 class FriPlant:
     """The arms start where they stand, and again after each session that a cabinet ended."""
 
-    # Torques are not among them: in the rehearsal the cabinets ended their sessions for torques beyond the limit.
-    modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
     realtime_only = True
 
     def __init__(self, robot: Robot, config: Config) -> None:

@@ -14,7 +14,6 @@ from q2r2_control.plants.fri.wire import (
     Command,
     CommandKind,
     IoValue,
-    Joints,
     Monitoring,
     Session,
     in_words,
@@ -31,8 +30,10 @@ _AT_REST = 1e-9  # [rad]
 _RESTARTED = 1000  # a counter that is back by more is that of a session that began anew
 _COUNTERS = 1 << 32
 _MOST_AHEAD = 20  # messages that may come at once after a moment without any
-_TORQUE_LASTS = 0.02  # a torque that nobody renews is a push without end [s]
-_NO_TORQUE = (0.0,) * JOINTS
+# A torque that nobody renews is a push without end: one that brakes follows it, and after a while no answer, so that
+# the cabinet ends the session [s].
+_TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
+_TORQUE_PERIOD = 0.005  # between two answers at most: with 0.01 the arm swings up at the default stiffness [s]
 
 
 class ArmSession:
@@ -48,7 +49,9 @@ class ArmSession:
         self.path = ReferencePath(0.0, np.zeros(JOINTS))
         self.following = self.dropped = False  # and whether the arm ceased to follow
         self.answered = -math.inf  # the latest time that an answer was for [s]
-        self.tau, self.tau_came = _NO_TORQUE, -math.inf  # overlay [Nm], and when it was decided on [s]
+        self.tau, self.tau_came = np.zeros(JOINTS), -math.inf  # overlay [Nm], and when it was decided on [s]
+        self.damping = np.zeros(JOINTS)  # that brakes where no overlay comes [Nm s/rad]
+        self.torque_limit = np.full(JOINTS, math.inf)  # of overlays [Nm]
         self.outputs: dict[str, IoValue] = {}  # of the cabinet, by name
         self._lag = 0.0  # of the answers behind where they are to be [s]
         self.lost = self.unreadable = 0  # messages of the cabinet
@@ -64,6 +67,9 @@ class ArmSession:
             if self._problem is not None:
                 return Reason.of(ReasonKind.FRI_UNREADABLE, arm=self._arm, source=self._source, text=str(self._problem))
             return Reason.of(ReasonKind.FRI_SILENT, arm=self._arm, source=self._source)
+        if self._is_too_slow(newest):
+            period, allowed = 1e3 * newest.period * newest.multiplier, 1e3 * _TORQUE_PERIOD
+            return Reason.of(ReasonKind.FRI_TOO_SELDOM, arm=self._arm, period=period, allowed=allowed)
         if newest.session is not Session.COMMANDING_ACTIVE:
             states = newest.session, newest.quality, newest.safety, newest.drives
             doing, quality, safety, drives = map(in_words, states)
@@ -90,6 +96,8 @@ class ArmSession:
         if message.session is Session.IDLE:
             return None
         command = self._command(message, now)
+        if command is None:
+            return None
         self._answers += 1
         return write_command(command, message.version)
 
@@ -136,7 +144,10 @@ class ArmSession:
         self.following = self._begun = False
         self._times = None
 
-    def _command(self, message: Monitoring, now: float) -> Command:
+    def _is_too_slow(self, message: Monitoring) -> bool:
+        return self.wanted is CommandKind.TORQUE and message.period * message.multiplier > _TORQUE_PERIOD
+
+    def _command(self, message: Monitoring, now: float) -> Command | None:
         counter, reflected = self._answers, message.counter
         if message.session < Session.COMMANDING_WAIT:
             self._begin_anew()
@@ -150,16 +161,23 @@ class ArmSession:
             self.following, self._begun = False, True
             self.path = ReferencePath(now, np.array(message.ipo_q or message.q))
             self._times.restart()
+        if self.wanted is CommandKind.TORQUE:
+            return self._torque(message, now)
         time = self._times.at(message.counter, now, counter, message.reflected)
         self.answered, self._lag = max(self.answered, time), now - DELAY - time
         there = self.path.at(time)
         if abs(self._lag) > message.period and np.abs(there - self.path.rest).max() <= _AT_REST:
             self._times.restart()  # where nothing moves, the next answer may be for any time
-        q: Joints = tuple(there.tolist())
-        if self.wanted is not CommandKind.TORQUE:
-            return Command(counter, reflected, q, io=self.outputs)
-        renewed = self.following and now - self.tau_came <= _TORQUE_LASTS
-        return Command(counter, reflected, message.ipo_q or q, self.tau if renewed else _NO_TORQUE, self.outputs)
+        return Command(counter, reflected, tuple(there.tolist()), io=self.outputs)
+
+    def _torque(self, message: Monitoring, now: float) -> Command | None:
+        """The newest overlay, or one that brakes, with the cabinet's own position as KUKA's example clients have it."""
+        age = now - self.tau_came
+        if self._is_too_slow(message) or (message.session is Session.COMMANDING_ACTIVE and age > _TORQUE_GONE):
+            return None
+        wanted = self.tau if self.following and age <= _TORQUE_LASTS else -self.damping * self.velocity
+        tau = tuple(np.clip(wanted, -self.torque_limit, self.torque_limit).tolist())
+        return Command(self._answers, message.counter, message.ipo_q or message.q, tau, self.outputs)
 
 
 def _ahead(message: Monitoring, before: Monitoring) -> int:

@@ -146,7 +146,7 @@ def read_monitoring(datagram: bytes) -> Monitoring:
         command=_member(CommandKind, ipo.command_mode),
         safety=_member(Safety, robot.safety),
         operation=_member(Operation, robot.operation),
-        drives=min((_member(Drives, drive) for drive in robot.drives), default=Drives.ACTIVE),
+        drives=_member(Drives, min(robot.drives, default=Drives.ACTIVE)),
         io=_io_of(data.io),
     )
 

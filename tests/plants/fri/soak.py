@@ -15,15 +15,17 @@ from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
 from q2r2_control.plants.fri.cabinet import CabinetSettings, Trip
-from q2r2_control.plants.fri.wire import Safety, write_monitoring
+from q2r2_control.plants.fri.cabinet_server import SimulatedArms
+from q2r2_control.plants.fri.wire import CommandKind, Safety, write_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import SIDES, Array, HandInputs, HandSample
+from q2r2_control.types import SIDES, Array, CommandMode, HandInputs, HandSample
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 ACCELERATION = 4.0  # of the reference [rad/s^2]
-_ALLOWANCE = 0.05  # after the braking time [s]
-_REST = 1e-4  # [rad/s]
+# After the braking time, in which arms that get torques settle [s], and what counts as rest.
+_ALLOWANCE = {CommandMode.POSITION: 0.05, CommandMode.TORQUE: 0.4}
+_REST = {CommandMode.POSITION: 1e-4, CommandMode.TORQUE: 0.02}  # [rad/s]
 _ENDS = ("pendant", "safety stop", "loop freezes", "computer freezes", "garbage")
 _ASKED = {Trip.STOPPED, Trip.SAFETY}
 _MUTATED = 100  # datagrams with wrong bytes before a session ends so
@@ -68,9 +70,16 @@ class FreezingLoop(Pipeline):
 
 
 def make_loop(
-    config: Config, periods: tuple[float, float] = (0.005, 0.002), start: Array | None = None, **network: Any
+    config: Config,
+    periods: tuple[float, float] = (0.005, 0.002),
+    start: Array | None = None,
+    mode: CommandMode = CommandMode.POSITION,
+    **network: Any,
 ) -> FreezingLoop:
-    """A loop whose reference leaves the cabinets' limits room for catching up; the arms ``start`` at home."""
+    """A loop whose reference leaves the cabinets' limits room for catching up; the arms ``start`` at home.
+
+    For torques they are simulated.
+    """
     changes = {"velocity_scale": 1.0 / (1.0 + CATCH_UP), "acceleration_limit": ACCELERATION}
     config = config.model_copy(update={"control": config.control.model_copy(update=changes)})
     robot = Robot.from_config(config)
@@ -82,14 +91,16 @@ def make_loop(
             upper=tuple(robot.model.upperPositionLimit[its.joints]),
             velocity=tuple(fastest),
             acceleration=tuple((1.0 + CATCH_UP) ** 2 * ACCELERATION + CATCH_UP_RAMP * fastest),
-            torque=(20.0,) * 7,
+            torque=tuple(robot.torque_limit[its.joints]),
             period=period,
+            command=CommandKind.TORQUE if mode is CommandMode.TORQUE else CommandKind.POSITION,
         )
     hands = PressingHands()
-    plant = VirtualCabinets(
-        robot, settings, robot.home if start is None else start, 1.0 / config.loop_rate_hz, **network
-    )
-    hands.pipeline = made = FreezingLoop(config, robot, hands, plant)
+    start = robot.home if start is None else start
+    if mode is CommandMode.TORQUE:
+        network["arms"] = SimulatedArms(robot, config)
+    plant = VirtualCabinets(robot, settings, start, 1.0 / config.loop_rate_hz, **network)
+    hands.pipeline = made = FreezingLoop(config, robot, hands, plant, mode)
     return made
 
 
@@ -107,6 +118,9 @@ class Soak:
     def __post_init__(self) -> None:
         assert isinstance(self.pipeline.plant, VirtualCabinets)
         self.plant, self.random = self.pipeline.plant, np.random.default_rng(self.seed)
+        self._late = {"computer freezes"}
+        if self.pipeline.drive.mode is CommandMode.TORQUE:  # torques end the session by themselves then
+            self._late.add("loop freezes")
         self._moving_since: float | None = None
         self._lasts = 0.3
         self._rest_by, self._start_at = math.inf, 0.0
@@ -122,7 +136,7 @@ class Soak:
         cabinets, now = self.plant.cabinets, tick.now
         for arm, cabinet in cabinets.items():
             for trip in cabinet.trips[self._seen[arm] :]:
-                if trip not in _ASKED and not (trip is Trip.LATE and self._end == "computer freezes"):
+                if trip not in _ASKED and not (trip is Trip.LATE and self._end in self._late):
                     self.faults.append(f"{now:.3f} s, {self._end}: {arm}: {trip}")
             self._seen[arm] = len(cabinet.trips)
         speed = float(np.abs(tick.reference.v).max())
@@ -132,7 +146,7 @@ class Soak:
             for arm, heard in self.plant.heard.items() if not any(tick.engaged.values()) else ():
                 way = np.diff(heard[-3:], axis=0)
                 fastest = np.abs(way[np.isfinite(way)]).max(initial=0.0) / cabinets[arm].settings.period
-                if fastest > _REST:
+                if fastest > _REST[self.pipeline.drive.mode]:
                     moves = f"{arm} moves at {fastest:.4f} rad/s after the time to brake"
                     self.faults.append(f"{now:.3f} s, {self._end}: {moves}")
             self._start_at = now + float(self.random.uniform(0.05, 0.3))
@@ -169,7 +183,7 @@ class Soak:
             self._send_garbage()
             cabinet.stop()
         braking = np.abs(tick.reference.v) / self.pipeline.controller.stop_deceleration
-        self._rest_by = now + float(braking.max()) + _ALLOWANCE
+        self._rest_by = now + float(braking.max()) + _ALLOWANCE[self.pipeline.drive.mode]
 
     def _send_garbage(self) -> None:
         """Some bytes of each datagram are wrong, or missing."""
@@ -187,8 +201,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--mode", type=CommandMode, default=CommandMode.POSITION)
     given = parser.parse_args()
-    pipeline = make_loop(load_config("config/dual_iiwa7.yaml"), jitter=0.0004, drift=200e-6)
+    pipeline = make_loop(load_config("config/dual_iiwa7.yaml"), mode=given.mode, jitter=0.0004, drift=200e-6)
     soak = Soak(pipeline, given.sessions, given.seed)
     soak.run()
     print(f"{soak.ended} sessions, fastest joint {soak.moved:.2f} rad/s, {len(soak.faults)} faults")

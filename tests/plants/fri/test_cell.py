@@ -10,12 +10,15 @@ import pytest
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import ReasonKind
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.answers import ReferencePath
 from q2r2_control.plants.fri.cabinet import Trip
 from q2r2_control.plants.fri.wire import Session
+from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import SIDES
+from q2r2_control.types import SIDES, CommandMode
 from tests.plants.fri.soak import FreezingLoop, Soak, make_loop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
@@ -96,8 +99,9 @@ def test_the_reference_brakes_as_the_path_does(robot: Robot) -> None:
         np.testing.assert_allclose(controller.step({}, 1e-9).q, path.at(t), atol=1e-7)
 
 
-def test_sessions_end_in_every_way_without_a_jump_and_begin_again(config: Config) -> None:
-    soak = Soak(make_loop(config, jitter=0.0004, drift=200e-6), sessions=6, seed=1).run()
+@pytest.mark.parametrize("mode", [CommandMode.POSITION, CommandMode.TORQUE])
+def test_sessions_end_in_every_way_without_a_jump_and_begin_again(config: Config, mode: CommandMode) -> None:
+    soak = Soak(make_loop(config, mode=mode, jitter=0.0004, drift=200e-6), sessions=6, seed=1).run()
     assert soak.ended == 6
     assert soak.moved > 0.3
     assert soak.faults == []
@@ -122,3 +126,24 @@ def test_an_arm_that_stands_beyond_its_margin_is_led_back(config: Config, robot:
     assert trips(plant) == []
     assert plant.heard["left"][0][6] == pytest.approx(start[joint], abs=1e-4)
     assert plant.heard["left"][-1][6] <= robot.position_upper[joint] - margin + 1e-4
+
+
+def test_arms_that_get_torques_follow_as_well_as_without_cabinets(config: Config) -> None:
+    pipeline = make_loop(config, mode=CommandMode.TORQUE, jitter=0.0005)
+    plant = started(pipeline)
+    summary = pipeline.run(4.0, realtime=False)
+    direct = Pipeline(
+        pipeline.config,
+        pipeline.robot,
+        ScriptedInput("circle", frequency_hz=0.5),
+        MujocoPlant(pipeline.robot, config),
+        "torque",
+    )
+    wanted = direct.run(4.0, realtime=False)
+    assert trips(plant) == []
+    for arm in SIDES:
+        figures, reference = summary.arms[arm], wanted.arms[arm]
+        assert figures.engaged_s > 3.0
+        assert figures.position_error_mm_rms is not None
+        assert reference.position_error_mm_rms is not None
+        assert figures.position_error_mm_rms < 1.3 * reference.position_error_mm_rms

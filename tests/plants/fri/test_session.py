@@ -18,6 +18,7 @@ from q2r2_control.plants.fri.wire import (
     read_command,
     write_monitoring,
 )
+from q2r2_control.wording import sentence
 
 Q = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
 IPO = (0.0, 0.501, 0.0, -1.2, 0.0, 1.0, 0.0)
@@ -70,17 +71,47 @@ def test_every_multiplier_th_message_is_answered() -> None:
     assert [answer is None for answer in answers] == [True, True, False, True, True, False]
 
 
-def test_torque_without_a_newer_one_ends() -> None:
-    cabinet = Cabinet()
+def begin_torques(cabinet: Cabinet) -> Monitoring:
+    """A session of torques is in commanding wait; returns the message of an active one."""
     cabinet.session.wanted = CommandKind.TORQUE
-    active = replace(ACTIVE, command=CommandKind.TORQUE)
-    for message in (replace(WAITING, command=CommandKind.TORQUE), active):
-        answer = cabinet.ask(message)
-        assert answer is not None
-        assert answer.tau == (0.0,) * 7
-    cabinet.session.following, cabinet.session.tau, cabinet.session.tau_came = True, (1.0,) * 7, cabinet.now
-    torques = [answer.tau for answer in (cabinet.ask(active) for _ in range(6)) if answer is not None]
-    assert torques == [(1.0,) * 7] * 4 + [(0.0,) * 7] * 2
+    cabinet.ask(replace(WAITING, command=CommandKind.TORQUE))
+    cabinet.session.following, cabinet.session.tau, cabinet.session.tau_came = True, np.ones(7), cabinet.now
+    cabinet.session.velocity, cabinet.session.damping = np.full(7, 0.2), np.full(7, 20.0)
+    return replace(ACTIVE, command=CommandKind.TORQUE)
+
+
+def test_torques_go_with_the_cabinets_own_position() -> None:
+    cabinet = Cabinet()
+    answer = cabinet.ask(begin_torques(cabinet))
+    assert answer is not None
+    assert (answer.q, answer.tau) == (IPO, (1.0,) * 7)
+
+
+def test_a_torque_without_a_newer_one_becomes_one_that_brakes_and_ends_with_the_answers() -> None:
+    cabinet = Cabinet()
+    active = begin_torques(cabinet)
+    q = iter(np.linspace(Q, np.add(Q, 0.025), 26)[1:])  # at 0.2 rad/s
+    answers = [cabinet.ask(replace(active, q=tuple(next(q).tolist()))) for _ in range(25)]
+    torques = [answer and answer.tau and round(answer.tau[0], 3) for answer in answers]
+    assert torques == [1.0] * 4 + [-4.0] * 16 + [None] * 5
+
+
+def test_no_torque_is_beyond_the_limit() -> None:
+    cabinet = Cabinet()
+    active = begin_torques(cabinet)
+    cabinet.session.torque_limit = np.full(7, 0.5)
+    answer = cabinet.ask(active)
+    assert answer is not None
+    assert answer.tau == (0.5,) * 7
+
+
+def test_torques_are_refused_to_a_cabinet_that_asks_too_seldom() -> None:
+    cabinet = Cabinet()
+    begin_torques(cabinet)
+    assert cabinet.ask(replace(WAITING, command=CommandKind.TORQUE, multiplier=2)) is None
+    fault = cabinet.session.fault(cabinet.now)
+    assert fault is not None
+    assert sentence(fault) == "left: the cabinet asks every 10 ms; allowed for torques: 5 at most"
 
 
 def test_a_drop_is_told_and_the_arm_follows_no_more() -> None:

@@ -10,12 +10,14 @@ import numpy as np
 from q2r2_control.events import Reason
 from q2r2_control.plants.base import check_command
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
+from q2r2_control.plants.fri.cabinet_server import SimulatedArms
 from q2r2_control.plants.fri.cell import FriCell
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
+_BEGIN = -0.1  # of the cabinets [s]
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
@@ -36,12 +38,18 @@ class VirtualCabinets:
         jitter: float = 0.0,
         loss: float = 0.0,
         seed: int = 0,
+        arms: SimulatedArms | None = None,
     ) -> None:
-        """``period`` of the loop, cabinets' clocks ``drift`` apart, up to ``jitter`` late [s]."""
+        """``period`` of the loop, cabinets' clocks ``drift`` apart, up to ``jitter`` late [s].
+
+        Without ``arms`` they are where they are commanded to be, and torques do not move them.
+        """
         self._robot, self._period, self._random = robot, period, np.random.default_rng(seed)
         self._jitter, self._loss = jitter, loss
+        self._simulation = arms
         self.cabinets = {
-            arm: Cabinet(its, StillArm(tuple(start[robot.arms[arm].joints]))) for arm, its in settings.items()
+            arm: Cabinet(its, arms.arms[arm] if arms else StillArm(tuple(start[robot.arms[arm].joints])))
+            for arm, its in settings.items()
         }
         rates = np.linspace(1.0 - 0.5 * drift, 1.0 + 0.5 * drift, len(settings))
         self._rates = dict(zip(settings, rates, strict=True))
@@ -57,9 +65,11 @@ class VirtualCabinets:
         for session in sessions.values():
             session.wanted = _KINDS[self._mode]
         self.cell = FriCell(self._robot, sessions, self._period)
-        self.now, self._serial = -0.1, 0  # the loop begins at 0
+        self.now, self._serial = _BEGIN, 0  # the loop begins at 0
         self._events: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
-        self.heard: dict[str, list[Array]] = {arm: [] for arm in self.cabinets}  # positions that a cabinet follows
+        self.heard: dict[str, list[Array]] = {
+            arm: [] for arm in self.cabinets
+        }  # positions that a cabinet follows, with torques measured ones
         for arm in self.cabinets:
             self._at(self.now, self._send, arm)
         self.due(0.0)
@@ -99,10 +109,12 @@ class VirtualCabinets:
 
     def _send(self, arm: str) -> None:
         cabinet = self.cabinets[arm]
+        if self._simulation is not None:
+            self._simulation.advance(self.now - _BEGIN)
         self.on_message(arm, self.now)
         message = cabinet.send(self.now)
         if cabinet.session is Session.COMMANDING_ACTIVE:
-            self.heard[arm].append(np.array(message.ipo_q))
+            self.heard[arm].append(np.array(message.ipo_q if self._mode is CommandMode.POSITION else message.q))
         elif self.heard[arm] and self.heard[arm][-1] is not None:
             self.heard[arm].append(np.full(7, np.nan))
         self._at(self.now + cabinet.settings.period * self._rates[arm], self._send, arm)
