@@ -266,6 +266,7 @@ class Pipeline:
             impedance=step.report.impedance,
             wall=step.report.wall,
             admittance=step.report.admittance,
+            sessions={} if self._sessions is None else self._sessions.sessions(),
         )
         if self._following:
             self._operator.vibrate(tick)

@@ -90,6 +90,9 @@ class SessionPlant(Protocol):
     def fault(self) -> Reason | None:
         """Why the arms cannot be commanded now, or ceased to be since the last call; None: they can."""
 
+    def sessions(self) -> dict[str, str]:
+        """Of each arm, its session in words."""
+
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
     """The plant called ``plant``, or ``plant`` itself. Raises :class:`ConfigError` for an unknown name."""

@@ -50,6 +50,7 @@ class Tick:
     admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
     held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)  # see :attr:`ControlLoop.held_grippers`
     holding: dict[str, bool] = field(default_factory=dict)  # arm whose gripper has an object -> whether it holds it
+    sessions: dict[str, str] = field(default_factory=dict)  # of arms that follow during sessions only, in words
 
     def tracking_error(self, arm: str) -> tuple[float, float]:
         """Distance [m] and angle [rad] of an arm's tool from its target; NaN where it has none."""

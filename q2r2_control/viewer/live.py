@@ -160,6 +160,8 @@ class LiveTable:
         repelled, self._repelled = list(self._repelled), {}
         for name, values in _arm_rows(tick, arms):
             table.add_row(name, *values)
+        if tick.sessions:
+            table.add_row("cabinet", *(tick.sessions[arm] for arm in arms))
         words = [why(tick, arm, self._joints[arm], binding, self._last.get(arm)) for arm in arms]
         table.add_row("why", *map(escape, words))
         table.add_row("next press", *(next_press(tick, arm, self._bindings) for arm in arms))

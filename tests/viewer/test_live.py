@@ -38,6 +38,15 @@ def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot:
     assert "paused" not in text
 
 
+def test_it_shows_each_arm_s_session_with_its_cabinet(robot: Robot) -> None:
+    table = LiveTable("demo", JOINTS, BindingSettings())
+    sessions = {"left": "commanding active, connection good, drives active", "right": "not heard"}
+    table(replace(tick_at(robot, 0.0), sessions=sessions))
+    text = printed(table.render(), 160)
+    assert "not heard" in text
+    assert sessions["left"] in text
+
+
 def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
     table = LiveTable("demo", JOINTS, BindingSettings())
     tick = tick_at(robot, 0.0)

@@ -105,6 +105,9 @@ class FriPlant:
         """See :meth:`FriCell.fault`."""
         return self.cell.fault()
 
+    def sessions(self) -> dict[str, str]:
+        return {arm: session.words for arm, session in self.cell.sessions.items()}
+
     def apply(self, command: Command) -> None:
         check_command(command, self._robot, self.modes)
         self.cell.apply(command)

@@ -60,6 +60,14 @@ class ArmSession:
         self._begun = False  # the cabinet's own position is known, where the path begins
         self._problem: ProtocolError | None = None  # with the newest datagram
 
+    @property
+    def words(self) -> str:
+        """How the cabinet says that it is."""
+        newest = self.newest
+        if newest is None:
+            return "not heard"
+        return f"{in_words(newest.session)}, connection {in_words(newest.quality)}, drives {in_words(newest.drives)}"
+
     def fault(self, now: float) -> Reason | None:
         """Why the arm cannot be commanded at ``now`` [s], or None."""
         newest, age = self.newest, now - self.arrival

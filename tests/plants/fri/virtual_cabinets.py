@@ -84,6 +84,9 @@ class VirtualCabinets:
     def fault(self) -> Reason | None:
         return self.cell.fault()
 
+    def sessions(self) -> dict[str, str]:
+        return {arm: session.words for arm, session in self.cell.sessions.items()}
+
     def apply(self, command: Command) -> None:
         check_command(command, self._robot, self.modes)
         self.cell.apply(command)
