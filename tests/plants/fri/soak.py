@@ -197,13 +197,36 @@ class Soak:
                     self.plant.cell.answer(arm, bytes(wrong), self.plant.now)
 
 
+def steady(pipeline: FreezingLoop, duration: float) -> bool:
+    """Sessions that nobody ends, for ``duration`` [s]; whether none ended."""
+    assert isinstance(pipeline.plant, VirtualCabinets)
+    cabinets = pipeline.plant.cabinets
+    for cabinet in cabinets.values():
+        cabinet.start_overlay()
+    figures = pipeline.run(duration, realtime=False).arms
+    for arm, cabinet in cabinets.items():
+        error, engaged = figures[arm].position_error_mm_rms, figures[arm].engaged_s
+        print(
+            f"{arm}: engaged {engaged:.1f} s, error {error:.2f} mm RMS, missed {cabinet.missed}, ends {cabinet.trips}"
+        )
+    return not any(cabinet.trips for cabinet in cabinets.values())
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=1000)
+    parser.add_argument("--steady", type=float, help="no end of a session for so long [s]")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--mode", type=CommandMode, default=CommandMode.POSITION)
+    parser.add_argument("--drift", type=float, default=200e-6, help="between the cabinets' clocks")
+    parser.add_argument("--jitter", type=float, default=0.4, help="of each datagram [ms]")
+    parser.add_argument("--loss", type=float, default=0.0, help="share of the datagrams, each way")
     given = parser.parse_args()
-    pipeline = make_loop(load_config("config/dual_iiwa7.yaml"), mode=given.mode, jitter=0.0004, drift=200e-6)
+    network = {"jitter": 1e-3 * given.jitter, "drift": given.drift, "loss": given.loss, "seed": given.seed}
+    periods = (0.005, 0.002) if given.steady is None else (0.005, 0.005)
+    pipeline = make_loop(load_config("config/dual_iiwa7.yaml"), periods, mode=given.mode, **network)
+    if given.steady is not None:
+        raise SystemExit(not steady(pipeline, given.steady))
     soak = Soak(pipeline, given.sessions, given.seed)
     soak.run()
     print(f"{soak.ended} sessions, fastest joint {soak.moved:.2f} rad/s, {len(soak.faults)} faults")
