@@ -50,7 +50,10 @@ def _choices(field: dict[str, Any], models: dict[str, Any]) -> list[dict[str, An
     found = []
     for choice in field.get("anyOf") or field.get("allOf") or [field]:
         reference = choice.get("$ref")
-        found.append(models[reference.rpartition("/")[2]] if reference else choice)
+        if "oneOf" in choice:
+            found += _choices({"anyOf": choice["oneOf"]}, models)
+        else:
+            found.append(models[reference.rpartition("/")[2]] if reference else choice)
     return found
 
 

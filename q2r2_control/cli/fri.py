@@ -16,6 +16,7 @@ from typer import Option
 
 from q2r2_control.cli.output import ConfigFile, Json, positive, print_report, say
 from q2r2_control.config.cell import load_config
+from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, tasks_named
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.cabinet import Cabinet, Trip
@@ -103,7 +104,7 @@ def fri_cabinet(
         every = right_period if arm == "right" and right_period is not None else period
         cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every)
         clients[str(arm)] = "127.0.0.1", its.port
-    grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if its.gripper is not None}
+    grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if isinstance(its.gripper, GripperIoConfig)}
     network = Network(loss, duplicate, 1e-3 * jitter)
     server = CabinetServer(arms, cabinets, clients, grippers, network, seed)
     for cabinet in server.cabinets.values():

@@ -116,10 +116,11 @@ def fri_check(
             plant.due(now)
             fault, answers = plant.fault(), np.array(plant.answer_times)
             lost = {arm: session.lost for arm, session in plant.cell.sessions.items()}
+            grippers = [f"{arm}: gripper {gripper.in_words()}" for arm, gripper in plant.grippers.items()]
         finally:
             plant.close()
     reports = [cabinet_report(arm, messages, lost[arm]) for arm, messages in heard.items()]
-    notes = machine_notes()
+    notes = grippers + machine_notes()
     for its in reports:
         if its.jitter_ms_p99 > _LARGE_JITTER * its.period_ms:
             notes.append(f"{its.arm}: messages come uneven by over half a period: the network, or a busy computer")

@@ -9,10 +9,10 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import yaml
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, Tag, ValidationError, field_validator, model_validator
 
 from q2r2_control.config.arms import (
     ArmConfig,
@@ -34,7 +34,7 @@ from q2r2_control.config.control import (
     check_priority,
 )
 from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
-from q2r2_control.config.fri import CabinetConfig
+from q2r2_control.config.fri import MODBUS_DELAY, CabinetConfig, ModbusGripperConfig
 from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSettings
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.strict import Network, StrictModel, network_of
@@ -151,6 +151,12 @@ class Config(StrictModel):
         """Those of the simulated cell; the others are on ROS topics."""
         return {name: camera for name, camera in self.cameras.items() if camera.topic is None}
 
+    @property
+    def gripper_delay(self) -> float:
+        """The longest time until a gripper has a command and its opening is measured, beyond a few ticks [s]."""
+        by_modbus = any(isinstance(cabinet.gripper, ModbusGripperConfig) for cabinet in self.fri.values())
+        return MODBUS_DELAY if by_modbus else 0.0
+
     def model_of(self, arm: str) -> str:
         """The model that an arm is, or is part of."""
         part_of = self.robot or next(made for side, made in self.arms.items() if side == arm)
@@ -248,7 +254,8 @@ def _first_fault(error: ValidationError) -> str:
     # A misspelt key leaves others missing or empty; the misspelling says more.
     faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     fault = faults[0]
-    key = _line(".".join(str(part) for part in fault["loc"] if part != "[key]")) or "(top level)"
+    # In brackets stand notes of pydantic: "[key]", and tags of models among which a key's value is one.
+    key = _line(".".join(str(part) for part in fault["loc"] if not str(part).startswith("["))) or "(top level)"
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
     if fault["type"] == "missing":
         return f"{key}: missing, and has no default{more}"
@@ -269,6 +276,8 @@ def _keys_at(location: tuple[int | str, ...]) -> list[str]:
     for part in location:
         annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
         if annotation is None:
+            choices = get_args(next(iter(get_args(model)), None))
+            model = next((get_args(choice)[0] for choice in choices if Tag(str(part)) in get_args(choice)), model)
             continue
         arguments = [given for given in getattr(annotation, "__args__", ()) if given is not type(None)]
         model = arguments[-1] if arguments else annotation

@@ -1,11 +1,12 @@
-"""Where KUKA's cabinets are, whose Fast Robot Interface moves the arms."""
+"""Where KUKA's cabinets are, whose Fast Robot Interface moves the arms, and where the arms' grippers are."""
 
 from __future__ import annotations
 
+import re
 from ipaddress import ip_address
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Discriminator, Field, Tag, field_validator
 
 from q2r2_control.config.strict import StrictModel
 
@@ -18,13 +19,65 @@ class GripperIoConfig(StrictModel):
     digital: bool = Field(False, description="the output is on or off, and not analog")
 
 
+# An opening of a gripper on Modbus is measured, and its newest command there, within this time, or it is not known [s].
+MODBUS_DELAY = 0.15
+_ENDPOINT = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:/]+)(?::([0-9]{1,5}))?")
+_Count = Annotated[int, Field(ge=0, le=255)]
+
+
+class ModbusGripperConfig(StrictModel):
+    """A Robotiq Hand-E, 2F-85 or 2F-140 by Modbus TCP, or by Modbus RTU on a serial device: 115200 baud, 8N1."""
+
+    modbus: str = Field(description="host:port or host, or a serial device such as /dev/ttyUSB0")
+    unit: int = Field(9, ge=1, le=247, description="the gripper's slave number")
+    speed: float = Field(1.0, ge=0, le=1, description="of the fingers, 0 slowest .. 1 fastest")
+    force: float = Field(0.5, ge=0, le=1, description="of a grasp, 0 least .. 1 greatest")
+    counts: tuple[_Count, _Count] = Field(
+        (0, 255), description="its position, open and closed, as q2r2 fri-check says; 2F-85 and 2F-140: about [3, 230]"
+    )
+
+    @field_validator("modbus")
+    @classmethod
+    def _is_somewhere(cls, modbus: str) -> str:
+        found = _ENDPOINT.fullmatch(modbus)
+        if not modbus.startswith("/") and not (found and 1 <= int(found[2] or 502) <= 65535):
+            raise ValueError("allowed is host:port or host, or a serial device such as /dev/ttyUSB0")
+        return modbus
+
+    @field_validator("counts")
+    @classmethod
+    def _closes_upwards(cls, counts: tuple[int, int]) -> tuple[int, int]:
+        if counts[0] >= counts[1]:
+            raise ValueError("allowed is a count for closed above the one for open")
+        return counts
+
+    @property
+    def endpoint(self) -> tuple[str, int] | None:
+        """Host and port of Modbus TCP; None: ``modbus`` is a serial device."""
+        found = _ENDPOINT.fullmatch(self.modbus)
+        return None if found is None else (found[1].strip("[]"), int(found[2] or 502))
+
+
+def _kind(gripper: Any) -> str:
+    """The tag of a gripper's model. Keys in messages are without tags, which stand in brackets."""
+    by_modbus = "modbus" in gripper if isinstance(gripper, dict) else isinstance(gripper, ModbusGripperConfig)
+    return "[modbus]" if by_modbus else "[io]"
+
+
+_AnyGripper = Annotated[
+    Annotated[GripperIoConfig, Tag("[io]")] | Annotated[ModbusGripperConfig, Tag("[modbus]")], Discriminator(_kind)
+]
+
+
 class CabinetConfig(StrictModel):
     """The cabinet of one arm, which sends to a port of this computer."""
 
     address: str = Field("127.0.0.1", description="of the cabinet; nothing else is heard")
     port: int = Field(30200, ge=0, le=65535, description="of this computer, as the Sunrise project names it")
     version: Literal[1, 2] | None = Field(None, description="of FRI; none: as the cabinet's messages are")
-    gripper: GripperIoConfig | None = Field(None, description="by inputs and outputs; none: not commanded")
+    gripper: _AnyGripper | None = Field(
+        None, description="on inputs and outputs of the cabinet, or by Modbus; none: not commanded"
+    )
 
     @field_validator("address")
     @classmethod

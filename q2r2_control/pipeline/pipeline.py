@@ -159,7 +159,8 @@ class Pipeline:
         self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
         watch = watch_settings(self.config.supervision, self.drive.yields)
         streams = StreamSettings(linked=self.config.teleop.linked)
-        self.loop = ControlLoop(self.controller, self.drive, 1.0 / self.config.loop_rate_hz, streams, watch)
+        period, delay = 1.0 / self.config.loop_rate_hz, self.config.gripper_delay
+        self.loop = ControlLoop(self.controller, self.drive, period, streams, watch, gripper_delay=delay)
 
     def _begin(self, realtime: bool) -> None:
         self._following = True

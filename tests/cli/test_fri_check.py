@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
+import yaml
 
 from q2r2_control.cli.fri_check import cabinet_report
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
 from tests.cli.command import q2r2
+from tests.support.robotiq_gripper import SimulatedGripper
 
 WIDE = (10.0,) * 7
 
@@ -36,6 +39,21 @@ def test_what_both_cabinets_send_is_said_and_where_one_does_not_command_the_exit
     assert min(told["answers_s"]) > 0.0
     active = all(cabinet["session"] == "commanding active" for cabinet in told["cabinets"])
     assert done.exit_code == (0 if active else 1)
+
+
+@pytest.mark.usefixtures("cabinets")
+def test_a_line_says_of_each_gripper_by_modbus_whether_it_answers_and_none_is_moved(fri_cell: str) -> None:
+    cell = yaml.safe_load(Path(fri_cell).read_text(encoding="utf-8"))
+    with SimulatedGripper() as simulated:
+        for arm, port in (("left", simulated.port), ("right", 1)):
+            cell["fri"][arm]["gripper"] = {"modbus": f"127.0.0.1:{port}"}
+        Path(fri_cell).write_text(yaml.safe_dump(cell), encoding="utf-8")
+        done = q2r2("fri-check", fri_cell, "--duration", "1", "--json")
+    assert [note for note in json.loads(done.stdout)["notes"] if "gripper" in note] == [
+        f"left: gripper 127.0.0.1:{simulated.port}, unit 9: not active until a run begins, position 120 of 255",
+        "right: gripper 127.0.0.1:1, unit 9: does not answer",
+    ]
+    assert simulated.written == []
 
 
 def test_a_cabinet_that_says_nothing_is_one_line(fri_cell: str) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from q2r2_control.config.fri import ModbusGripperConfig
 from tests.config.cell_files import CELL, changed, fault, loaded, shipped
 
 ARM = {"model": "iiwa7", "home": [0] * 7, "tip": "link_ee"}
@@ -36,6 +37,26 @@ def test_an_unknown_key_is_named_with_those_allowed_there(tmp_path: Path, path: 
     assert allowed
 
 
+@pytest.mark.parametrize(
+    ("gripper", "allowed"),
+    [
+        ({"modbus": "gripper", "units": 9}, "counts, force, modbus, speed, unit"),
+        ({"units": 9}, "digital, input, output"),
+    ],
+)
+def test_the_keys_of_a_gripper_are_those_of_its_kind(tmp_path: Path, gripper: dict[str, Any], allowed: str) -> None:
+    message = fault(tmp_path, changed("fri.left.gripper", gripper))
+    assert message.startswith(f"fri.left.gripper.units = 9: unknown key; allowed here: {allowed}")
+
+
+def test_a_gripper_by_modbus_is_at_a_host_or_on_a_serial_device(tmp_path: Path) -> None:
+    for modbus, endpoint in (("[::1]:1502", ("::1", 1502)), ("gripper", ("gripper", 502)), ("/dev/ttyUSB0", None)):
+        config = loaded(tmp_path, changed("fri.left.gripper", {"modbus": modbus}))
+        gripper = config.fri["left"].gripper
+        assert isinstance(gripper, ModbusGripperConfig)
+        assert gripper.endpoint == endpoint
+
+
 def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path: Path) -> None:
     message = fault(tmp_path, CELL.read_text().replace("shape: box", "shapes: box"))
     assert message.startswith("obstacles.table.shapes = 'box': unknown key; allowed here: colour, ")
@@ -51,6 +72,8 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("teleop.stance", "behind", "'side_by_side', 'mirror' or 'mirror_reflected'"),
         ("teleop.axes", ["+x", "+x", "+z"], "once each"),
         ("arms.left.flange", {"thickness": 0.03}, "give both"),
+        ("fri.left.gripper.modbus", "gripper:0", "host:port or host, or a serial device such as /dev/ttyUSB0"),
+        ("fri.left.gripper", {"modbus": "gripper", "counts": [230, 3]}, "a count for closed above the one for open"),
         ("arms.left.flange", {"model": "disc", "thickness": 0.03, "radius": 0.05}, "give the model or those"),
         ("arms.left.flange", {"mass": 0.3}, "give its thickness and radius as well"),
         ("arms.left.flange", {"frame": "end"}, "are those of a model: give it as well"),

@@ -10,11 +10,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from q2r2_control.config.fri import MODBUS_DELAY, CabinetConfig, ModbusGripperConfig
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
-from q2r2_control.types import HandSample
+from q2r2_control.types import Command, HandSample
 from tests.support.object_cell import cell as object_cell
 from tests.support.processes import Watch, cell
 
@@ -38,6 +41,48 @@ def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick(plant: str) -> 
     assert summary.fallback_ticks == summary.uncertified_ticks == 0
     assert all(not figures.gripper_held_s for figures in summary.arms.values())
     assert len(watch.ticks) == len(widest)
+
+
+class SeldomAskedGrippers(KinematicPlant):
+    """Its grippers get the newest command, and are measured, as seldom as one on Modbus may."""
+
+    _measured: dict[str, float] | None = None
+    _asked = 0.0
+
+    def apply(self, command: Command) -> None:
+        if self._measured is None or self._time - self._asked >= 0.8 * MODBUS_DELAY:
+            self._asked, self._measured, self._granted = self._time, self.openings, dict(command.grippers)
+        super().apply(replace(command, grippers=self._granted))
+
+    @property
+    def openings(self) -> dict[str, float]:
+        return super().gripper_openings()
+
+    def gripper_openings(self) -> dict[str, float]:
+        return self._measured or self.openings
+
+
+def test_fingers_count_as_wide_as_they_are_also_where_the_gripper_is_seldom_asked() -> None:
+    config, hands = cell(), LeftUpperPresses("circle")
+    hands.again = 1.25  # it is half closed
+    slow = {
+        side: arm.model_copy(update={"gripper": arm.gripper.model_copy(update={"speed": 0.05})})
+        for side, arm in config.arms.items()
+    }
+    left = CabinetConfig(gripper=ModbusGripperConfig(modbus="gripper"))
+    config = config.model_copy(update={"arms": slow, "fri": {"left": left}, "loop_rate_hz": 500.0})
+    plant = SeldomAskedGrippers(Robot.from_config(config), config)
+    loop, seen = Pipeline.from_config(config, input=hands, plant=plant), list[float]()
+
+    def listener(tick: Tick) -> None:
+        seen.append(plant.openings["left"])
+        least, greatest = loop.controller.openings["left"]
+        assert least <= seen[-1] <= greatest, f"at {tick.t:.3f} s"
+
+    loop.listeners.append(listener)
+    loop.run(1.8, realtime=False)
+    assert min(seen) < 0.6
+    assert seen[-1] > 0.9
 
 
 @pytest.mark.slow
@@ -73,10 +118,12 @@ def test_a_run_after_one_that_ended_while_something_was_held_bears_no_weight_tha
 
 
 class LeftUpperPresses(ScriptedInput):
-    """The left hand presses its upper button at 1.0 and at 1.6 s, and moves in between."""
+    """The left hand presses its upper button at 1.0 s and once again, and moves in between."""
+
+    again = 1.6  # [s]
 
     def poll(self, now: float) -> list[HandSample]:
-        held = 1.0 <= now < 1.1 or 1.6 <= now < 1.7
+        held = 1.0 <= now < 1.1 or self.again <= now < self.again + 0.1
         return [
             replace(sample, inputs=replace(sample.inputs, button_upper=held)) if sample.hand == "left" else sample
             for sample in super().poll(now)

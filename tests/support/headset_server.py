@@ -49,7 +49,7 @@ def running(server: HeadsetServer) -> Iterator[HeadsetServer]:
 
 def eventually(condition: Callable[[], object], what: str = "") -> None:
     """Wait for the other thread, far longer than it needs."""
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + 30.0
     while not condition():
         assert time.monotonic() < deadline, f"never happened: {what or condition}"
         time.sleep(0.001)

@@ -11,12 +11,14 @@ from collections import deque
 from threading import Thread
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.fri import GripperIoConfig, ModbusGripperConfig
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.events import Reason
 from q2r2_control.plants.base import check_command
 from q2r2_control.plants.fri.cell import FriCell
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.wire import JOINTS, LONGEST, CommandKind
+from q2r2_control.plants.modbus_gripper import ModbusGripper
 from q2r2_control.process.scheduling import schedule_thread_first, thread_priority
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
@@ -38,7 +40,7 @@ class FriPlant:
     realtime_only = True
 
     def __init__(self, robot: Robot, config: Config) -> None:
-        """Raises :class:`ConfigError` unless every arm has a cabinet and seven joints, or a port cannot be had."""
+        """Raises :class:`ConfigError` unless every arm has a cabinet and seven joints, and a gripper its package."""
         for arm, its in robot.arms.items():
             if arm not in set(config.fri):
                 raise ConfigError(f"fri.{arm}: missing; allowed: the cabinet of each arm, as {{port: 30200}}")
@@ -48,6 +50,7 @@ class FriPlant:
         self._period = 1.0 / config.loop_rate_hz
         self._mode = CommandMode.POSITION
         self._sockets: dict[str, socket.socket] = {}
+        self.grippers = self._modbus_grippers()
         self._thread: Thread | None = None
         # Of the newest answers, from a message's arrival until its answer was sent [s].
         self.answer_times: deque[float] = deque(maxlen=_KEPT)
@@ -70,7 +73,7 @@ class FriPlant:
             source = f"cabinet {cabinet.address} on port {cabinet.port}"
             sessions[arm] = ArmSession(arm, source, cabinet.version)
             sessions[arm].wanted = _KINDS[self._mode]
-        grippers = {arm: cabinet.gripper for arm, cabinet in self._cabinets.items() if cabinet.gripper is not None}
+        grippers = {arm: its.gripper for arm, its in self._cabinets.items() if isinstance(its.gripper, GripperIoConfig)}
         self.cell = FriCell(self._robot, sessions, self._period, grippers)
         try:
             for arm, cabinet in self._cabinets.items():
@@ -84,6 +87,9 @@ class FriPlant:
         priority = thread_priority()
         self._thread = Thread(target=self._answer, args=(priority and priority + 1,), name="fri", daemon=True)
         self._thread.start()
+        self.grippers = self._modbus_grippers()
+        for gripper in self.grippers.values():
+            gripper.start()
         deadline = time.monotonic() + _WAIT
         while not self.cell.is_heard and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -111,6 +117,9 @@ class FriPlant:
     def apply(self, command: Command) -> None:
         check_command(command, self._robot, self.modes)
         self.cell.apply(command)
+        for arm, gripper in self.grippers.items():
+            if arm in command.grippers:
+                gripper.command(float(command.grippers[arm]))
 
     def advance(self, dt: float) -> None:
         """Time passes by itself."""
@@ -119,7 +128,9 @@ class FriPlant:
         return self.cell.state()
 
     def gripper_openings(self) -> dict[str, float]:
-        return self.cell.openings()
+        by_modbus = {arm: gripper.opening for arm, gripper in self.grippers.items()}
+        known = {arm: opening for arm, opening in by_modbus.items() if opening is not None}
+        return {**self.cell.openings(), **known}
 
     def close(self) -> None:
         if self._thread is not None:
@@ -127,9 +138,16 @@ class FriPlant:
             self._thread.join()
             self._thread = None
             sys.setswitchinterval(self._before)
+            for gripper in self.grippers.values():
+                gripper.close()
         for opened in self._sockets.values():
             opened.close()
         self._sockets.clear()
+
+    def _modbus_grippers(self) -> dict[str, ModbusGripper]:
+        """New ones, which know nothing of an earlier run."""
+        configs = {arm: cabinet.gripper for arm, cabinet in self._cabinets.items()}
+        return {arm: ModbusGripper(arm, its) for arm, its in configs.items() if isinstance(its, ModbusGripperConfig)}
 
     def _answer(self, priority: int) -> None:
         if priority:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.fri import ModbusGripperConfig
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.cabinet import Cabinet, StillArm
 from q2r2_control.plants.fri.cabinet_server import settings_of
@@ -18,7 +19,10 @@ from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES
+from tests.plants.conftest import hold
 from tests.plants.fri.conftest import PATIENCE
+from tests.support.headset_server import eventually
+from tests.support.robotiq_gripper import SimulatedGripper
 
 
 @contextmanager
@@ -70,6 +74,23 @@ def test_the_sessions_of_both_cabinets_come_to_commanding_where_the_arms_are_hel
     np.testing.assert_allclose(state.q, robot.home)
     assert state.held is not None
     np.testing.assert_allclose(state.held, robot.home)
+
+
+def test_a_gripper_by_modbus_gets_its_openings_and_is_measured(robot: Robot, fri_config: Config) -> None:
+    with SimulatedGripper() as simulated:
+        gripper = ModbusGripperConfig(modbus=f"127.0.0.1:{simulated.port}")
+        left = fri_config.fri["left"].model_copy(update={"gripper": gripper})
+        config = fri_config.model_copy(update={"fri": {**fri_config.fri, "left": left}})
+        plant = FriPlant.from_config(robot, config)
+        with cabinets(robot, config, 2):
+            plant.reset()
+            try:
+                assert plant.gripper_openings() == {}, "before it is active"
+                plant.apply(hold(robot.home, left=0.2, right=0.9))
+                eventually(lambda: plant.gripper_openings() == {"left": pytest.approx(0.2, abs=0.003)})
+            finally:
+                plant.close()
+        assert simulated.activations == 1
 
 
 def test_without_a_cabinet_the_run_says_which_one_and_where(robot: Robot, fri_config: Config, monkeypatch) -> None:  # type: ignore[no-untyped-def]

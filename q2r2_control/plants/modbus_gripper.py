@@ -1,0 +1,191 @@
+"""A Robotiq gripper on Modbus, for any plant, with a thread of its own: no call of a loop waits for it.
+
+Hand-E, 2F-85 and 2F-140 have the same registers (chapter 4 of their instruction manuals).
+
+**Safety.** Fingers count as all of their way until an opening is measured, and then as what is around the openings that
+were measured and commanded a moment ago. An activation opens and closes them all of their way, and is therefore done
+only before the first opening of a run. An opening is not told any more once it, or the command that the gripper had
+then, is older than ``MODBUS_DELAY``: supervision grants no other opening then.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from threading import Event, Thread
+from typing import Any
+
+from q2r2_control.config.fri import MODBUS_DELAY, ModbusGripperConfig
+from q2r2_control.errors import ConfigError
+
+_OUTPUTS, _INPUTS = 0x03E8, 0x07D0  # the first of three registers to write, and to read, of two bytes each
+_PERIOD = 0.025  # of reading, and of writing where the opening is a new one [s]
+_AGAIN = 1.0  # after which a lost connection is tried again [s]
+_TIMEOUT, _REPEATS = 0.3, 1  # of an answer [s], and how often it is asked for once more
+_ACTIVATE, _GO = 0x01, 0x08  # rACT and rGTO of the action request
+_RESET, _ACTIVATION = bytes(6), bytes((_ACTIVATE, 0, 0, 0, 0, 0))
+_MAJOR = 0x0A  # and above: only a reset ends such a fault
+_FAULTS = {  # others end by activation, or by asking for them
+    0x08: "too hot, it has to cool down",
+    0x0A: "supply voltage too low",
+    0x0B: "automatic release in progress",
+    0x0C: "internal fault",
+    0x0D: "activation failed, something may be in the fingers' way",
+    0x0E: "overcurrent",
+    0x0F: "automatic release completed",
+}
+_logger = logging.getLogger(__name__)
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # it would print each try of a lost connection
+
+
+@dataclass(frozen=True, slots=True)
+class GripperStatus:
+    """One reading of a gripper."""
+
+    requested: bool  # gACT: activation was asked for
+    activated: bool  # gSTA: it is done
+    holds: bool  # gOBJ: an object stopped the fingers, opening or closing
+    fault: int  # gFLT
+    position: int  # gPO: about 0 open .. 255 closed
+
+    @classmethod
+    def of(cls, registers: Sequence[int]) -> GripperStatus:
+        """Raises struct.error unless ``registers`` are three."""
+        status, _, fault, _, position, _ = struct.pack(">3H", *registers)
+        return cls(bool(status & 0x01), status >> 4 & 0x03 == 3, status >> 6 in (1, 2), fault & 0x0F, position)
+
+    @property
+    def ready(self) -> bool:
+        """Whether it follows commands."""
+        return self.activated and self.fault < _MAJOR
+
+    @property
+    def trouble(self) -> str:
+        """Its fault in words, if any."""
+        return f"fault 0x{self.fault:02x}, {_FAULTS[self.fault]}" if self.fault in _FAULTS else ""
+
+
+class ModbusGripper:
+    """One arm's gripper, in one run. Its openings are 0 closed .. 1 open."""
+
+    def __init__(self, arm: str, config: ModbusGripperConfig) -> None:
+        """Raises :class:`ConfigError` where pymodbus is not installed."""
+        self._arm, self._config, self._client = arm, config, _client(arm, config)
+        self._where = f"{config.modbus}, unit {config.unit}"
+        self.status: GripperStatus | None = None  # None: it does not answer
+        self._wanted: float | None = None
+        self._measured: tuple[float, float] | None = None  # the opening, and when the command then was chosen [s]
+        self._used = False  # it was ready in this run
+        self._sent, self._told = b"", ""
+        self._closing = Event()
+        self._thread = Thread(target=self._serve, name=f"{arm} gripper", daemon=True)
+
+    def start(self) -> None:
+        """Read it from now on; it is not activated before the first :meth:`command`."""
+        self._thread.start()
+
+    def command(self, opening: float) -> None:
+        """Want an opening from now on."""
+        self._wanted = opening
+
+    @property
+    def opening(self) -> float | None:
+        """The measured one; None where it is not known."""
+        measured = self._measured
+        return None if measured is None or time.monotonic() - measured[1] > MODBUS_DELAY else measured[0]
+
+    def in_words(self) -> str:
+        """Where it is, and how."""
+        if (status := self.status) is None:
+            return f"{self._where}: does not answer"
+        state = "active" if status.activated else "not active until a run begins"
+        notes = (f"{self._where}: {state}", f"position {status.position} of 255")
+        return ", ".join(filter(None, (*notes, "holds something" if status.holds else "", status.trouble)))
+
+    def close(self) -> None:
+        """Leave the gripper as it is, after :meth:`start`."""
+        self._closing.set()
+        self._thread.join()
+
+    def _serve(self) -> None:
+        while not self._closing.is_set():
+            began = time.monotonic()
+            try:
+                self._exchange(began)
+                pause = began + _PERIOD - time.monotonic()
+            except Exception as error:  # not all that comes from a serial device is an OSError
+                self._client.close()
+                self.status = self._measured = None
+                self._sent, pause = b"", _AGAIN
+                self._tell(f"does not answer at {self._where}", f", and is asked again every {_AGAIN:g} s: {error}")
+            self._closing.wait(max(pause, 0.0))
+        self._client.close()
+
+    def _exchange(self, now: float) -> None:
+        """Write what has changed, then read."""
+        status, wanted, unit = self.status, self._wanted, self._config.unit
+        if status is not None and wanted is not None and (request := self._request(status, wanted)) != self._sent:
+            if request == _ACTIVATION:
+                _logger.info("%s gripper: is activated, its fingers open and close", self._arm)
+            _checked(self._client.write_registers(_OUTPUTS, list(struct.unpack(">3H", request)), device_id=unit))
+            self._sent = request
+        answer = _checked(self._client.read_input_registers(_INPUTS, count=3, device_id=unit))
+        status = GripperStatus.of(answer.registers)
+        self._used |= status.ready
+        known = self._used and status.activated
+        self._measured = (self._opening(status.position), now) if known else None
+        self.status = status
+        ended = self._used and not status.ready
+        trouble = status.trouble or ("is not active any more" if ended else "")
+        self._tell(trouble, "; the next run activates it" if ended else "")
+
+    def _request(self, status: GripperStatus, wanted: float) -> bytes:
+        """The output registers that the gripper should have now."""
+        if status.ready:
+            speed, force = round(255 * self._config.speed), round(255 * self._config.force)
+            return bytes((_ACTIVATE | _GO, 0, 0, self._position(wanted), speed, force))
+        if self._used or self._sent == _ACTIVATION:
+            return self._sent
+        return _RESET if status.requested else _ACTIVATION
+
+    def _position(self, opening: float) -> int:
+        """The position to ask for: at both ends as far as it goes, wherever that is."""
+        if opening in (0.0, 1.0):
+            return 255 - round(255 * opening)
+        opened, closed = self._config.counts
+        return round(closed + opening * (opened - closed))
+
+    def _opening(self, position: int) -> float:
+        opened, closed = self._config.counts
+        return min(max((closed - position) / (closed - opened), 0.0), 1.0)
+
+    def _tell(self, trouble: str, detail: str) -> None:
+        """Say once what is wrong, and once that nothing is any more."""
+        if trouble and trouble != self._told:
+            _logger.warning("%s gripper: %s%s", self._arm, trouble, detail)
+        elif self._told and not trouble:
+            _logger.info("%s gripper: answers, and nothing is wrong with it", self._arm)
+        self._told = trouble
+
+
+def _client(arm: str, config: ModbusGripperConfig) -> Any:
+    """A client that connects at its first request."""
+    try:
+        from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+
+        if config.endpoint is None:
+            return ModbusSerialClient(config.modbus, baudrate=115200, timeout=_TIMEOUT, retries=_REPEATS)
+    except (ImportError, RuntimeError) as error:  # as pymodbus says that pyserial is missing
+        needs = "needs pymodbus and pyserial: pip install 'q2r2_control[modbus]'"
+        raise ConfigError(f"fri.{arm}.gripper.modbus: {needs}") from error
+    host, port = config.endpoint
+    return ModbusTcpClient(host, port=port, timeout=_TIMEOUT, retries=_REPEATS)
+
+
+def _checked(answer: Any) -> Any:
+    if answer.isError():
+        raise OSError(f"it refuses: {answer}")
+    return answer

@@ -1,0 +1,232 @@
+"""A gripper on Modbus against a simulated one, which moves by a step each time that it is read."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from pymodbus.framer import FramerType
+
+from q2r2_control.config.fri import ModbusGripperConfig
+from q2r2_control.errors import ConfigError
+from q2r2_control.plants.modbus_gripper import ModbusGripper
+from tests.support.headset_server import eventually, warnings
+from tests.support.robotiq_gripper import SimulatedGripper
+
+ACTIVATE, RESET = (1, 0, 0, 0, 0, 0), (0, 0, 0, 0, 0, 0)
+MODULE = "q2r2_control.plants.modbus_gripper"
+Connect = Callable[..., ModbusGripper]
+
+
+@pytest.fixture
+def simulated() -> Iterator[SimulatedGripper]:
+    with SimulatedGripper() as made:
+        yield made
+
+
+@pytest.fixture
+def connect(simulated: SimulatedGripper, monkeypatch: pytest.MonkeyPatch) -> Iterator[Connect]:
+    """A gripper under test, which a busy machine does not make lose its connection."""
+    monkeypatch.setattr(f"{MODULE}._TIMEOUT", 30.0)
+    monkeypatch.setattr(f"{MODULE}._AGAIN", 0.01)
+    started: list[ModbusGripper] = []
+
+    def start(**settings: Any) -> ModbusGripper:
+        config = ModbusGripperConfig(**{"modbus": f"127.0.0.1:{simulated.port}", **settings})
+        started.append(ModbusGripper("left", config))
+        started[-1].start()
+        return started[-1]
+
+    yield start
+    simulated.stop()  # or one that waits for an answer would go on to
+    for gripper in started:
+        gripper.close()
+
+
+def read_on(simulated: SimulatedGripper, times: int = 10) -> None:
+    """Wait until the gripper was read some more times."""
+    enough = simulated.reads + times
+    eventually(lambda: simulated.reads >= enough, "the gripper is read")
+
+
+def measures(gripper: ModbusGripper, opening: float) -> None:
+    eventually(lambda: gripper.opening == pytest.approx(opening, abs=0.003), f"opening {opening}")
+
+
+def test_it_is_only_read_before_the_first_command(connect: Connect, simulated: SimulatedGripper) -> None:
+    gripper = connect()
+    read_on(simulated)
+    assert simulated.written == []
+    assert gripper.opening is None
+    assert (
+        gripper.in_words() == f"127.0.0.1:{simulated.port}, unit 9: not active until a run begins, position 120 of 255"
+    )
+
+
+def test_the_first_command_activates_it_and_it_goes_on_to_the_newest_opening(
+    connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    gripper = connect(speed=0.2, force=1.0)
+    gripper.command(0.4)
+    measures(gripper, 0.4)
+    gripper.command(0.8)
+    measures(gripper, 0.8)
+    assert simulated.written == [ACTIVATE, (9, 0, 0, 153, 51, 255), (9, 0, 0, 51, 51, 255)]
+    assert "left gripper: is activated, its fingers open and close" in caplog.messages
+
+
+def test_one_that_is_active_is_not_activated_so_that_it_keeps_what_it_holds(
+    connect: Connect, simulated: SimulatedGripper
+) -> None:
+    simulated.activate()
+    gripper = connect()
+    measures(gripper, 1 - 120 / 255)
+    gripper.command(1.0)
+    measures(gripper, 1.0)
+    assert simulated.written == [(9, 0, 0, 0, 255, 128)]
+
+
+@pytest.mark.parametrize(
+    ("fault", "begins"),
+    [
+        pytest.param(0x0E, [RESET, ACTIVATE], id="overcurrent"),
+        pytest.param(0x09, [], id="nobody has spoken to it for a second"),
+    ],
+)
+def test_a_fault_is_reset_where_only_a_reset_ends_it(
+    connect: Connect, simulated: SimulatedGripper, fault: int, begins: list[tuple[int, ...]]
+) -> None:
+    simulated.activate()
+    simulated.fault = fault
+    gripper = connect()
+    read_on(simulated)
+    assert (gripper.opening is None) == bool(begins), "before it counts as measured, its fingers may open and close"
+    gripper.command(0.0)
+    measures(gripper, 0.0)
+    assert simulated.written == [*begins, (9, 0, 0, 255, 255, 128)]
+
+
+def test_fingers_that_an_object_stops_are_measured_there(connect: Connect, simulated: SimulatedGripper) -> None:
+    simulated.object_at = 204
+    gripper = connect()
+    gripper.command(0.0)
+    eventually(lambda: gripper.status and gripper.status.holds, "it holds the object")
+    measures(gripper, 0.2)
+    assert gripper.in_words().endswith("unit 9: active, position 204 of 255, holds something")
+
+
+def test_the_ends_of_its_counts_are_closed_and_open_and_are_gone_beyond(
+    connect: Connect, simulated: SimulatedGripper
+) -> None:
+    simulated.activate()
+    gripper = connect(counts=(3, 230))
+    for opening, position in ((0.5, 116), (0.0, 255), (1.0, 0)):
+        gripper.command(opening)
+        measures(gripper, opening)
+        read_on(simulated)
+        assert simulated.position == position
+
+
+def test_a_lost_connection_is_said_once_and_comes_back_with_the_newest_opening(
+    connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
+) -> None:
+    gripper = connect()
+    gripper.command(0.0)
+    measures(gripper, 0.0)
+    simulated.stop()
+    with socket.create_server(("127.0.0.1", simulated.port)) as drops:
+        for _ in range(5):
+            drops.accept()[0].close()
+        assert gripper.opening is None
+        assert gripper.in_words().endswith("unit 9: does not answer")
+        gripper.command(0.6)
+    simulated.written.clear()
+    simulated.start()
+    measures(gripper, 0.6)
+    assert simulated.written == [(9, 0, 0, 102, 255, 128)]
+    (said,) = warnings(caplog)
+    assert said.startswith(f"left gripper: does not answer at 127.0.0.1:{simulated.port}, unit 9, and is asked again")
+
+
+def test_an_opening_is_not_known_any_more_before_the_gripper_counts_as_lost(
+    connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
+) -> None:
+    gripper = connect()
+    gripper.command(0.5)
+    measures(gripper, 0.5)
+    simulated.silent = True
+    eventually(lambda: gripper.opening is None)
+    assert gripper.status is not None
+    assert warnings(caplog) == []
+
+
+def test_one_that_was_switched_off_in_mid_run_is_not_activated_before_the_next(
+    connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
+) -> None:
+    gripper = connect()
+    gripper.command(0.5)
+    measures(gripper, 0.5)
+    simulated.power_off()
+    eventually(lambda: gripper.opening is None)
+    gripper.command(0.0)
+    read_on(simulated)
+    assert simulated.written == []
+    assert warnings(caplog) == ["left gripper: is not active any more; the next run activates it"]
+
+
+def test_a_fault_in_mid_run_is_said_once_in_words(
+    connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
+) -> None:
+    gripper = connect()
+    gripper.command(0.5)
+    measures(gripper, 0.5)
+    simulated.fault = 0x0E
+    read_on(simulated)
+    measures(gripper, 0.5)
+    assert simulated.activations == 1
+    assert warnings(caplog) == ["left gripper: fault 0x0e, overcurrent; the next run activates it"]
+
+
+@contextmanager
+def serial_line(port: int) -> Iterator[str]:
+    """A serial device whose other end is a TCP port."""
+    end, device = os.openpty()
+    done = threading.Event()
+
+    def carry(line: int) -> None:
+        while not done.is_set():
+            for source in select.select([end, line], [], [], 0.02)[0]:
+                os.write(end if source == line else line, os.read(source, 1000))
+
+    with socket.create_connection(("127.0.0.1", port)) as line:
+        thread = threading.Thread(target=carry, args=(line.fileno(),))
+        thread.start()
+        yield os.ttyname(device)
+        done.set()
+        thread.join()
+    os.close(end)
+    os.close(device)
+
+
+def test_on_a_serial_device_it_speaks_modbus_rtu() -> None:
+    with SimulatedGripper(FramerType.RTU) as simulated, serial_line(simulated.port) as device:
+        gripper = ModbusGripper("left", ModbusGripperConfig(modbus=device))
+        gripper.start()
+        gripper.command(0.2)
+        measures(gripper, 0.2)
+        gripper.close()
+        assert simulated.activations == 1
+
+
+def test_without_its_package_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymodbus.client", None)
+    with pytest.raises(ConfigError, match=r"fri\.left\.gripper\.modbus: .* pip install 'q2r2_control\[modbus\]'"):
+        ModbusGripper("left", ModbusGripperConfig(modbus="192.168.1.11"))
