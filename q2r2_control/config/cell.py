@@ -37,7 +37,7 @@ from q2r2_control.config.external import ControllerKind, ExternalConfig, check_e
 from q2r2_control.config.fri import CabinetConfig
 from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSettings
 from q2r2_control.config.resources import find_resource
-from q2r2_control.config.strict import Network, StrictModel, network_of
+from q2r2_control.config.strict import Network, StrictModel, first_fault, network_of
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 
@@ -146,6 +146,13 @@ class Config(StrictModel):
     )
     judge: JudgeSettings = JudgeSettings()
 
+    @model_validator(mode="after")
+    def _fits_together(self) -> Config:
+        check_models(self.robot, self.arms)
+        check_priority(self.control.priority, self.arms)
+        check_external(self.controller, self.external, self.arms)
+        return self
+
     @property
     def simulated_cameras(self) -> dict[str, CameraConfig]:
         """Those of the simulated cell; the others are on ROS topics."""
@@ -198,14 +205,11 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
         # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
         content = json.dumps(data, default=str)
         config = Config.model_validate_json(content, strict=True, context={"folder": folder})
-        check_models(config.robot, config.arms)
-        check_priority(config.control.priority, config.arms)
-        check_external(config.controller, config.external, config.arms)
         return _within_driver_limits(config)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     except ValidationError as error:
-        raise ConfigError(f"{path}: {_first_fault(error)}") from error
+        raise ConfigError(f"{path}: {first_fault(error, Config)}") from error
     except (ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
 
@@ -243,33 +247,6 @@ _Loader.add_implicit_resolver(
 )
 
 
-def _first_fault(error: ValidationError) -> str:
-    """One line about the first fault: key, value, what is allowed, and how many more there are."""
-    # A misspelt key leaves others missing or empty; the misspelling says more.
-    faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
-    fault = faults[0]
-    key = _line(".".join(str(part) for part in fault["loc"] if part != "[key]")) or "(top level)"
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    if fault["type"] == "missing":
-        return f"{key}: missing, and has no default{more}"
-    allowed = fault["msg"].removeprefix("Value error, ")
-    if fault["type"] == "extra_forbidden":
-        allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1]))}"
-    return f"{key} = {fault['input']!r:.60}: {allowed}{more}"
-
-
 def _line(text: object) -> str:
     """``text`` as one line of bounded length."""
     return " ".join(str(text).split())[:300]
-
-
-def _keys_at(location: tuple[int | str, ...]) -> list[str]:
-    """Names of the keys that the model at ``location`` accepts."""
-    model: Any = Config
-    for part in location:
-        annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
-        if annotation is None:
-            continue
-        arguments = [given for given in getattr(annotation, "__args__", ()) if given is not type(None)]
-        model = arguments[-1] if arguments else annotation
-    return sorted(getattr(model, "model_fields", {}))
