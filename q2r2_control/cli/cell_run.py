@@ -138,6 +138,8 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None) ->
         raise ConfigError(f"{config.name}: {'; '.join(faults)}; --force runs it all the same")
     for fault in faults:
         say(f"FAULT {fault}", console, "red")
+    if config.note_on_grippers is not None:
+        say(config.note_on_grippers, console, "yellow")
     watch = None
     if options.tasks and isinstance(pipeline.plant, MujocoPlant):
         watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)

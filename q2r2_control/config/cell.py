@@ -26,6 +26,7 @@ from q2r2_control.config.arms import (
     Side,
     check_models,
 )
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.control import (
     AdmittanceSettings,
     ControllerSettings,
@@ -157,6 +158,15 @@ class Config(StrictModel):
     def simulated_cameras(self) -> dict[str, CameraConfig]:
         """Those of the simulated cell; the others are on ROS topics."""
         return {name: camera for name, camera in self.cameras.items() if camera.topic is None}
+
+    @property
+    def note_on_grippers(self) -> str | None:
+        """A line about a control that leads grippers where no arm has one; None where all is well."""
+        analog = self.teleop.bindings.words_of(Action.GRIPPER_ANALOG)
+        moved = any(arm.gripper.joints for arm in self.arms.values()) or any(cell.gripper for cell in self.fri.values())
+        if analog is None or moved or self.controller is ControllerKind.EXTERNAL:
+            return None
+        return f"teleop.bindings: {analog} is gripper_analog, but no arm has a gripper; allowed: arms.*.gripper.joints"
 
     def model_of(self, arm: str) -> str:
         """The model that an arm is, or is part of."""
