@@ -23,7 +23,7 @@ from q2r2_control.judging.judge import Verdict
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import ArmSummary, Percentiles, RunSummary, TorqueSummary
 from q2r2_control.teleop.arm_states import ArmState, is_fault
-from q2r2_control.viewer.tables import figure_table
+from q2r2_control.viewer.tables import figure_table, print_table
 from q2r2_control.wording import sentence
 
 _COMPILING = "compiling the controller for this machine, once for each version of its code; 1-2 minutes"
@@ -47,7 +47,7 @@ def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:
         return
     console = Console()
     for table in tables:
-        console.print(table)
+        print_table(table, console)
 
 
 def say(line: str, console: Console | None = None, style: str = "") -> None:
