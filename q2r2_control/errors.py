@@ -1,5 +1,7 @@
 """The one exception root: every error the package raises on purpose says what, where and what is allowed."""
 
+from __future__ import annotations
+
 
 class Q2R2Error(Exception):
     """Root of all errors that q2r2_control raises on purpose."""
@@ -27,3 +29,14 @@ class PlantError(Q2R2Error):
 
 class RecordingError(Q2R2Error):
     """A recording cannot be read or replayed; the message names the file, what is wrong and what is allowed."""
+
+
+def shown(value: object, length: int = 60) -> str:
+    """``value`` for an error: one line of at most ``length`` characters."""
+    return " ".join(repr(value).split())[:length]
+
+
+def check_kind(name: str, value: object, kind: type, allowed: str, error: type[Q2R2Error] = ConfigError) -> None:
+    """Raise an ``error`` that says what is ``allowed`` unless ``value`` is of a ``kind``."""
+    if not isinstance(value, kind):
+        raise error(f"{name} = {shown(value)}: allowed: {allowed}")

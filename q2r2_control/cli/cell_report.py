@@ -87,6 +87,8 @@ def check_cell(config: Config) -> CellCheck:
     arms = [_arm_check(config, robot, name) for name in robot.arms]
     stops = stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit))
     notes = [f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in arms if arm.object]
+    if config.note_on_grippers is not None:
+        notes.append(config.note_on_grippers)
     for allowed in config.control.contact_allowed:
         inside = f"the reference gets inside by up to {1e3 * allowed.depth:g} mm at {1e3 * allowed.speed:g} mm/s"
         notes.append(f"{' and '.join(allowed.pair)} may touch in torque mode: {inside}")

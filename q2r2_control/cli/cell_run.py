@@ -41,6 +41,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.live import LiveTable
+from q2r2_control.viewer.tables import print_table
 
 _PERIOD = 1.0 / 30.0  # [s]
 
@@ -138,6 +139,8 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None) ->
         raise ConfigError(f"{config.name}: {'; '.join(faults)}; --force runs it all the same")
     for fault in faults:
         say(f"FAULT {fault}", console, "red")
+    if config.note_on_grippers is not None:
+        say(config.note_on_grippers, console, "yellow")
     watch = None
     if options.tasks and isinstance(pipeline.plant, MujocoPlant):
         watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
@@ -162,7 +165,7 @@ def print_summary(run: CellRun, json: bool) -> None:
         print(as_json_text(data))
         return
     console = Console()
-    console.print(summary_table(run.summary))
+    print_table(summary_table(run.summary), console)
     _print_lines(console, map(task_line, run.tasks))
     if run.recording is not None:
         _print_lines(console, _recording_lines(run.recording))

@@ -17,7 +17,7 @@ from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import Robot
-from q2r2_control.viewer.tables import figure_table
+from q2r2_control.viewer.tables import figure_table, print_table
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ def _print_cell(cell: CellCheck) -> None:
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"cell {cell.name}")
     for table in _cell_tables(cell):
-        console.print(table, soft_wrap=False)
+        print_table(table, console)
     for arm, line in (cell.driven or {"arms": "the built-in controller"}).items():
         console.print(f"{arm} driven by {line}", markup=False)
     for note in cell.notes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
@@ -16,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
 
+from q2r2_control.control.jit import calling_before_compiling
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import ReasonKind
@@ -23,10 +23,10 @@ from q2r2_control.judging.judge import Verdict
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import ArmSummary, Percentiles, RunSummary, TorqueSummary
 from q2r2_control.teleop.arm_states import ArmState, is_fault
-from q2r2_control.viewer.tables import figure_table
+from q2r2_control.viewer.tables import figure_table, print_table
 from q2r2_control.wording import sentence
 
-_NOTICE_AFTER = 3.0  # [s]
+_COMPILING = "compiling the controller for this machine, once for each version of its code; 1-2 minutes"
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
 ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
@@ -47,7 +47,7 @@ def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:
         return
     console = Console()
     for table in tables:
-        console.print(table)
+        print_table(table, console)
 
 
 def say(line: str, console: Console | None = None, style: str = "") -> None:
@@ -73,15 +73,9 @@ def print_progress(what: str) -> None:
 
 @contextmanager
 def notice_of_compiling() -> Iterator[None]:
-    """Say what takes so long, where building the controller does."""
-    text = "building the controller; where its code is new it is compiled for this machine first, 1-2 minutes"
-    timer = threading.Timer(_NOTICE_AFTER, say, [text])
-    timer.daemon = True
-    timer.start()
-    try:
+    """Say what takes so long, where the controller's kernels have to be compiled."""
+    with calling_before_compiling(lambda: say(_COMPILING)):
         yield
-    finally:
-        timer.cancel()
 
 
 def notes_of(task: str | None, operator: str | None, record: object) -> dict[str, str]:

@@ -9,10 +9,10 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import yaml
-from pydantic import Field, Tag, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from q2r2_control.config.arms import (
     ArmConfig,
@@ -26,6 +26,7 @@ from q2r2_control.config.arms import (
     Side,
     check_models,
 )
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.control import (
     AdmittanceSettings,
     ControllerSettings,
@@ -37,7 +38,7 @@ from q2r2_control.config.external import ControllerKind, ExternalConfig, check_e
 from q2r2_control.config.fri import MODBUS_DELAY, CabinetConfig, ModbusGripperConfig
 from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSettings
 from q2r2_control.config.resources import find_resource
-from q2r2_control.config.strict import Network, StrictModel, network_of
+from q2r2_control.config.strict import Network, StrictModel, first_fault, network_of
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 
@@ -146,6 +147,13 @@ class Config(StrictModel):
     )
     judge: JudgeSettings = JudgeSettings()
 
+    @model_validator(mode="after")
+    def _fits_together(self) -> Config:
+        check_models(self.robot, self.arms)
+        check_priority(self.control.priority, self.arms)
+        check_external(self.controller, self.external, self.arms)
+        return self
+
     @property
     def simulated_cameras(self) -> dict[str, CameraConfig]:
         """Those of the simulated cell; the others are on ROS topics."""
@@ -156,6 +164,15 @@ class Config(StrictModel):
         """The longest time until a gripper has a command and its opening is measured, beyond a few ticks [s]."""
         by_modbus = any(isinstance(cabinet.gripper, ModbusGripperConfig) for cabinet in self.fri.values())
         return MODBUS_DELAY if by_modbus else 0.0
+
+    @property
+    def note_on_grippers(self) -> str | None:
+        """A line about a control that leads grippers where no arm has one; None where all is well."""
+        analog = self.teleop.bindings.words_of(Action.GRIPPER_ANALOG)
+        moved = any(arm.gripper.joints for arm in self.arms.values()) or any(cell.gripper for cell in self.fri.values())
+        if analog is None or moved or self.controller is ControllerKind.EXTERNAL:
+            return None
+        return f"teleop.bindings: {analog} is gripper_analog, but no arm has a gripper; allowed: arms.*.gripper.joints"
 
     def model_of(self, arm: str) -> str:
         """The model that an arm is, or is part of."""
@@ -204,14 +221,11 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
         # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
         content = json.dumps(data, default=str)
         config = Config.model_validate_json(content, strict=True, context={"folder": folder})
-        check_models(config.robot, config.arms)
-        check_priority(config.control.priority, config.arms)
-        check_external(config.controller, config.external, config.arms)
         return _within_driver_limits(config)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     except ValidationError as error:
-        raise ConfigError(f"{path}: {_first_fault(error)}") from error
+        raise ConfigError(f"{path}: {first_fault(error, Config)}") from error
     except (ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
 
@@ -249,36 +263,6 @@ _Loader.add_implicit_resolver(
 )
 
 
-def _first_fault(error: ValidationError) -> str:
-    """One line about the first fault: key, value, what is allowed, and how many more there are."""
-    # A misspelt key leaves others missing or empty; the misspelling says more.
-    faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
-    fault = faults[0]
-    # In brackets stand notes of pydantic: "[key]", and tags of models among which a key's value is one.
-    key = _line(".".join(str(part) for part in fault["loc"] if not str(part).startswith("["))) or "(top level)"
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    if fault["type"] == "missing":
-        return f"{key}: missing, and has no default{more}"
-    allowed = fault["msg"].removeprefix("Value error, ")
-    if fault["type"] == "extra_forbidden":
-        allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1]))}"
-    return f"{key} = {fault['input']!r:.60}: {allowed}{more}"
-
-
 def _line(text: object) -> str:
     """``text`` as one line of bounded length."""
     return " ".join(str(text).split())[:300]
-
-
-def _keys_at(location: tuple[int | str, ...]) -> list[str]:
-    """Names of the keys that the model at ``location`` accepts."""
-    model: Any = Config
-    for part in location:
-        annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
-        if annotation is None:
-            choices = get_args(next(iter(get_args(model)), None))
-            model = next((get_args(choice)[0] for choice in choices if Tag(str(part)) in get_args(choice)), model)
-            continue
-        arguments = [given for given in getattr(annotation, "__args__", ()) if given is not type(None)]
-        model = arguments[-1] if arguments else annotation
-    return sorted(getattr(model, "model_fields", {}))

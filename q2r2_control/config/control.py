@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
-from q2r2_control.config.strict import StrictModel
-from q2r2_control.errors import ConfigError
+from q2r2_control.config.strict import StrictModel, first_fault
+from q2r2_control.errors import ConfigError, check_kind
 
 EQUAL = "equal"
 _LIVE = "live"  # marks a setting that may change while a controller runs
@@ -128,14 +128,14 @@ class ControllerSettings(StrictModel):
 
         Raises :class:`ConfigError` for a name that is not among them and for a value that is not allowed.
         """
+        check_kind("control", values, Mapping, f"new values by name, of {', '.join(LIVE)}")
         for name, value in values.items():
             if name not in LIVE:
                 raise ConfigError(f"control.{name} = {value!r:.60}: while a controller runs: {', '.join(LIVE)}")
         try:
             return ControllerSettings.model_validate(self.model_dump() | dict(values))
         except ValidationError as error:
-            fault = error.errors()[0]
-            raise ConfigError(f"control.{fault['loc'][0]} = {fault['input']!r:.60}: {fault['msg']}") from error
+            raise ConfigError(f"control.{first_fault(error, ControllerSettings)}") from error
 
     @property
     def largest_distance(self) -> tuple[str, float]:

@@ -6,7 +6,7 @@ import os
 import sysconfig
 from pathlib import Path
 
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import ConfigError, shown
 
 _CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -21,6 +21,8 @@ def resource_roots() -> list[Path]:
 
 def find_resource(path: str | os.PathLike[str]) -> Path:
     """Resolve ``path`` from the working directory, then among the shipped files. Raises :class:`ConfigError`."""
+    if not isinstance(path, str | os.PathLike):
+        raise ConfigError(f"{shown(path)}: allowed: the path of a file, as text or pathlib.Path")
     wanted = Path(path)
     try:
         wanted = wanted.expanduser()

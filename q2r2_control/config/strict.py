@@ -3,14 +3,65 @@
 from __future__ import annotations
 
 from ipaddress import IPv4Network, IPv6Network, ip_network
+from typing import Any, get_args
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Tag, ValidationError
+
+from q2r2_control.errors import ConfigError, shown
 
 
 class StrictModel(BaseModel):
-    """Settings without unknown keys, change, or numbers that are not finite."""
+    """Settings without unknown keys, change, or numbers that are not finite.
+
+    Raises :class:`ConfigError` that names key, value and what is allowed, for wrong values and for a change.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise ConfigError(f"{type(self).__name__}: {first_fault(error, type(self))}") from error
+
+    # By this pydantic knows its own initialiser. It would call another one for settings within settings too, and an
+    # error from there could not name their key in full.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    def __setattr__(self, name: str, value: object) -> None:
+        kind = type(self).__name__
+        raise ConfigError(f"{kind}.{name} = {shown(value)}: settings do not change; allowed: another {kind}")
+
+
+def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
+    """One line about the first fault in a ``model``: key, value, what is allowed, and how many more there are."""
+    # A misspelt key leaves others missing or empty; the misspelling says more.
+    faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
+    fault = faults[0]
+    # In brackets stand notes of pydantic: "[key]", and tags of models among which a key's value is one.
+    key = ".".join(str(part) for part in fault["loc"] if not str(part).startswith("["))
+    key = " ".join(key.split())[:300] or "(top level)"
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    if fault["type"] == "missing":
+        return f"{key}: missing, and has no default{more}"
+    allowed = fault["msg"].removeprefix("Value error, ")
+    if fault["type"] == "extra_forbidden":
+        allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1], model))}"
+    return f"{key} = {shown(fault['input'])}: {allowed}{more}"
+
+
+def _keys_at(location: tuple[int | str, ...], root: type[BaseModel]) -> list[str]:
+    """Names of the keys that the model at ``location`` in ``root`` accepts."""
+    model: Any = root
+    for part in location:
+        annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
+        if annotation is None:
+            choices = get_args(next(iter(get_args(model)), None))
+            model = next((get_args(choice)[0] for choice in choices if Tag(str(part)) in get_args(choice)), model)
+            continue
+        arguments = [given for given in getattr(annotation, "__args__", ()) if given is not type(None)]
+        model = arguments[-1] if arguments else annotation
+    return sorted(getattr(model, "model_fields", {}))
 
 
 Network = IPv4Network | IPv6Network

@@ -22,7 +22,7 @@ from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
 from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.control.tasks.external import add_costs, load_tasks
-from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.errors import ConfigError, RobotError, check_kind
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, pose_of
@@ -47,8 +47,10 @@ class CartesianController:
     def __init__(
         self, robot: Robot, settings: ControllerSettings | None = None, *, solver: Solver | None = None
     ) -> None:
+        check_kind("robot", robot, Robot, "a Robot, as Robot.from_config and Robot.from_urdf return")
+        settings = ControllerSettings() if settings is None else settings
+        check_kind("settings", settings, ControllerSettings, "ControllerSettings, which a Config has as config.control")
         self.robot = robot
-        settings = settings or ControllerSettings()
         self._nv = robot.model.nv
         self._arms = tuple(robot.arms)
         self._solver = solver or DaqpSolver(self._nv, settings.solve_time_limit)
@@ -126,8 +128,8 @@ class CartesianController:
         allowed: the controller recovers from it. Raises :class:`RobotError` for a wrong shape or no finite number.
         """
         state = self._state
-        state.q[:] = self._checked("q", q)
-        state.v[:] = 0.0 if v is None else self._checked("v", v)
+        posture, velocity = self.robot.checked("q", q), 0.0 if v is None else self.robot.checked("v", v)
+        state.q[:], state.v[:] = posture, velocity
         self._fingers.set_all({})
         self._objects.clear()
         self._active.used[0] = 0
@@ -138,20 +140,16 @@ class CartesianController:
         self._observe_again(self._unchanged)
         self._certified = proven and self._apart
 
-    def _checked(self, name: str, values: Array) -> Array:
-        array = np.array(values, dtype=np.float64)
-        if array.shape != (self._nv,) or not np.isfinite(array).all():
-            raise RobotError(f"{name} = {values!r:.80}: expected {self._nv} finite numbers")
-        return array
-
     def step(self, targets: Mapping[str, pin.SE3 | None], dt: float, posture: Array | None = None) -> Reference:
         """Move the reference by ``dt`` seconds towards the tool ``targets`` (world frame).
 
         An arm that is missing or None holds. A target that is not a finite pose is not used: the arm's last target
         stays, and the report names the arm. A dt that is not in (0, 0.1] s moves nothing, or no more than 0.1 s.
         Joints that the tools leave free go to ``posture`` (nv,) [rad], or home; one that is not finite is not used.
+        Raises :class:`RobotError` for ``targets`` that are no mapping.
         """
-        usable = isinstance(dt, _NUMBER) and math.isfinite(dt) and dt > 0.0
+        check_kind("targets", targets, Mapping, "a pin.SE3 or None by arm, such as {'left': pose}", RobotError)
+        usable = _passes(dt)
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         state = self._state
         self._targets.aim_posture(posture)
@@ -184,7 +182,12 @@ class CartesianController:
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
 
     def brake(self, dt: float) -> None:
-        """Move the reference by ``dt`` [s] along its certified stop, of which the rest stays certified."""
+        """Move the reference by ``dt`` [s] along its certified stop, of which the rest stays certified.
+
+        A dt that :meth:`step` does not use moves nothing.
+        """
+        if not _passes(dt):
+            return
         self._observed, _, _ = self._move(self._model_pointer, self._data_pointer, self._solution, False, dt, 0.0)
         self._apart = self._observed[-1] >= -ROUNDING
 
@@ -194,7 +197,7 @@ class CartesianController:
         As fast as a gain of 4 /s of the way that is left, so ``q`` should move as the arms should. None: they hold
         where they come to rest, as they do anyhow after a target. Raises :class:`RobotError` as :meth:`reset` does.
         """
-        self._targets.hold_at(None if q is None else self._checked("q", q))
+        self._targets.hold_at(None if q is None else self.robot.checked("q", q))
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         """Say that the gripper of ``arm`` is, and stays, between two openings, 0 closed .. 1 fully open.
@@ -206,6 +209,7 @@ class CartesianController:
 
         Raises :class:`RobotError` for a name that is no arm's and for numbers that are no interval.
         """
+        self.robot.arm(arm)
         interval, before = self._fingers.checked(arm, least, greatest), self._fingers.intervals[arm]
         if interval == before:
             return None
@@ -252,13 +256,16 @@ class CartesianController:
         return int(blocked)
 
     def tool_pose(self, arm: str) -> pin.SE3:
-        """World pose of an arm's tool at the reference."""
-        i = self._arms.index(arm)
+        """World pose of an arm's tool at the reference. Raises :class:`RobotError` for an arm that does not exist."""
+        i = self._arms.index(self.robot.arm(arm).name)
         return pose_of(self._tasks.rotation[i], self._tasks.translation[i])
 
     def spare_distance(self, arm: str) -> float:
-        """How much nearer ``arm`` may come to what is no part of it at the reference [m]; inf if there is no pair."""
-        return float(self._spare(self._model_pointer, self._data_pointer, self._with_others[arm]))
+        """How much nearer ``arm`` may come to what is no part of it at the reference [m]; inf if there is no pair.
+
+        Raises as :meth:`tool_pose` does.
+        """
+        return float(self._spare(self._model_pointer, self._data_pointer, self._with_others[self.robot.arm(arm).name]))
 
     @property
     def stop_deceleration(self) -> Array:
@@ -295,3 +302,8 @@ class CartesianController:
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
+
+
+def _passes(dt: float) -> bool:
+    """Whether ``dt`` [s] is a time in which something may move."""
+    return isinstance(dt, _NUMBER) and math.isfinite(dt) and dt > 0.0

@@ -11,7 +11,8 @@ import hashlib
 import os
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import types
 from numba.core import cgutils
+from numba.core.event import Listener, install_listener
 from numba.core.registry import cpu_target
 
 _ROOMS = ("control", "compliance")
@@ -149,6 +151,28 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
     finally:
         config.CACHE_DIR = previous
     return compiled
+
+
+class _FirstCompilation(Listener):
+    """Calls once."""
+
+    def __init__(self, notice: Callable[[], None]) -> None:
+        self._notice: Callable[[], None] | None = notice
+
+    def on_start(self, event: Any) -> None:
+        notice, self._notice = self._notice, None
+        if notice is not None:
+            notice()
+
+    def on_end(self, event: Any) -> None:
+        """Nothing is done."""
+
+
+@contextmanager
+def calling_before_compiling(notice: Callable[[], None]) -> Iterator[None]:
+    """Call ``notice`` once, before the first kernel that is compiled; never where all come from the cache."""
+    with install_listener("numba:compile", _FirstCompilation(notice)):
+        yield
 
 
 @kernel

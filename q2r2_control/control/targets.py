@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
@@ -98,11 +99,13 @@ class TargetTracker:
             self._targets.hold[:] = q
             self._targets.latched[:] = 1
 
-    def aim_posture(self, posture: Array | None) -> None:
+    def aim_posture(self, posture: npt.ArrayLike | None) -> None:
         """Let the free joints go to ``posture`` (nv,) [rad], home where there is none; a bad one changes nothing."""
         if posture is None:
             self._targets.posture[:] = self._home
-        elif posture.shape == self._home.shape and np.isfinite(posture).all():
+            return
+        posture = np.asarray(posture)
+        if posture.shape == self._home.shape and posture.dtype.kind in "fiu" and np.isfinite(posture).all():
             self._targets.posture[:] = posture
 
     def offer(self, targets: Mapping[str, pin.SE3 | None]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Protocol, runtime_checkable
 
 from q2r2_control.config.cell import Config
+from q2r2_control.errors import check_kind
 from q2r2_control.plugins import INPUTS, load_class
 from q2r2_control.types import DeviceControls, HandSample, HapticFeedback
 
@@ -53,6 +54,7 @@ def make_input(source: Input | str, config: Config, **options: object) -> Input:
     Raises :class:`ConfigError` for an unknown name.
     """
     if not isinstance(source, str):
+        check_kind("input", source, Input, "the name of an input, or an object with all methods of Input")
         return source
     taken = {name: value for name, value in options.items() if name in options_of(source)}
     made: Input = load_class(INPUTS, source).from_config(config, **taken)

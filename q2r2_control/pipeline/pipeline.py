@@ -15,7 +15,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive, permitted
-from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
@@ -102,6 +102,7 @@ class Pipeline:
         :meth:`Teleop.change` says when they count, and an event whether they did. Raises :class:`ConfigError` for a
         binding to a control that the input lacks.
         """
+        check_kind("teleop", settings, TeleopSettings, "TeleopSettings, which a Config has as config.teleop")
         settings.bindings.check_device(self.input.controls)
         self.requests.settings = settings
 
@@ -124,8 +125,9 @@ class Pipeline:
         ``realtime``: the loop follows the clock, and a late tick moves no joint farther than a period allows. Otherwise
         time is simulated and the run is repeatable. Raises :class:`ConfigError` for a duration that is not positive.
         """
-        if duration is not None and not (math.isfinite(duration) and duration > 0.0):
-            raise ConfigError(f"duration = {duration!r}: allowed: a positive number of seconds")
+        number = isinstance(duration, float | int | np.number)
+        if duration is not None and not (number and math.isfinite(duration) and duration > 0.0):
+            raise ConfigError(f"duration = {shown(duration)}: allowed: a positive number of seconds")
         if isinstance(self.plant, SessionPlant) and self.plant.realtime_only and not realtime:
             raise ConfigError("simulated time: allowed with a plant that is simulated only")
         self._prepare(realtime)

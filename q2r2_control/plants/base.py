@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.errors import ConfigError, PlantError, check_kind
 from q2r2_control.events import Reason
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
@@ -97,6 +97,7 @@ class SessionPlant(Protocol):
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
     """The plant called ``plant``, or ``plant`` itself. Raises :class:`ConfigError` for an unknown name."""
     if not isinstance(plant, str):
+        check_kind("plant", plant, Plant, "the name of a plant, or an object with all methods of Plant")
         return plant
     made: Plant = load_class(PLANTS, plant).from_config(robot, config)
     return made

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -236,8 +237,14 @@ def name_of_stack(parts: Sequence[Description]) -> str:
 def check_position(joint: ET.Element, position: float, key: str) -> None:
     """Raise :class:`ConfigError` that begins with ``key`` where ``position`` is outside the joint's limits."""
     lower, upper = joint_limits(joint)
-    if not lower <= position <= upper:
-        raise ConfigError(f"{key} = {position:g}: joint {joint.get('name')} allows {lower:g} .. {upper:g}")
+    if lower <= position <= upper:
+        return
+    unit = "m" if joint.get("type") == "prismatic" else "rad"
+    radians = math.radians(position)
+    # Beyond half a turn, and within the limits once converted: most likely degrees.
+    hint = f"; {position:g} degrees are {radians:.4g} rad" if unit == "rad" and abs(position) > math.pi else ""
+    hint = hint if lower <= radians <= upper else ""
+    raise ConfigError(f"{key} = {position:g}: joint {joint.get('name')} allows {lower:g} .. {upper:g} {unit}{hint}")
 
 
 def _check_link(link: str, model: Model, key: str) -> None:

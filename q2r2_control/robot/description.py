@@ -79,7 +79,7 @@ def load_description(
         elif model.endswith((".urdf", ".xacro")):
             file = find_resource(model).resolve()
         else:
-            file = find_resource(f"robots/{model}.urdf")
+            file = _shipped_model(model)
         srdf_file = file.with_name(file.name.removesuffix(".xacro").removesuffix(".urdf") + ".srdf")
     if file.suffix == ".xacro":
         text = expand_xacro(file, xacro_args or {}, packages)
@@ -90,6 +90,17 @@ def load_description(
     urdf = parse_urdf(text, str(file), file.parent, packages)
     srdf = parse_srdf(_read(srdf_file), str(srdf_file)) if srdf_file is not None and srdf_file.is_file() else None
     return Description(urdf=urdf, srdf=srdf, file=file)
+
+
+def _shipped_model(model: str) -> Path:
+    """The file of a name. Raises :class:`ConfigError` for no such file, and for a path of another kind of file."""
+    try:
+        return find_resource(f"robots/{model}.urdf")
+    except ConfigError:
+        if Path(model).name == model and not Path(model).suffix:
+            raise
+        kinds = f"a name in robots/, a path that ends in .urdf or .xacro, or {EXAMPLE_ROBOT_DATA}NAME"
+        raise ConfigError(f"neither a name nor a model's file; allowed: {kinds}") from None
 
 
 def parse_urdf(

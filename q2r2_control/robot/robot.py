@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
@@ -128,6 +129,7 @@ class Robot:
     @classmethod
     def from_config(cls, config: Config) -> Robot:
         """The robot of a cell. Raises :class:`ConfigError` or :class:`RobotError` with what is wrong and where."""
+        check_kind("config", config, Config, "a Config, as load_config returns")
         cell = compose(config)
         urdf = parse_urdf(cell.urdf, cell.name)
         robot = cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name, cell.parts)
@@ -150,38 +152,72 @@ class Robot:
         text, where, folder = _text_of(path_or_xml, "URDF text")
         urdf = parse_urdf(text, where, folder)
         exclusions = None if srdf is None else parse_srdf(*_text_of(srdf, "SRDF text")[:2])
-        if not arms:
-            raise RobotError(f"{where}: no arms given; expected a mapping such as {{'left': 'left_tool_frame'}}")
+        names = [*arms, *arms.values()] if isinstance(arms, Mapping) else []
+        if not names or not all(isinstance(name, str) and name for name in names):
+            given = f"arms = {shown(arms)}" if arms else "no arms given"
+            raise RobotError(f"{where}: {given}; expected a mapping such as {{'left': 'left_tool_frame'}}")
+        if len(set(arms.values())) < len(arms):
+            raise RobotError(f"{where}: arms = {shown(arms, 200)}: allowed: a tool frame of its own for each arm")
         limits = {joint.get("name", ""): joint_limits(joint) for joint in urdf.findall("joint")}
         home = {name: 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2 for name, (lower, upper) in limits.items()}
         return cls(urdf, exclusions, dict(arms), home, where)
 
     def capped_acceleration(self, cap: float) -> Array:
-        """Acceleration limits (nv,) with ``cap`` [rad/s^2] for every joint: the smaller one of it and the robot's."""
+        """Acceleration limits (nv,) with ``cap`` [rad/s^2] for every joint: the smaller one of it and the robot's.
+
+        Raises :class:`RobotError` for no number above 0.
+        """
+        if not isinstance(cap, float | int | np.number) or not cap > 0:
+            raise RobotError(f"acceleration cap = {shown(cap)}: allowed: a number above 0 [rad/s^2]")
         return np.minimum(self.acceleration_limit, cap)
 
-    def tool_pose(self, q: Array, arm: str) -> pin.SE3:
-        """Pose of the arm's tool frame in the world at ``q`` (nv,)."""
-        pin.forwardKinematics(self.model, self._data, q)
-        return pin.updateFramePlacement(self.model, self._data, self.arms[arm].frame_id).copy()
+    def arm(self, name: str) -> Arm:
+        """The arm called ``name``. Raises :class:`RobotError` where there is none."""
+        if not isinstance(name, str) or name not in self.arms:
+            raise RobotError(f"{self.name}: no arm {shown(name)}; arms: {', '.join(self.arms)}")
+        return self.arms[name]
 
-    def distances(self, q: Array) -> list[PairDistance]:
-        """Distance of every monitored pair at ``q`` (nv,), computed by Coal, in the order of the collision pairs."""
+    def checked(self, name: str, values: npt.ArrayLike) -> Array:
+        """A copy of ``values``, one for each joint (nv,). Raises :class:`RobotError` that says their ``name``."""
+        try:
+            array = np.array(values, dtype=np.float64)
+        except (TypeError, ValueError):
+            array = np.empty(0)
+        if array.shape != (self.model.nv,) or not np.isfinite(array).all():
+            raise RobotError(f"{name} = {shown(values)}: expected {self.model.nv} finite numbers, one for each joint")
+        return array
+
+    def tool_pose(self, q: npt.ArrayLike, arm: str) -> pin.SE3:
+        """Pose of the arm's tool frame in the world at ``q`` (nv,).
+
+        Raises :class:`RobotError` for another shape, no finite number and an arm that does not exist.
+        """
+        frame_id = self.arm(arm).frame_id
+        pin.forwardKinematics(self.model, self._data, self.checked("q", q))
+        return pin.updateFramePlacement(self.model, self._data, frame_id).copy()
+
+    def distances(self, q: npt.ArrayLike) -> list[PairDistance]:
+        """Distance of every monitored pair at ``q`` (nv,), computed by Coal, in the order of the collision pairs.
+
+        Raises :class:`RobotError` for another shape and no finite number.
+        """
         values = self.distance_values(q).tolist()
         return [
             PairDistance(a, b, value) for (a, b), value in zip(pair_names(self.collision_model), values, strict=True)
         ]
 
-    def distance_values(self, q: Array) -> Array:
+    def distance_values(self, q: npt.ArrayLike) -> Array:
         """The numbers of :meth:`distances` alone (pairs,) [m]."""
+        q = self.checked("q", q)
         pin.computeDistances(self.model, self._data, self.collision_model, self._collision_data, q)
         return np.array([result.min_distance for result in self._collision_data.distanceResults], dtype=np.float64)
 
-    def closest_points(self, q: Array, pair: tuple[str, str]) -> Array | None:
+    def closest_points(self, q: npt.ArrayLike, pair: tuple[str, str]) -> Array | None:
         """The nearest points (2, 3) [m] of a monitored pair in the world at ``q`` (nv,); None where it is none."""
         names = pair_names(self.collision_model)
         if pair not in names:
             return None
+        q = self.checked("q", q)
         pin.updateGeometryPlacements(self.model, self._data, self.collision_model, self._collision_data, q)
         result = pin.computeDistance(self.collision_model, self._collision_data, names.index(pair))
         return np.array([result.getNearestPoint1(), result.getNearestPoint2()])
@@ -236,6 +272,8 @@ class Robot:
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:
     """Text, what to call it in errors, and the folder it came from."""
+    if not isinstance(path_or_text, str | os.PathLike):
+        raise RobotError(f"{shown(path_or_text)}: neither {name_of_text} nor the path of a file")
     if isinstance(path_or_text, str) and path_or_text.lstrip().startswith("<"):
         return path_or_text, name_of_text, None
     try:

@@ -9,8 +9,9 @@ import numpy as np
 import pinocchio as pin
 from pydantic import ValidationError
 
+from q2r2_control.config.strict import first_fault
 from q2r2_control.config.teleop import RotationFrame, Stance, TeleopSettings, axes_matrix
-from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.errors import ConfigError, Q2R2Error, shown
 from q2r2_control.quaternions import (
     IDENTITY,
     Quaternion,
@@ -63,9 +64,7 @@ class RelativeMotion:
         try:
             settings = TeleopSettings.model_validate(given)
         except ValidationError as error:
-            fault = error.errors()[0]
-            key = ".".join(str(part) for part in fault["loc"])
-            raise ConfigError(f"RelativeMotion: {key} = {fault['input']!r:.60}: {fault['msg']}") from error
+            raise ConfigError(f"RelativeMotion: {first_fault(error, TeleopSettings)}") from error
         self._scale, self._rotation_scale = self._full = settings.position_scale, settings.rotation_scale
         self._in_tool_frame = settings.rotation_frame is RotationFrame.TOOL
         self._axis_scales = np.array(settings.axis_scales)
@@ -86,8 +85,11 @@ class RelativeMotion:
         return cls(settings.stance, settings.position_scale, settings.rotation_frame, *scales)
 
     def anchor(self, hand: pin.SE3, tool: pin.SE3) -> None:
-        """Make ``hand`` (finite, input's frame) and ``tool`` (world frame) correspond from now on."""
-        self.anchor_floats(floats_of(hand), floats_of(tool))
+        """Make ``hand`` (input's frame) and ``tool`` (world frame) correspond from now on.
+
+        Raises :class:`Q2R2Error` for what is no finite pose, as :meth:`target` and :meth:`hand` do.
+        """
+        self.anchor_floats(_checked_floats("anchor: hand", hand), _checked_floats("anchor: tool", tool))
 
     def anchor_floats(self, hand: Pose, tool: Pose) -> None:
         self.anchor_position(hand[0], tool[0])
@@ -117,7 +119,7 @@ class RelativeMotion:
 
         Raises :class:`Q2R2Error` when nothing has been anchored.
         """
-        return se3_of(self.target_floats(floats_of(hand)))
+        return se3_of(self.target_floats(_checked_floats("target: hand", hand)))
 
     def target_floats(self, hand: Pose) -> Pose:
         if self._hand_position is None:
@@ -158,12 +160,13 @@ class RelativeMotion:
         """
         if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.hand: call anchor(hand, tool) first")
+        position, now = _checked_floats("hand: tool", tool)
         scales = self._scale * self._axis_scales
-        moved = tool.translation - self._tool_position
+        moved = np.subtract(position, self._tool_position)
         way = self._map.T @ np.divide(moved, scales, out=np.zeros(3), where=scales > 0.0)
         rotation = self._hand_rotation
         if self._rotation_scale > 0.0:
-            (_, now), back = floats_of(tool), inverse(self._tool_rotation)
+            back = inverse(self._tool_rotation)
             scaled = rotation_vector(product(back, now) if self._in_tool_frame else product(now, back))
             x, y, z = (self._turn_map.T @ scaled / self._rotation_scale).tolist()
             turn = rotation_of((x, y, z))
@@ -172,6 +175,15 @@ class RelativeMotion:
 
     def _scaled_axes(self) -> list[tuple[int, float]]:
         return _axes_of(self._scale * self._axis_scales[:, None] * self._map)
+
+
+def _checked_floats(name: str, pose: pin.SE3) -> Pose:
+    """The pose as floats. Raises :class:`Q2R2Error` for no pose, and one that is not finite or no rotation."""
+    if not isinstance(pose, pin.SE3) or not np.allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-3):
+        raise Q2R2Error(f"RelativeMotion.{name} = {shown(pose)}: allowed: a pin.SE3 with a proper rotation")
+    if not np.isfinite(pose.translation).all():
+        raise Q2R2Error(f"RelativeMotion.{name} = {shown(pose)}: allowed: finite numbers")
+    return floats_of(pose)
 
 
 def _axes_of(matrix: Array) -> list[tuple[int, float]]:

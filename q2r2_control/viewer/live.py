@@ -155,7 +155,7 @@ class LiveTable:
             return table
         arms = list(tick.tools)
         for arm in arms:
-            table.add_column(arm, justify="right", min_width=18)
+            table.add_column(arm, justify="right", min_width=14)
         binding, self._binding = list(self._binding), {}
         repelled, self._repelled = list(self._repelled), {}
         for name, values in _arm_rows(tick, arms):

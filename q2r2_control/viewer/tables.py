@@ -4,37 +4,58 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
+from textwrap import wrap
 from typing import Any
 
 from rich import box
+from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
 Cell = Text | str | float | None
+_NARROWEST_NAME = 12  # names are folded, but not below this
+_WIDEST = 1000
 
 
 def figure_table(
-    title: str, columns: Sequence[str], rows: Iterable[Sequence[Cell]], notes: Sequence[str] = ()
+    title: str, columns: Sequence[str], given: Iterable[Sequence[Cell]], notes: Sequence[str] = ()
 ) -> Table:
     """A table of figures and names under headings; ``notes`` are lines below it.
 
     A heading's unit, which follows its last space, stands in a second line. A column with a unit or with numbers keeps
     to the right and is never cut; others go on in the next line. A row of one cell is the heading of the rows below.
+    Where the console is too narrow even so, the table is wider than the console: print it by :func:`print_table`.
     """
-    rows = [tuple(row) for row in rows]
+    given = list(given)
+    rows = [tuple(map(_shown, row)) for row in given]
     look: Any = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False, "min_width": len(title)}
     table = Table(title=Text(title), title_justify="left", **look)
     for index, column in enumerate(columns):
         name, _, unit = column.rpartition(" ")
-        numbers = any(isinstance(row[index], int | float) for row in rows if len(row) > index)
+        numbers = any(isinstance(row[index], int | float) for row in given if len(row) > index)
         figures = index > 0 and (numbers or unit.startswith(("[", "/")))
-        heading = Text(f"{name}\n{unit}" if figures else column)
-        table.add_column(heading, justify="right" if figures else "left", no_wrap=figures, overflow="fold")
+        cells = [row[index].plain for row in rows if len(row) > max(index, 1)]
+        if figures:
+            width = max(map(len, (*column.split(), *cells)))
+            heading = "\n".join([*wrap(name, width), unit])
+        else:
+            heading, width = column, min(max(map(len, (column, *cells))), _NARROWEST_NAME)
+        look = {"justify": "right" if figures else "left", "no_wrap": figures, "overflow": "fold", "min_width": width}
+        table.add_column(Text(heading), **look)
     for row in rows:
-        table.add_row(*map(_shown, row), style="bold" if len(row) == 1 < len(columns) else None)
+        table.add_row(*row, style="bold" if len(row) == 1 < len(columns) else None)
     if notes:
         table.caption, table.caption_justify = Text("\n".join(notes)), "left"
     return table
+
+
+def print_table(table: Table, console: Console) -> None:
+    """Print a table without cutting figures off, which may take lines that are longer than the console's."""
+    of_title, table.min_width = table.min_width, None
+    needed = Measurement.get(console, console.options.update(max_width=_WIDEST), table).minimum
+    table.min_width, table.width = of_title, needed if needed > console.width else None
+    console.print(table, soft_wrap=False, crop=False)
 
 
 def record_table(title: str, records: Sequence[Any], notes: Sequence[str] = ()) -> Table:

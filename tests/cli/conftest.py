@@ -1,4 +1,4 @@
-"""The output of commands does not depend on how busy the machine is; cabinets that stand in for KUKA's."""
+"""The output of commands does not depend on what is in the cache of kernels; cabinets that stand in for KUKA's."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,8 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def _no_notice_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It comes after seconds, whatever they are spent on."""
-    monkeypatch.setattr("q2r2_control.cli.output._NOTICE_AFTER", 3600.0)
+    """Kernels may have to be compiled in any test."""
+    monkeypatch.setattr("q2r2_control.cli.output.calling_before_compiling", nullcontext)
 
 
 @pytest.fixture

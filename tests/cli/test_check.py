@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.cli.cell_report import check_cell
+from q2r2_control.config.bindings import Action, BindingSettings
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.verification.fault_injection import FINGERS, with_contact
 from tests.cli.command import CELL, changed_cell, external_cell, one_object, q2r2
 from tests.robot.conftest import one_arm
@@ -115,6 +117,18 @@ def test_where_gravity_alone_is_too_much_the_note_says_so_and_promises_nothing_o
         r"(-?\d\.\d\d ){7}rad; .*; to change: the model's torque limits, masses and position limits$",
         note,
     )
+
+
+def test_check_notes_a_control_that_leads_grippers_of_which_there_are_none() -> None:
+    def notes_with(gripper: dict[str, object]) -> list[str]:
+        cell = one_arm(tool={"model": "hand_e", "frame": "tool_frame"}, gripper=gripper)
+        bindings = BindingSettings(upper=Action.NONE, trigger=Action.GRIPPER_ANALOG)
+        return check_cell(cell.model_copy(update={"teleop": TeleopSettings(bindings=bindings)})).notes
+
+    assert notes_with({}) == [
+        "teleop.bindings: trigger is gripper_analog, but no arm has a gripper; allowed: arms.*.gripper.joints"
+    ]
+    assert notes_with({"joints": ["finger_joint_1", "finger_joint_2"], "open_position": 0.025}) == []
 
 
 def test_what_may_touch_is_said() -> None:

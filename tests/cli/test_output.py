@@ -15,7 +15,7 @@ from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import Percentiles
-from q2r2_control.viewer.tables import figure_table, record_table, short_figure
+from q2r2_control.viewer.tables import figure_table, print_table, record_table, short_figure
 from q2r2_control.wording import sentence
 from tests.support.hands_input import HandsInput
 from tests.support.processes import cell
@@ -25,7 +25,7 @@ LINK = "left_arm_left_gripper_left_finger_joint_with_a_long_name_indeed"
 
 def printed(table: Table, width: int = 80) -> str:
     console = Console(file=io.StringIO(), width=width)
-    console.print(table)
+    print_table(table, console)
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
@@ -39,6 +39,22 @@ def test_figures_names_units_and_notes_are_whole_in_80_columns() -> None:
     assert "…" not in text
     first = "".join(line[1:].split(" ")[0] for line in text.splitlines())
     assert f"{LINK}_{LINK}" in first
+
+
+@pytest.mark.parametrize("width", [80, 60, 30])
+def test_no_figure_is_cut_however_narrow_the_console_is(width: int) -> None:
+    columns = (
+        "controller",
+        *(f"{what} [us]" for what in ("free air", "carry", "crossing", "worst margin", "fallback")),
+    )
+    figures = ("-2.967", "123.456", "-9999.9", "176.000", "1234567")
+    text = printed(
+        figure_table("ticks", columns, [("q2r2_control", *figures), ("another_controller", *figures)]), width
+    )
+    for line in (line.split() for line in text.splitlines() if "-2.967" in line):
+        assert line[-len(figures) :] == list(figures)
+        assert line[0].startswith(("q2r2", "another"))
+    assert text.count("-2.967") == 2
 
 
 def test_a_record_is_a_column_with_a_row_for_each_field() -> None:

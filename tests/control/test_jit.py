@@ -4,6 +4,7 @@ import ast
 import copy
 import pickle
 import re
+import runpy
 import shutil
 from collections import namedtuple
 from pathlib import Path
@@ -144,3 +145,18 @@ def test_the_template_compiles_and_sees_what_changes_in_the_model(tmp_path: Path
     np.testing.assert_allclose(found["tau"], -1.0)
     found["q"][3] = np.nan
     assert not found["torque"](found["pointer"], found["q"], found["tau"])
+
+
+def test_compiling_is_announced_once_and_machine_code_from_the_cache_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jit, "_FOLDER", str(tmp_path))
+    source = "from q2r2_control.control.jit import kernel\n\n\n@kernel\ndef double(x):\n    return 2.0 * x\n"
+    (tmp_path / "doubling.py").write_text(source)
+    notices: list[str] = []
+    for announced in (["said"], []):
+        notices.clear()
+        double = runpy.run_path(str(tmp_path / "doubling.py"))["double"]
+        with jit.calling_before_compiling(lambda: notices.append("said")):
+            assert double(2.0) == double(2) == 4.0
+        assert notices == announced

@@ -77,6 +77,8 @@ def test_a_joint_without_end_gets_two_turns_each_way() -> None:
     [
         ("iiwa9", "robots/iiwa7.urdf"),
         ("no/such.urdf", "no such file"),
+        ("config/dual_iiwa7.yaml", "neither a name nor a model's file; allowed: a name in robots/, a path"),
+        ("robots/iiwa7.srdf", "neither a name nor a model's file; allowed: a name in robots/, a path"),
         ("example-robot-data:pandda", "panda"),
         ("example-robot-data:cassie", "no URDF"),
         ("package://lbr/urdf/iiwa7.urdf", "AMENT_PREFIX_PATH"),

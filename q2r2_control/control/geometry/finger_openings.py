@@ -46,9 +46,7 @@ class FingerOpenings:
         self._parts: dict[int, tuple[float, float]] = {}
 
     def checked(self, arm: str, least: float, greatest: float) -> Interval:
-        """The interval as it can be set. Raises :class:`RobotError` for no arm and for no interval."""
-        if arm not in self._fingers:
-            raise RobotError(f"opening of arm {arm!r:.40}: no such arm; arms: {', '.join(self._fingers)}")
+        """The interval as it can be set. Raises :class:`RobotError` for no interval."""
         usable = all(isinstance(value, int | float | np.floating) for value in (least, greatest))
         if not (usable and math.isfinite(least) and math.isfinite(greatest) and least <= greatest):
             raise RobotError(

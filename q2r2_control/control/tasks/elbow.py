@@ -45,13 +45,24 @@ class ElbowSwivel:
         """``angles`` [rad]: of each arm that has the task, 0: elbow up; None: as at home.
 
         ``joints``: at shoulder, elbow and wrist, without the arm's prefix. ``gain``: swivel speed per radian [1/s].
-        Raises :class:`ValueError` for an arm or a joint that is not there, and for numbers that are not positive.
+        Raises :class:`ValueError` for an arm or a joint that is not there, and for numbers that are not allowed.
         """
-        if len(joints) != 3 or not (gain > 0.0 and weight > 0.0):
-            raise ValueError("allowed: three joints, and a gain and a weight above 0")
+        for key, value in (("gain", gain), ("weight", weight)):
+            if not isinstance(value, float | int) or not 0.0 < value < math.inf:
+                raise ValueError(f"{key} = {value!r:.40}: allowed: a number above 0")
+        if isinstance(joints, str) or len(joints) != 3:
+            raise ValueError(f"joints = {joints!r:.60}: allowed: three, at shoulder, elbow and wrist")
+        if not isinstance(angles, Mapping) or not angles:
+            raise ValueError(f"angles = {angles!r:.60}: allowed: an angle or null by arm, such as {{left: 0.3}}")
+        for arm, angle in angles.items():
+            if angle is not None and not (isinstance(angle, float | int) and abs(angle) <= math.tau):
+                raise ValueError(f"angles.{arm!s:.40} = {angle!r:.40}: allowed: -6.28 .. 6.28 rad, or null")
         self._robot, self._gain, self._weight = robot, gain, weight
         self._data = robot.model.createData()
         self._joints = {arm: [_joint(robot, arm, name) for name in joints] for arm in angles}
+        for arm, found in self._joints.items():
+            if not found[0] < found[1] < found[2]:
+                raise ValueError(f"joints = {list(joints)!s:.60}: allowed: three of {arm} from base to tip")
         self._angles = {
             arm: self.angle(arm, robot.home) if angle is None else float(angle) for arm, angle in angles.items()
         }

@@ -7,6 +7,7 @@ separation and the certificate do not depend on costs, so no task can break them
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 from typing import Any, Protocol
@@ -41,10 +42,12 @@ def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> tuple[T
     for name, settings in wanted.items():
         if name not in installed:
             raise ConfigError(f"control.tasks.{name}: installed tasks: {', '.join(sorted(installed)) or 'none'}")
+        made = installed[name].load()
         try:
-            tasks.append(installed[name].load()(robot, **settings))
+            tasks.append(made(robot, **settings))
         except (TypeError, ValueError) as error:
-            raise ConfigError(f"control.tasks.{name}: {error}") from error
+            allowed = ", ".join(list(inspect.signature(made).parameters)[1:])
+            raise ConfigError(f"control.tasks.{name}: {error}; its settings: {allowed or 'none'}") from error
     return tuple(tasks)
 
 

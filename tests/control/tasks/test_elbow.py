@@ -74,8 +74,11 @@ def test_a_stretched_arm_has_no_elbow_to_turn_and_rests() -> None:
     [
         ({"angles": {"middle": 0.1}}, "no arm 'middle'; allowed: left, right"),
         ({"angles": {"left": 0.1}, "joints": ["A2", "B4", "A6"]}, "left has no joint 'B4'; allowed: A1, A2"),
-        ({"angles": {}, "gain": 0.0}, "a gain and a weight above 0"),
-        ({"angle": 0.1}, "angle"),
+        ({"angles": {}, "joints": ["A2", "B4", "A6"]}, "angles = {}: allowed: an angle or null by arm"),
+        ({"angles": {"left": 17.0}}, "angles.left = 17.0: allowed: -6.28 .. 6.28 rad, or null"),
+        ({"angles": {"left": 0.1}, "joints": ["A2", "A6", "A4"]}, "allowed: three of left from base to tip"),
+        ({"angles": {"left": 0.1}, "gain": 0.0}, "gain = 0.0: allowed: a number above 0"),
+        ({"angles": {"left": 0.1}, "elbow": "B4"}, "argument 'elbow'; its settings: angles, joints, gain, weight"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused_by_name(settings: dict[str, object], told: str) -> None:
