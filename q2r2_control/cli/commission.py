@@ -186,9 +186,15 @@ class _Commissioning:
         if reports is None:
             say("the cabinets give no measured torques, so no load is identified", self._console, "yellow")
             return None
-        self._console.print(record_table("loads, centres in the flange's frame", reports))
+        figures = [tuple(asdict(report).values()) for report in reports]
+        columns = ("arm", "against", "found [kg]", "expected [kg]", "found [mm]", "expected [mm]", "unexplained [Nm]")
+        rows = [[" ".join(map(str, cell)) if isinstance(cell, list) else cell for cell in row] for row in figures]
+        self._console.print(figure_table("loads, centres in the flange's frame", columns, rows))
         for report in reports:
             report.check()
+            if not report.is_judged:
+                why = f"no load explains {report.residual_nm:.1f} Nm, so the masses of the arm's own model are wrong"
+                say(f"the {report.arm} arm's load is not judged by the model: {why}", self._console, "yellow")
         return [asdict(report) for report in reports]
 
     def _stop(self, run: SlowRun) -> list[dict[str, Any]]:

@@ -92,7 +92,7 @@ def _text(file: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What the cabinets sent for some seconds."""
+    """Messages of the cabinets over some seconds, and how they were answered."""
 
     cabinets: list[CabinetReport]
     answers: Array  # from the arrival of each message until its answer was sent [s]

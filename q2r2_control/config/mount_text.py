@@ -27,7 +27,8 @@ def with_mount(text: str, side: str, position: Sequence[float], rpy: Sequence[fl
         if value is None:
             edits.append((first.index, first.index, f"{key}: {written}{between}"))
         else:
-            edits.append((value.start_mark.index, value.end_mark.index, written))
+            start = value.start_mark.index
+            edits.append((start, start + len(text[start : value.end_mark.index].rstrip()), written))
     for start, end, written in sorted(edits, reverse=True):
         text = text[:start] + written + text[end:]
     return text

@@ -1,4 +1,4 @@
-"""What a commissioning measures while the arms are led slowly: joints, loads, stops. Each judges by a stated bound."""
+"""Measurements of a commissioning, of arms that are led slowly: joints, loads, stops. Each has a stated bound."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 
 from q2r2_control.errors import PlantError
 from q2r2_control.pipeline.slow_run import Moment, SlowRun, resting
-from q2r2_control.robot.load import LEAST_POSTURES, LoadReport, identify_load
+from q2r2_control.robot.load import LEAST_POSTURES, MODEL, PENDANT, LoadReport, identify_load
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -75,10 +76,10 @@ class LoadSurvey:
     def __init__(self, run: SlowRun) -> None:
         self._run, self._start = run, run.reference
         self._goals = _postures(run.robot, self._start)
-        self._rests: list[Array] = []  # (2, nv) posture [rad] and torque [Nm] of each
+        self._rests: list[Array] = []  # (3, nv) posture [rad], torque, external torque [Nm] of each
 
     def measure(self) -> list[LoadReport] | None:
-        """One report an arm; None where the cabinets measure no torques.
+        """Of each arm, against its model and against the pendant; None where the cabinets measure no torques.
 
         Where it raises :class:`PlantError`, the next call goes on with the next posture.
         """
@@ -87,11 +88,20 @@ class LoadSurvey:
                 free = f"{len(self._rests)} postures are free; allowed: {LEAST_POSTURES}"
                 raise PlantError(f"{free}; begin where the arms are far apart")
             if (moments := self._run.lead_to(goal)) is not None:
-                rest = resting(moments)
-                self._rests.append(np.mean([(moment.q, moment.tau) for moment in rest], axis=0))
+                rows = [(moment.q, moment.tau, moment.external) for moment in resting(moments)]
+                self._rests.append(np.mean(rows, axis=0))
         self._run.lead_to(self._start)
-        q, tau = np.array(self._rests).transpose(1, 0, 2)
-        return [identify_load(self._run.robot, arm, q, tau) for arm in self._run.robot.arms] if tau.any() else None
+        robot, data = self._run.robot, self._run.robot.model.createData()
+        q, tau, external = np.array(self._rests).transpose(1, 0, 2)
+        if not tau.any():
+            return None
+        unexplained = tau - [pin.computeGeneralizedGravity(robot.model, data, posture).copy() for posture in q]
+        return [
+            identify_load(robot, arm, q, missing, against)
+            for arm in robot.arms
+            for against, missing in ((MODEL, unexplained), (PENDANT, external))
+            if np.isfinite(missing).all()
+        ]
 
 
 def _postures(robot: Robot, start: Array) -> Iterator[Array]:

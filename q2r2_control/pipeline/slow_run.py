@@ -60,7 +60,7 @@ class Moment(NamedTuple):
     now: float  # by the loop's clock [s]
     q: Array  # measured
     tau: Array  # measured [Nm]
-    external: Array | None  # by contacts, as measured [Nm]
+    external: Array  # that the cabinet's model does not explain [Nm]; NaN where it does not tell
     reference: Array
     v: Array  # of the reference [rad/s]
     deceleration: Array | None  # of the certified stop from there [rad/s^2]
@@ -74,7 +74,7 @@ class SlowRun:
     unless the run :attr:`is_over`.
     """
 
-    def __init__(self, config: Config, plant: Callable[[Robot, Config], Plant]) -> None:
+    def __init__(self, config: Config, plant: Callable[[Robot, Config], Plant], realtime: bool = True) -> None:
         control = config.control.model_copy(update={"velocity_scale": SPEED})
         teleop = TeleopSettings(bindings=BindingSettings(lower=Action.NONE, grip=Action.DEAD_MAN))
         slow = config.model_copy(update={"control": control, "teleop": teleop})
@@ -82,7 +82,7 @@ class SlowRun:
         self._hands = _Hands()
         self._pipeline = Pipeline(slow, self.robot, self._hands, plant(self.robot, slow))
         self._pipeline.listeners.append(self._look)
-        self._thread = Thread(target=self._run, name="slow run")
+        self._thread = Thread(target=self._run, args=(realtime,), name="slow run")
         self._error: BaseException | None = None
         self._goal: Array | None = None  # for the loop to take up
         self._newest: Moment | None = None
@@ -141,8 +141,8 @@ class SlowRun:
         self._begin()
         self._hands.held = self._pipeline.teleop.hand_of(arm)
         try:
-            end = time.monotonic() + duration
-            self._wait(lambda: time.monotonic() >= end)
+            end = self._now + duration
+            self._wait(lambda: self._now >= end)
         finally:
             self._hands.held = None
         return self._end()
@@ -166,10 +166,10 @@ class SlowRun:
     def _phase(self) -> Phase:
         return self._pipeline.supervisor.phase
 
-    def _run(self) -> None:
+    def _run(self, realtime: bool) -> None:
         try:
             with real_time():
-                self._pipeline.run()
+                self._pipeline.run(realtime=realtime)
         except BaseException as error:
             self._error = error
 
@@ -179,7 +179,7 @@ class SlowRun:
             tick.now,
             tick.state.q,
             tick.state.tau,
-            tick.state.tau_external,
+            np.full_like(tick.state.tau, np.nan) if tick.state.tau_external is None else tick.state.tau_external,
             tick.reference.q,
             tick.reference.v,
             tick.command.deceleration,
@@ -195,18 +195,27 @@ class SlowRun:
             self._pipeline.supervisor.go_home(self._goal)
             self._goal = None
 
+    @property
+    def _now(self) -> float:
+        """By the loop's clock, which moves the arms [s]."""
+        return 0.0 if self._newest is None else self._newest.now
+
     def _wait(self, until: Callable[[], bool]) -> None:
-        end, was_active = time.monotonic() + _PATIENCE, self._phase is Phase.ACTIVE
+        end, was_active = None, self._phase is Phase.ACTIVE
         while not until():
-            if self.is_over:
-                raise PlantError(str(self._error)) from self._error
             lost = was_active and self._phase is not Phase.ACTIVE
-            if lost or time.monotonic() > end:
+            if end is None and self._newest is not None:
+                end = self._now + _PATIENCE
+            if lost or self.is_over or (end is not None and self._now > end):
                 self._fail(f"not done within {_PATIENCE:g} s")
             time.sleep(_LOOKS)
 
     def _fail(self, otherwise: str) -> None:
-        """Raise :class:`PlantError` that says why the arms are not commanded, where they are not."""
+        """Raise :class:`PlantError` that says what has ended the run, or why the arms are not commanded."""
+        while self._phase in (Phase.BRAKING, Phase.STOPPED) and not self.is_over:
+            time.sleep(_LOOKS)
+        if self.is_over:
+            raise PlantError(str(self._error)) from self._error
         fault = self._pipeline.supervisor.fault
         raise PlantError(otherwise if fault is None else sentence(fault))
 
