@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 from typer import Exit, Option
 
 from q2r2_control.cli.output import ConfigFile, Json, print_report, say
 from q2r2_control.config.cell import load_config
+from q2r2_control.events import Reason
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.plants.fri.wire import Monitoring, in_words
 from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, real_time, stop_on_signals
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import CommandMode
+from q2r2_control.types import Array, CommandMode
 from q2r2_control.viewer.tables import record_table
 from q2r2_control.wording import sentence
 
@@ -88,6 +90,45 @@ def _text(file: str) -> str:
     return Path(file).read_text().strip() if Path(file).exists() else ""
 
 
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """Messages of the cabinets over some seconds, and how they were answered."""
+
+    cabinets: list[CabinetReport]
+    answers: Array  # from the arrival of each message until its answer was sent [s]
+    fault: Reason | None  # why the arms could not be commanded at the end
+    notes: list[str]
+
+    def table(self, duration: float) -> Table:
+        """Of ``duration`` [s]."""
+        return record_table(f"cabinets, for {duration:g} s", self.cabinets, self.notes)
+
+
+def listen(plant: FriPlant, duration: float, asked: Callable[[], bool] = lambda: False) -> Heard:
+    """Listen to the cabinets of a plant that was reset, for ``duration`` [s] or until it is ``asked`` to end."""
+    heard: dict[str, list[tuple[Monitoring, float]]] = {arm: [] for arm in plant.cell.sessions}
+    end = time.monotonic() + duration
+    while (now := time.monotonic()) < end and not asked():
+        for arm, messages in heard.items():
+            newest = plant.cell.newest(arm)
+            if not messages or newest[0] is not messages[-1][0]:
+                messages.append(newest)
+        time.sleep(_LOOKS)
+    plant.due(now)
+    fault, answers = plant.fault(), np.array(plant.answer_times)
+    reports = [cabinet_report(arm, messages, plant.cell.sessions[arm].lost) for arm, messages in heard.items()]
+    notes = [f"{arm}: gripper {gripper.in_words()}" for arm, gripper in plant.grippers.items()] + machine_notes()
+    for its in reports:
+        if its.jitter_ms_p99 > _LARGE_JITTER * its.period_ms:
+            notes.append(f"{its.arm}: messages come uneven by over half a period: the network, or a busy computer")
+    if fault is not None:
+        notes.append(sentence(fault))
+    if len(answers):
+        median, late = 1e3 * np.quantile(answers, (0.5, 0.99))
+        notes.insert(0, f"answered after {median:.2f} ms, median, and {late:.2f} ms, p99")
+    return Heard(reports, answers, fault, notes)
+
+
 def fri_check(
     config: ConfigFile,
     duration: Annotated[float, Option(min=1, max=3600, help="[s].")] = 10.0,
@@ -105,31 +146,13 @@ def fri_check(
     with stop_on_signals(stop.ask), real_time(), few_garbage_collections():
         try:
             plant.reset()
-            heard: dict[str, list[tuple[Monitoring, float]]] = {arm: [] for arm in plant.cell.sessions}
-            end = time.monotonic() + duration
-            while (now := time.monotonic()) < end and not stop.asked:
-                for arm, messages in heard.items():
-                    newest = plant.cell.newest(arm)
-                    if not messages or newest[0] is not messages[-1][0]:
-                        messages.append(newest)
-                time.sleep(_LOOKS)
-            plant.due(now)
-            fault, answers = plant.fault(), np.array(plant.answer_times)
-            lost = {arm: session.lost for arm, session in plant.cell.sessions.items()}
-            grippers = [f"{arm}: gripper {gripper.in_words()}" for arm, gripper in plant.grippers.items()]
+            heard = listen(plant, duration, lambda: stop.asked)
         finally:
             plant.close()
-    reports = [cabinet_report(arm, messages, lost[arm]) for arm, messages in heard.items()]
-    notes = grippers + machine_notes()
-    for its in reports:
-        if its.jitter_ms_p99 > _LARGE_JITTER * its.period_ms:
-            notes.append(f"{its.arm}: messages come uneven by over half a period: the network, or a busy computer")
-    if fault is not None:
-        notes.append(sentence(fault))
-    if len(answers):
-        median, late = 1e3 * np.quantile(answers, (0.5, 0.99))
-        notes.insert(0, f"answered after {median:.2f} ms, median, and {late:.2f} ms, p99")
-    table = record_table(f"cabinets, for {duration:g} s", reports, notes)
-    data = {"cabinets": [asdict(report) for report in reports], "answers_s": answers.tolist(), "notes": notes}
-    print_report(data, (table,), json)
-    raise Exit(0 if fault is None else 1)
+    data = {
+        "cabinets": [asdict(report) for report in heard.cabinets],
+        "answers_s": heard.answers.tolist(),
+        "notes": heard.notes,
+    }
+    print_report(data, (heard.table(duration),), json)
+    raise Exit(0 if heard.fault is None else 1)

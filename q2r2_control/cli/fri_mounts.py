@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 import pinocchio as pin
 from rich.console import Console
+from rich.table import Table
 from typer import Option
 
 from q2r2_control.cli.output import ConfigFile, Json, print_report, say
@@ -22,6 +23,7 @@ from q2r2_control.types import SIDES, Array, CommandMode
 from q2r2_control.viewer.tables import figure_table
 from q2r2_control.wording import sentence
 
+Tip = Annotated[tuple[float, float, float], Option(help="Of either tool, where both touch, in its frame [m].")]
 _STILL, _LISTENS = 2e-3, 0.5  # joints at rest move less than this [rad] for so long [s]
 
 
@@ -34,6 +36,17 @@ class MountReport:
     moved_mm: float  # from where the cell has it
     turned_deg: float
     off_mm: list[float]  # of each point
+
+    def table(self) -> Table:
+        """How far the tips are apart, and the lines for the YAML."""
+        rows = [(f"point {number}", off) for number, off in enumerate(self.off_mm, 1)]
+        notes = [
+            f"the right arm's base is {self.moved_mm:.1f} mm and {self.turned_deg:.2f} deg from where the cell has it",
+            "arms.right.mount:",
+            f"  position: {self.position}",
+            f"  rpy: {self.rpy}",
+        ]
+        return figure_table("tips, after the fit", ("", "apart [mm]"), rows, notes)
 
 
 def mount_report(config: Config, points: Array, touched: Array) -> MountReport:
@@ -54,7 +67,7 @@ def mount_report(config: Config, points: Array, touched: Array) -> MountReport:
 def fri_mounts(
     config: ConfigFile,
     points: Annotated[int, Option(min=3, max=20, help="That both tips touch, far apart and not on a line.")] = 3,
-    tip: Annotated[tuple[float, float, float], Option(help="In the tool frame of either arm [m].")] = (0.0, 0.0, 0.0),
+    tip: Tip = (0.0, 0.0, 0.0),
     json: Json = False,
 ) -> None:
     """Find where the right arm's base is: guide both tips by hand to the same points, one after the other.
@@ -68,24 +81,24 @@ def fri_mounts(
     plant = FriPlant(robot, cell)
     plant.begin(CommandMode.POSITION)
     say("waits for the cabinets", console)
-    tips: dict[str, list[Array]] = {arm: [] for arm in SIDES}
     try:
         plant.reset()
-        for number in range(1, points + 1):
-            for arm in SIDES:
-                say(f"point {number} of {points}: guide the {arm} tip there, hold it still, and press Enter", console)
-                tips[arm].append(robot.tool_pose(_resting(plant, arm, robot, console), arm).act(np.array(tip)))
+        report = measure_mount(plant, cell, robot, points, np.array(tip), console)
     finally:
         plant.close()
-    report = mount_report(cell, *(np.array(tips[arm]) for arm in SIDES))
-    rows = [(f"point {number}", off) for number, off in enumerate(report.off_mm, 1)]
-    notes = [
-        f"the right arm's base is {report.moved_mm:.1f} mm and {report.turned_deg:.2f} deg from where the cell has it",
-        "arms.right.mount:",
-        f"  position: {report.position}",
-        f"  rpy: {report.rpy}",
-    ]
-    print_report(asdict(report), (figure_table("tips, after the fit", ("", "apart [mm]"), rows, notes),), json)
+    print_report(asdict(report), (report.table(),), json)
+
+
+def measure_mount(
+    plant: FriPlant, config: Config, robot: Robot, points: int, tip: Array, console: Console
+) -> MountReport:
+    """Ask for ``points`` that both tips touch, with ``tip`` (3,) in the tool frame of either arm [m]."""
+    tips: dict[str, list[Array]] = {arm: [] for arm in SIDES}
+    for number in range(1, points + 1):
+        for arm in SIDES:
+            say(f"point {number} of {points}: guide the {arm} tip there, hold it still, and press Enter", console)
+            tips[arm].append(robot.tool_pose(_resting(plant, arm, robot, console), arm).act(tip))
+    return mount_report(config, *(np.array(tips[arm]) for arm in SIDES))
 
 
 def _resting(plant: FriPlant, arm: str, robot: Robot, console: Console) -> Array:
@@ -93,16 +106,22 @@ def _resting(plant: FriPlant, arm: str, robot: Robot, console: Console) -> Array
     while True:
         if not sys.stdin.readline():
             raise ConfigError("no more input; allowed: Enter for each point")
-        seen, end = [], time.monotonic() + _LISTENS
-        while time.monotonic() < end:
-            plant.due(time.monotonic())
-            seen.append(plant.state().q)
-            time.sleep(0.01)
-        heard = min(session.arrival for session in plant.cell.sessions.values())
-        if time.monotonic() - heard > _LISTENS:
-            fault = plant.fault()
-            raise PlantError("a cabinet is silent" if fault is None else sentence(fault))
-        moved = np.ptp(np.array(seen), axis=0)[robot.arms[arm].joints].max()
+        seen = postures_over(plant, _LISTENS)
+        moved = np.ptp(seen, axis=0)[robot.arms[arm].joints].max()
         if moved <= _STILL:
             return np.asarray(np.mean(seen, axis=0))
         say(f"the {arm} arm moved by {moved:.4f} rad in {_LISTENS:g} s: hold it still, and press Enter again", console)
+
+
+def postures_over(plant: FriPlant, duration: float) -> Array:
+    """Measured postures (n, nv) [rad] over ``duration`` [s]. Raises :class:`PlantError` where a cabinet is silent."""
+    seen, end = [], time.monotonic() + duration
+    while time.monotonic() < end:
+        plant.due(time.monotonic())
+        seen.append(plant.state().q)
+        time.sleep(0.01)
+    heard = min(session.arrival for session in plant.cell.sessions.values())
+    if time.monotonic() - heard > _LISTENS:
+        fault = plant.fault()
+        raise PlantError("a cabinet is silent" if fault is None else sentence(fault))
+    return np.array(seen)

@@ -18,6 +18,7 @@ from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
 from q2r2_control.cli.fri import rehearsal
 from q2r2_control.cli.output import DEMO_CONFIG, ConfigFile, Json, Operator, Task, notes_of, positive, print_report, say
 from q2r2_control.config.cell import load_config
+from q2r2_control.config.resources import find_resource
 from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import options_of
@@ -25,6 +26,7 @@ from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, trajectory_named
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
+from q2r2_control.robot.commissioned import not_commissioned
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
@@ -63,14 +65,18 @@ def run(
     task: Task = None,
     operator: Operator = None,
     force: Annotated[bool, Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
+    i_know: Annotated[bool, Option("--i-know", help="Run real cabinets without q2r2 commission.")] = False,
     json: Json = False,
 ) -> None:
     """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
 
     A cell in which q2r2 check finds a fault is refused with the same line and exit code 2, unless --force is given.
+    One with real cabinets that is not commissioned is refused too, unless --i-know is given.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
     cell = load_config(config)
+    if (plant or cell.plant) == "fri" and not i_know and (why := not_commissioned(cell, find_resource(config))):
+        raise ConfigError(f"{config}: {why}; q2r2 commission {config} commissions it; --i-know runs it all the same")
     source = input or cell.input
     asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
     asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}

@@ -51,9 +51,12 @@ class WayHome(Protocol):
 class JointHoming:
     """Leads all joints to a goal, from where they come to rest."""
 
-    def __init__(self, robot: Robot, kept: Array, goal: Array) -> None:
-        """``kept`` (pairs,) [m]: what each monitored pair keeps; ``goal`` (nv,) [rad]."""
-        self._robot, self._kept, self._goal = robot, kept, goal
+    def __init__(self, robot: Robot, kept: Array, goal: Array, straight: bool = False) -> None:
+        """``kept`` (pairs,) [m]: what each monitored pair keeps; ``goal`` (nv,) [rad].
+
+        ``straight``: no way but the straight one is gone.
+        """
+        self._robot, self._kept, self._goal, self._straight = robot, kept, goal, straight
         self._needed = kept
         self._search: Iterator[list[Array] | None] | None = None
         self._points: list[Array] | None = None  # still to be reached, the goal last
@@ -118,6 +121,8 @@ class JointHoming:
         """Way points between ``start`` and the goal."""
         robot, goal = self._robot, self._goal
         yield ()
+        if self._straight:
+            return
         for arm in robot.arms.values():
             first = start.copy()
             first[arm.joints] = goal[arm.joints]
@@ -188,12 +193,16 @@ class Homing:
     def active(self) -> bool:
         return self._way is not None
 
-    def begin(self) -> None:
+    def begin(self, goal: Array | None = None) -> None:
+        """Begin the way home, or the straight way of all joints to another ``goal`` (nv,) [rad]."""
         self.outcome = None
-        if self._tools_only:
+        kept = self._controller.kept_distances
+        if goal is not None:
+            self._way = JointHoming(self._robot, kept, goal, straight=True)
+        elif self._tools_only:
             self._way = ToolHoming(self._home, self._controller.tool_pose)
         else:
-            self._way = JointHoming(self._robot, self._controller.kept_distances, self._robot.home)
+            self._way = JointHoming(self._robot, kept, self._robot.home)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
         """The target of each tool in ``dt`` [s], from the ``last`` reference: none where joints are led."""

@@ -24,7 +24,7 @@ from q2r2_control.supervision.homing import Homing
 from q2r2_control.supervision.joint_watch import ExternalArms, JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
-from q2r2_control.types import Reference, RobotState
+from q2r2_control.types import Array, Reference, RobotState
 
 _REST = 1e-4  # of the reference [rad/s]
 # A joint that stands still this far from the reference may have nothing that moves it [rad], [rad/s].
@@ -233,14 +233,14 @@ class Supervisor:
             self.phase = Phase.INACTIVE
         return None
 
-    def go_home(self) -> Reason | None:
-        """Begin the way home. Returns why that is not possible now, or None."""
+    def go_home(self, goal: Array | None = None) -> Reason | None:
+        """Begin the way home, or as :meth:`Homing.begin` does. Returns why that is not possible now, or None."""
         if self.paused:
             return Reason(ReasonKind.CONTROLLER_PAUSED)
         if self.phase is not Phase.ACTIVE:
             return Reason.of(ReasonKind.CONTROLLER_PHASE, phase=str(self.phase))
         self._forget_targets()
-        self.homing.begin()
+        self.homing.begin(goal)
         return None
 
     def activate(self, state: RobotState, now: float) -> None:

@@ -149,6 +149,16 @@ def test_while_no_way_is_known_the_arms_stand_still_and_a_tick_looks_at_two_samp
     assert ticks > 100
 
 
+def test_where_only_the_straight_way_is_asked_for_no_other_one_is_gone(robot: Robot) -> None:
+    free = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))
+    bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
+    searched: Any = SimpleNamespace(arms=robot.arms, distance_values=free, **bounds)
+    homing = JointHoming(searched, np.full(3, 0.02), robot.home, straight=True)
+    for _ in range(2):
+        homing.step(robot.home + 0.5, np.zeros_like(robot.home), DT)
+    assert homing.outcome is ReasonKind.HOMING_NO_WAY
+
+
 def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) -> None:
     settings = load_config(CONFIG).control
     homing = JointHoming(robot, kept_distances(robot, settings).values, robot.home)

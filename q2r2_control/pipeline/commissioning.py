@@ -1,0 +1,172 @@
+"""Measurements of a commissioning, of arms that are led slowly: joints, loads, stops. Each has a stated bound."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.errors import PlantError
+from q2r2_control.pipeline.slow_run import Moment, SlowRun, resting
+from q2r2_control.robot.load import LEAST_POSTURES, MODEL, PENDANT, LoadReport, identify_load
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+_STEP = np.radians(1.17)  # of a joint, of which the way leaves 0.17 degrees
+_REACHED, _BEHIND = 0.2, 0.8  # how far a measured joint may be from the commanded one, at rest and on the way [deg]
+# Of A2 .. A7 about the first posture; turning A1 changes no torque [rad].
+_SPREAD = np.array([0.0, 0.1, 0.2, 0.25, 0.4, 0.5, 0.5])
+_TRIES = 40
+_LED = 2.0  # upwards before the hand lets go [s]
+_LATENCY = 0.15  # from letting go until the measured arm brakes, as the gate grants a hand that is silent [s]
+_LEAST_SPEED = 0.01  # of the tool, to be stopped from [m/s]
+_STANDS = 1e-3  # joints that are nearer to where they come to rest [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class JointMotion:
+    """A joint that was commanded a degree away and back."""
+
+    joint: str
+    commanded_deg: float
+    measured_deg: float
+    behind_deg: float  # the most on the way
+    others_deg: float  # the most that another joint has moved
+
+    def check(self) -> JointMotion:
+        """Itself. Raises :class:`PlantError` for a joint that did not follow, or not alone."""
+        off = abs(self.measured_deg - self.commanded_deg)
+        if off > _REACHED or self.behind_deg > _BEHIND or self.others_deg > _REACHED:
+            raise PlantError(
+                f"{self.joint}: commanded {self.commanded_deg:.2f} deg, measured {self.measured_deg:.2f}, "
+                f"{self.behind_deg:.2f} behind on the way, other joints moved by {self.others_deg:.2f}; allowed: off "
+                f"by {_REACHED:g}, {_BEHIND:g} behind, others {_REACHED:g}; see to its brake, and to swapped joints"
+            )
+        return self
+
+
+def measure_joint(run: SlowRun, joint: int) -> JointMotion:
+    """Lead ``joint``, an index of ``Robot.joint_names``, a degree towards its middle and back, and check."""
+    robot, start = run.robot, run.reference
+    goal = start.copy()
+    middle = 0.5 * (robot.position_lower + robot.position_upper)[joint]
+    goal[joint] += _STEP if goal[joint] < middle else -_STEP
+    there = run.lead_to(goal)
+    back = None if there is None else run.lead_to(start)
+    if there is None or back is None:
+        raise PlantError(f"{robot.joint_names[joint]}: no room for a degree; begin where the arms are far apart")
+    moments = [*there, *back]
+    q, reference = (np.degrees([getattr(moment, name) for moment in moments]) for name in ("q", "reference"))
+    end = len(there) - 1
+    others = np.delete(np.ptp(q, axis=0), joint)
+    return JointMotion(
+        joint=robot.joint_names[joint],
+        commanded_deg=float(reference[end, joint] - reference[0, joint]),
+        measured_deg=float(q[end, joint] - q[0, joint]),
+        behind_deg=float(np.abs(reference - q)[:, joint].max()),
+        others_deg=float(others.max()),
+    ).check()
+
+
+class LoadSurvey:
+    """Leads all arms through postures about the one that they rest in, and finds what each carries."""
+
+    def __init__(self, run: SlowRun) -> None:
+        self._run, self._start = run, run.reference
+        self._goals = _postures(run.robot, self._start)
+        self._rests: list[Array] = []  # (3, nv) posture [rad], torque, external torque [Nm] of each
+
+    def measure(self) -> list[LoadReport] | None:
+        """Of each arm, against its model and against the pendant; None where the cabinets measure no torques.
+
+        Where it raises :class:`PlantError`, the next call goes on with the next posture.
+        """
+        while len(self._rests) < LEAST_POSTURES:
+            if (goal := next(self._goals, None)) is None:
+                free = f"{len(self._rests)} postures are free; allowed: {LEAST_POSTURES}"
+                raise PlantError(f"{free}; begin where the arms are far apart")
+            if (moments := self._run.lead_to(goal)) is not None:
+                rows = [(moment.q, moment.tau, moment.external) for moment in resting(moments)]
+                self._rests.append(np.mean(rows, axis=0))
+        self._run.lead_to(self._start)
+        robot, data = self._run.robot, self._run.robot.model.createData()
+        q, tau, external = np.array(self._rests).transpose(1, 0, 2)
+        if not tau.any():
+            return None
+        unexplained = tau - [pin.computeGeneralizedGravity(robot.model, data, posture).copy() for posture in q]
+        return [
+            identify_load(robot, arm, q, missing, against)
+            for arm in robot.arms
+            for against, missing in ((MODEL, unexplained), (PENDANT, external))
+            if np.isfinite(missing).all()
+        ]
+
+
+def _postures(robot: Robot, start: Array) -> Iterator[Array]:
+    """Goals (nv,) about ``start``, the same at every time."""
+    random = np.random.default_rng(0)
+    for _ in range(_TRIES):
+        goal = start.copy()
+        for arm in robot.arms.values():
+            goal[arm.joints] += random.uniform(-_SPREAD, _SPREAD)
+        yield goal
+
+
+@dataclass(frozen=True, slots=True)
+class StopReport:
+    """An arm that stopped as its hand let go."""
+
+    arm: str
+    tool_speed_mm_s: float
+    stopped_mm: float
+    allowed_mm: float  # by the certified stop, after the latency
+    stopped_s: float
+    allowed_s: float
+
+    def check(self) -> StopReport:
+        """Itself. Raises :class:`PlantError` for a stop that was longer or later than it may be."""
+        if self.tool_speed_mm_s < 1e3 * _LEAST_SPEED:
+            raise PlantError(f"the {self.arm} arm did not go up; begin where its tool has 100 mm of room above it")
+        if self.stopped_mm > self.allowed_mm or self.stopped_s > self.allowed_s:
+            raise PlantError(
+                f"the {self.arm} arm stopped after {self.stopped_mm:.1f} mm and {self.stopped_s:.2f} s; allowed: "
+                f"{self.allowed_mm:.1f} mm and {self.allowed_s:.2f} s; see to the network's and this computer's latency"
+            )
+        return self
+
+
+def measure_stop(run: SlowRun, arm: str) -> StopReport:
+    """Let a hand lead ``arm`` upwards and let go, as an operator's does, and check."""
+    return stop_report(run.robot, arm, run.let_go(arm, _LED)).check()
+
+
+def stop_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
+    """Of ``moments`` in which ``arm`` was led by a hand, and came to rest."""
+    led = [index for index, moment in enumerate(moments) if moment.engaged[arm]]
+    if not led:
+        raise PlantError(f"the {arm} arm did not follow the hand")
+    last, rest = moments[led[-1]], moments[-1].q
+    released = moments[min(led[-1] + 1, len(moments) - 1)]
+    v = np.where(np.isin(np.arange(len(rest)), robot.arms[arm].joints), last.v, 0.0)
+    deceleration = np.full_like(v, np.inf) if last.deceleration is None else np.maximum(last.deceleration, 1e-6)
+    brakes = np.abs(v) / deceleration
+    way = v * (_LATENCY + 0.5 * brakes)
+    here, end, furthest, ahead = (
+        robot.tool_pose(q, arm).translation for q in (released.q, rest, released.q + way, last.reference + 0.01 * v)
+    )
+    at = robot.tool_pose(last.reference, arm).translation
+    moving = [
+        moment.now
+        for moment in moments[led[-1] + 1 :]
+        if np.abs(moment.q - rest)[robot.arms[arm].joints].max() > _STANDS
+    ]
+    return StopReport(
+        arm=arm,
+        tool_speed_mm_s=float(1e5 * np.linalg.norm(ahead - at)),
+        stopped_mm=float(1e3 * np.linalg.norm(end - here)),
+        allowed_mm=float(1e3 * np.linalg.norm(furthest - here)),
+        stopped_s=max(moving, default=released.now) - released.now,
+        allowed_s=float(brakes.max()) + _LATENCY,
+    )

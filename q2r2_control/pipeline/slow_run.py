@@ -1,0 +1,225 @@
+"""Arms led slowly, joint by joint or by a hand of the program's, while a person at a terminal looks on.
+
+The pipeline runs in a thread of its own, with every promise of an ordinary run, and holds the arms between the motions.
+Its controller knows 5 % of the joints' speeds as their limits, so that nothing can ask for more.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from threading import Thread
+from types import TracebackType
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config.bindings import Action, BindingSettings
+from q2r2_control.config.cell import Config
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.errors import PlantError
+from q2r2_control.events import ReasonKind
+from q2r2_control.inputs.played import EvenSampling, PlayedInput
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.base import Plant
+from q2r2_control.process.scheduling import real_time, stop_on_signals
+from q2r2_control.robot.robot import Robot
+from q2r2_control.summary.tick import Tick
+from q2r2_control.supervision.supervisor import Phase
+from q2r2_control.types import SIDES, Array, HandInputs
+from q2r2_control.wording import sentence
+
+SPEED = 0.05  # of the joints' speeds
+HAND_SPEED = 0.03  # [m/s]
+_PATIENCE = 20.0  # for the cabinets to command, and for arms to come to rest [s]
+_STILL, REST = 2e-3, 0.3  # joints at rest move less than this [rad] for so long [s]
+_LOOKS = 0.05  # [s]
+_RATE = 75.0  # of the hands [Hz]
+
+
+class _Hands(PlayedInput):
+    """Both hands, at rest until one is held: then its arm is engaged, and it goes up."""
+
+    def __init__(self) -> None:
+        self.held: str | None = None
+        self._height = dict.fromkeys(SIDES, 1.0)  # [m]
+        super().__init__(self._posed, self._pressed, {hand: EvenSampling(_RATE) for hand in SIDES})
+
+    def _posed(self, hand: str, t: float) -> pin.SE3:
+        self._height[hand] += (hand == self.held) * HAND_SPEED / _RATE
+        return pin.SE3(np.eye(3), np.array([0.0, 0.0, self._height[hand]]))
+
+    def _pressed(self, hand: str, t: float) -> HandInputs:
+        return HandInputs(press_middle=float(hand == self.held))
+
+
+class Moment(NamedTuple):
+    """One tick. Joints are (nv,) [rad]."""
+
+    now: float  # by the loop's clock [s]
+    q: Array  # measured
+    tau: Array  # measured [Nm]
+    external: Array  # that the cabinet's model does not explain [Nm]; NaN where it does not tell
+    reference: Array
+    v: Array  # of the reference [rad/s]
+    deceleration: Array | None  # of the certified stop from there [rad/s^2]
+    engaged: dict[str, bool]  # arms that follow a hand
+
+
+class SlowRun:
+    """A context in which the arms of ``plant`` are led. Leaving it brings them to rest, and closes the plant.
+
+    Every method raises :class:`PlantError` where the arms do not do what they are asked to. It may be called again,
+    unless the run :attr:`is_over`.
+    """
+
+    def __init__(self, config: Config, plant: Callable[[Robot, Config], Plant], realtime: bool = True) -> None:
+        control = config.control.model_copy(update={"velocity_scale": SPEED})
+        teleop = TeleopSettings(bindings=BindingSettings(lower=Action.NONE, grip=Action.DEAD_MAN))
+        slow = config.model_copy(update={"control": control, "teleop": teleop})
+        self.robot = Robot.from_config(slow)
+        self._hands = _Hands()
+        self._pipeline = Pipeline(slow, self.robot, self._hands, plant(self.robot, slow))
+        self._pipeline.listeners.append(self._look)
+        self._thread = Thread(target=self._run, args=(realtime,), name="slow run")
+        self._error: BaseException | None = None
+        self._goal: Array | None = None  # for the loop to take up
+        self._newest: Moment | None = None
+        self._rest: Moment  # since which the arms rest
+        self._moments: list[Moment] | None = None  # of a motion that goes on
+
+    def __enter__(self) -> SlowRun:
+        self._thread.start()
+        try:
+            self._wait_for_sessions()
+        except BaseException:
+            self._end_run()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end_run()
+
+    def _end_run(self) -> None:
+        with stop_on_signals(self._pipeline.stop):  # the arms come to rest first
+            self._pipeline.stop()
+            self._thread.join()
+
+    @property
+    def reference(self) -> Array:
+        """Where the joints are led to by now (nv,) [rad]."""
+        assert self._newest is not None
+        return self._newest.reference
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a fault has ended the run, so that nothing can be led any more."""
+        return not self._thread.is_alive()
+
+    def lead_to(self, goal: Array) -> list[Moment] | None:
+        """Lead all joints straight to ``goal`` (nv,) [rad], and wait until the arms rest; all ticks from rest to rest.
+
+        None: the straight way there is not free, and nothing has moved.
+        """
+        homing = self._pipeline.supervisor.homing
+        self._begin()
+        homing.outcome, self._goal = None, goal.copy()
+        self._wait(lambda: self._goal is None and not homing.active)
+        outcome = self._pipeline.supervisor.homing.outcome
+        kind = None if outcome is None else outcome.kind
+        if kind is ReasonKind.HOMING_NO_WAY:
+            return None
+        if kind is not ReasonKind.HOMING_ARRIVED:
+            self._fail("the way there was ended" if outcome is None else sentence(outcome))
+        return self._end()
+
+    def let_go(self, arm: str, duration: float) -> list[Moment]:
+        """Let a hand lead ``arm`` upwards for ``duration`` [s], and let go; all ticks from rest to rest."""
+        self._begin()
+        self._hands.held = self._pipeline.teleop.hand_of(arm)
+        try:
+            end = self._now + duration
+            self._wait(lambda: self._now >= end)
+        finally:
+            self._hands.held = None
+        return self._end()
+
+    def _begin(self) -> None:
+        self._wait_for_sessions()
+        assert self._newest is not None
+        self._rest, self._moments = self._newest, [self._newest]
+
+    def _end(self) -> list[Moment]:
+        moments = self._moments
+        assert moments is not None
+        self._wait(lambda: moments[-1].now - self._rest.now >= REST)
+        self._moments = None
+        return moments
+
+    def _wait_for_sessions(self) -> None:
+        self._wait(lambda: self._phase is Phase.ACTIVE and self._newest is not None)
+
+    @property
+    def _phase(self) -> Phase:
+        return self._pipeline.supervisor.phase
+
+    def _run(self, realtime: bool) -> None:
+        try:
+            with real_time():
+                self._pipeline.run(realtime=realtime)
+        except BaseException as error:
+            self._error = error
+
+    def _look(self, tick: Tick) -> None:
+        """In the loop's own thread, once a tick."""
+        moment = Moment(
+            tick.now,
+            tick.state.q,
+            tick.state.tau,
+            np.full_like(tick.state.tau, np.nan) if tick.state.tau_external is None else tick.state.tau_external,
+            tick.reference.q,
+            tick.reference.v,
+            tick.command.deceleration,
+            tick.engaged,
+        )
+        self._newest = moment
+        if self._moments is not None:
+            self._moments.append(moment)
+            moved = np.abs((moment.q - self._rest.q, moment.reference - self._rest.reference)).max()
+            if moved > _STILL:
+                self._rest = moment
+        if self._goal is not None:
+            self._pipeline.supervisor.go_home(self._goal)
+            self._goal = None
+
+    @property
+    def _now(self) -> float:
+        """By the loop's clock, which moves the arms [s]."""
+        return 0.0 if self._newest is None else self._newest.now
+
+    def _wait(self, until: Callable[[], bool]) -> None:
+        end, was_active = None, self._phase is Phase.ACTIVE
+        while not until():
+            lost = was_active and self._phase is not Phase.ACTIVE
+            if end is None and self._newest is not None:
+                end = self._now + _PATIENCE
+            if lost or self.is_over or (end is not None and self._now > end):
+                self._fail(f"not done within {_PATIENCE:g} s")
+            time.sleep(_LOOKS)
+
+    def _fail(self, otherwise: str) -> None:
+        """Raise :class:`PlantError` that says what has ended the run, or why the arms are not commanded."""
+        while self._phase in (Phase.BRAKING, Phase.STOPPED) and not self.is_over:
+            time.sleep(_LOOKS)
+        if self.is_over:
+            raise PlantError(str(self._error)) from self._error
+        fault = self._pipeline.supervisor.fault
+        raise PlantError(otherwise if fault is None else sentence(fault))
+
+
+def resting(moments: list[Moment]) -> list[Moment]:
+    """Those at the end, in which the arms rested."""
+    return [moment for moment in moments if moments[-1].now - moment.now <= REST]

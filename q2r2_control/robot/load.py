@@ -1,0 +1,117 @@
+"""The mass and centre of mass that an arm carries, from torques that were measured while it rested in many postures.
+
+At rest the torques that gravity asks for are linear in the mass m of the last link and in m c, c being its centre of
+mass. Torques that a model does not explain therefore tell by how much m and m c differ from it. Published masses of an
+arm's links differ by up to a factor of two; where they are wrong, no load explains the torques, and it is not judged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.pairs import LinkClass
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+LEAST_POSTURES = 8
+MODEL, PENDANT = "its tool's model", "the pendant, if its load data are the model's,"
+_LEAST_SPREAD = 0.2  # smallest singular value of the regressor, a posture, relative to g [m]
+_LIGHT = 0.05  # a mass that has no centre worth telling [kg]
+_MASS_BOUND, _CENTRE_BOUND = 0.3, 50.0  # of the identified load to the expected one [kg], [mm]
+_EXPLAINED = 1.0  # residual of a model of the arm that is good enough [Nm]
+
+
+@dataclass(frozen=True, slots=True)
+class LoadReport:
+    """The load that fits an arm's torques, centres in the flange's frame as the pendant has them."""
+
+    arm: str
+    against: str  # whose torques they were compared with: MODEL or PENDANT
+    identified_kg: float
+    expected_kg: float
+    identified_centre_mm: list[float]
+    expected_centre_mm: list[float]
+    residual_nm: float  # torque that no load explains, RMS
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether the torques are those of a load."""
+        return self.against == PENDANT or self.residual_nm <= _EXPLAINED
+
+    def check(self) -> None:
+        """Raises :class:`RobotError` for a load that is judged, and not the expected one."""
+        away = float(np.linalg.norm(np.subtract(self.identified_centre_mm, self.expected_centre_mm)))
+        wrong = abs(self.identified_kg - self.expected_kg) > _MASS_BOUND or away > _CENTRE_BOUND
+        if wrong and self.is_judged:
+            centre = ", ".join(f"{value:.0f}" for value in self.identified_centre_mm)
+            raise RobotError(
+                f"the {self.arm} arm carries {self.identified_kg:.2f} kg at {centre} mm; {self.against} has "
+                f"{self.expected_kg:.2f} kg, {away:.0f} mm away; allowed: off by {_MASS_BOUND:g} kg and "
+                f"{_CENTRE_BOUND:g} mm. Weigh the tool, and enter its mass and centre in the pendant's load data and "
+                "in the tool's model"
+            )
+
+
+def identify_load(robot: Robot, arm: str, postures: Array, missing: Array, against: str) -> LoadReport:
+    """The load of ``arm`` from the torques ``missing`` (n, nv) [Nm] at rest in ``postures`` (n, nv) [rad].
+
+    They are the measured ones less those of the arm and its expected tool, as the robot's model or the cabinet has them
+    (``against``). Raises :class:`RobotError` for fewer than eight postures, and for postures too alike.
+    """
+    if len(postures) < LEAST_POSTURES:
+        raise RobotError(f"{len(postures)} postures: allowed: {LEAST_POSTURES} or more")
+    model, data, joints = robot.model, robot.model.createData(), robot.arms[arm].joints
+    at_rest, last = np.zeros(model.nv), 10 * int(joints[-1])
+    # Of each body: m, m c (3,), inertia (6,).
+    regressors = [pin.computeJointTorqueRegressor(model, data, q, at_rest, at_rest).copy() for q in postures]
+    A = np.concatenate([regressor[joints, last : last + 4] for regressor in regressors])
+    b = missing[:, joints].ravel()
+    least = np.linalg.svd(A, compute_uv=False)[-1] / np.sqrt(len(postures)) / np.linalg.norm(model.gravity.linear)
+    if least < _LEAST_SPREAD:
+        raise RobotError(f"the postures are too alike: spread {least:.2f}; allowed: {_LEAST_SPREAD:g} or more")
+    difference = np.linalg.lstsq(A, b, rcond=None)[0]
+    flange, tool = _tool_of(robot, arm)
+    # As a mass and its moment in the flange's frame.
+    mass, moment = difference[0], flange.rotation.T @ (difference[1:] - difference[0] * flange.translation)
+    known = tool.mass * tool.lever
+    return LoadReport(
+        arm=arm,
+        against=against,
+        identified_kg=float(tool.mass + mass),
+        expected_kg=float(tool.mass),
+        identified_centre_mm=_centre(tool.mass + mass, known + moment),
+        expected_centre_mm=_centre(tool.mass, known),
+        residual_nm=float(np.sqrt(np.mean((b - A @ difference) ** 2))),
+    )
+
+
+def _centre(mass: float, moment: Array) -> list[float]:
+    """Of a ``mass`` [kg] with that ``moment`` (3,) [kg m], in [mm]."""
+    centre: list[float] = (1e3 * moment / mass).round(1).tolist() if mass > _LIGHT else [0.0, 0.0, 0.0]
+    return centre
+
+
+def _tool_of(robot: Robot, arm: str) -> tuple[pin.SE3, pin.Inertia]:
+    """Where the flange is on the last joint, and the inertia in its frame of all links that are no arm's."""
+    frames, its = robot.model.frames, robot.arms[arm]
+    carried = [
+        frame
+        for frame in frames
+        if frame.type == pin.FrameType.BODY
+        and (role := robot.roles.get(frame.name)) is not None
+        and role.part in (LinkClass.TOOL, LinkClass.FINGER)
+        and arm in role.arms
+    ]
+    # A link's inertia is that of the fixed joint's frame before it.
+    mounts = [frames[frame.parentFrame] for frame in carried]
+    names = {frame.name for frame in carried}
+    bases = [frames[mount.parentFrame] for mount in mounts if frames[mount.parentFrame].name not in names]
+    flange = (bases[0] if bases else frames[its.frame_id]).placement
+    total = pin.Inertia.Zero()
+    for mount in mounts:
+        total += flange.actInv(mount.placement).act(mount.inertia)
+    return flange, total

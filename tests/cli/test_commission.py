@@ -1,0 +1,220 @@
+"""``q2r2 commission``, step by step, with a person's answers, and ``q2r2 run`` before and after it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.cli.fri_check import CabinetReport, Heard
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.resources import find_resource
+from q2r2_control.pipeline.slow_run import SlowRun
+from q2r2_control.plants.fri.plant import FriPlant
+from q2r2_control.robot.commissioned import fingerprint
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import SIDES, Array
+from tests.cli.command import q2r2
+from tests.pipeline.slow_cell import PendantCabinets, StuckArm, slow_run
+
+MODULE = "q2r2_control.cli.commission"
+GUIDED = ["", "y", "", "y"]  # both arms, and the joints are right
+TO_THE_END = [*GUIDED, "keep", "", "Ada"]
+GOOD = CabinetReport(
+    "left", 2, 10.0, 100, 0, 0.1, 0.1, "monitoring ready", "excellent", "normal", "t1", "off", [0.0] * 7, 0.0
+)
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Path:
+    """One whose cabinets are real, and do not answer."""
+    text = find_resource("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8").replace("127.0.0.1", "192.0.2.1")
+    (file := tmp_path / "my_cell.yaml").write_text(text, encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def virtual(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Puts cabinets in virtual time in the place of real ones, whose arms are guided by a quarter of a radian."""
+
+    def use(run: Callable[[Config], SlowRun] = slow_run, report: CabinetReport = GOOD, guided: float = 0.25) -> None:
+        heard = Heard([report, replace(GOOD, arm="right")], np.zeros(0), None, [])
+        at = iter(np.arange(0.0, 100.0 * guided + 1.0, guided) if guided else np.zeros(100))
+
+        def postures(plant: FriPlant, duration: float) -> Array:
+            return np.full((1, 14), next(at))
+
+        monkeypatch.setattr(FriPlant, "reset", lambda plant: None)
+        monkeypatch.setattr(f"{MODULE}.listen", lambda plant, duration: heard)
+        monkeypatch.setattr(f"{MODULE}.postures_over", postures)
+        monkeypatch.setattr(f"{MODULE}.SlowRun", lambda config, plant: run(config))
+
+    return use
+
+
+def commission(cell: Path, answers: list[str], *options: str) -> tuple[int, list[str], str]:
+    """Exit code, lines on stderr, and stdout."""
+    done = q2r2("commission", str(cell), "--duration", "1", *options, typed="".join(f"{line}\n" for line in answers))
+    return done.exit_code, done.stderr.splitlines(), done.stdout
+
+
+def refused(cell: Path, answers: list[str]) -> str:
+    """The one line that ends a commissioning that is not passed; nothing is kept."""
+    code, lines, _ = commission(cell, answers)
+    assert code == 1
+    assert lines[-1].startswith("q2r2: ")
+    assert lines[-1].endswith("; the cell is not commissioned")
+    assert [line for line in lines if line.startswith("q2r2: ")] == lines[-1:]
+    assert list(cell.parent.glob("*.json")) == []
+    return lines[-1]
+
+
+def test_a_cell_that_shows_all_it_has_to_is_signed_off_and_may_run(cell: Path, virtual: Callable[..., None]) -> None:
+    virtual()
+    before = q2r2("run", str(cell), "--input", "scripted")
+    assert before.exit_code == 2
+    assert f"q2r2 commission {cell}" in before.stderr
+    assert "--i-know" in before.stderr
+    code, lines, out = commission(cell, TO_THE_END, "--json")
+    assert code == 0, lines[-1]
+    kept = json.loads((cell.parent / "my_cell.commissioned.json").read_text(encoding="utf-8"))
+    assert kept == json.loads(out)
+    assert (kept["operator"], kept["fingerprint"], kept["repeats"]) == ("Ada", fingerprint(load_config(cell)), 0)
+    assert list(kept["steps"]) == ["cabinets", "joints", "mounts", "motion", "load", "stop"]
+    assert [len(kept["steps"][name]) for name in ("motion", "load", "stop")] == [14, 4, 2]
+    after = q2r2("run", str(cell), "--input", "scripted", "--trajectory", "nowhere")
+    assert "nowhere" in after.stderr  # it came as far as that
+    cell.write_text(cell.read_text(encoding="utf-8").replace("192.0.2.1", "192.0.2.2"), encoding="utf-8")
+    assert "were changed since" in q2r2("run", str(cell), "--input", "scripted").stderr
+
+
+def test_a_user_who_knows_runs_a_cell_without_a_sign_off(cell: Path) -> None:
+    done = q2r2("run", str(cell), "--input", "scripted", "--trajectory", "nowhere", "--i-know")
+    assert "nowhere" in done.stderr
+
+
+def test_cabinets_that_stand_in_need_no_sign_off() -> None:
+    done = q2r2("run", "config/dual_iiwa7_fri.yaml", "--input", "scripted", "--trajectory", "nowhere")
+    assert "nowhere" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("report", "told"),
+    [
+        (replace(GOOD, quality="fair"), "left: connection fair"),
+        (replace(GOOD, lost=3), "2.9 % lost"),
+        (replace(GOOD, safety="stop 1 on path"), "safety stop 1 on path"),
+    ],
+    ids=["poor connection", "lost messages", "safety stop"],
+)
+def test_a_cabinet_that_is_not_heard_well_may_be_tried_again(
+    cell: Path, virtual: Callable[..., None], report: CabinetReport, told: str
+) -> None:
+    virtual(report=report)
+    line = refused(cell, ["y", "n"])
+    assert line.startswith("q2r2: cabinets: ")
+    assert told in line
+
+
+def test_joints_that_an_operator_does_not_recognise_end_it(cell: Path, virtual: Callable[..., None]) -> None:
+    virtual()
+    assert "the right arm's joints are not those that moved" in refused(cell, ["", "y", "", "n"])
+
+
+def test_an_arm_that_was_not_moved_is_said_and_takes_another_word(cell: Path, virtual: Callable[..., None]) -> None:
+    virtual(guided=0.0)
+    code, lines, _ = commission(cell, ["", "y", "confirm", "", "again", "", "n"])
+    assert code == 1
+    assert "the left arm's joints have not moved" in lines
+    assert "allowed: confirm, again, n" in lines
+    assert lines.count("the right arm's joints have not moved") == 2
+
+
+@pytest.mark.parametrize("answers", [[], [""], GUIDED, [*GUIDED, "keep"]])
+def test_an_input_that_ends_ends_it(cell: Path, virtual: Callable[..., None], answers: list[str]) -> None:
+    virtual()
+    assert "no more input; allowed: " in refused(cell, answers)
+
+
+def test_an_arm_that_does_not_move_ends_the_motion(cell: Path, virtual: Callable[..., None]) -> None:
+    virtual(partial(slow_run, arm=StuckArm))
+    line = refused(cell, [*TO_THE_END[:-1], "n"])
+    assert line.startswith("q2r2: motion: left_A1: commanded")
+
+
+def test_a_tool_that_is_heavier_than_its_model_ends_the_load(cell: Path, virtual: Callable[..., None]) -> None:
+    truth = Robot.from_config(load_config(cell))
+    truth.model.appendBodyToJoint(7, pin.Inertia(0.8, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
+    virtual(partial(slow_run, truth=truth))
+    line = refused(cell, TO_THE_END)
+    assert line.startswith("q2r2: load: the left arm carries 1.86 kg")
+    assert "pendant's load data" in line
+
+
+def test_cabinets_that_do_not_let_a_client_command_end_it(cell: Path, virtual: Callable[..., None]) -> None:
+    def lock(cabinets: PendantCabinets) -> None:
+        cabinets.locked = True
+
+    virtual(partial(slow_run, prepare=lock))
+    assert "left: the cabinet is in monitoring ready" in refused(cell, [*TO_THE_END[:-1], "n"])
+
+
+@pytest.fixture
+def interrupted(virtual: Callable[..., None]) -> list[PendantCabinets]:
+    """A person presses Ctrl-C while the left arm moves."""
+    made: list[PendantCabinets] = []
+
+    def prepare(cabinets: PendantCabinets) -> None:
+        made.append(cabinets)
+        arm = cabinets.cabinets["left"].arm
+        start = arm.q
+
+        def press(side: str, now: float) -> None:
+            if abs(arm.q[0] - start[0]) > 0.005:
+                cabinets.on_message = lambda side, now: None
+                os.kill(os.getpid(), signal.SIGINT)
+
+        cabinets.on_message = press
+
+    virtual(partial(slow_run, prepare=prepare))
+    return made
+
+
+def test_ctrl_c_brings_the_arms_to_rest_first(cell: Path, interrupted: list[PendantCabinets]) -> None:
+    assert "motion: stopped by Ctrl-C" in refused(cell, TO_THE_END)
+    for arm in SIDES:
+        assert interrupted[0].cabinets[arm].trips == []
+        path = interrupted[0].cell.sessions[arm].path
+        assert np.abs(path.rest - path.at(path.end)).max() < 1e-9
+
+
+@pytest.mark.usefixtures("cabinets")
+def test_cabinets_that_stand_in_are_listened_to_and_arms_that_nobody_guides_are_said(fri_cell: str) -> None:
+    done = q2r2("commission", fri_cell, "--duration", "1", typed="n\n\nn\n")
+    assert done.exit_code == 1
+    last = done.stderr.splitlines()[-1]
+    assert "connection" in last or "joints are not those that moved" in last  # by how busy this machine is
+
+
+def test_a_measured_mount_is_written_into_the_cell_after_a_question(
+    cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    virtual()
+    points = np.array([[0.5, 0.1, 0.3], [0.6, -0.2, 0.3], [0.4, 0.0, 0.5]])
+    touched = {"left": iter(points), "right": iter(points + np.array([0.0, 0.01, 0.0]))}
+
+    def rests(plant: FriPlant, arm: str, robot: Robot, console: object) -> pin.SE3:
+        return pin.SE3(np.eye(3), next(touched[arm]))
+
+    monkeypatch.setattr("q2r2_control.cli.fri_mounts._resting", rests)
+    monkeypatch.setattr(Robot, "tool_pose", lambda robot, q, arm: q if isinstance(q, pin.SE3) else pin.SE3.Identity())
+    refused(cell, [*GUIDED, "measure", "y"])
+    assert load_config(cell).arms["right"].mount.position == pytest.approx((0.0, -0.41, 0.0))

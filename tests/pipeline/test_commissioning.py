@@ -1,0 +1,119 @@
+"""Measurements of arms that are led slowly, and their bounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.errors import PlantError
+from q2r2_control.pipeline.commissioning import JointMotion, LoadSurvey, measure_joint, measure_stop, stop_report
+from q2r2_control.pipeline.slow_run import Moment
+from q2r2_control.robot.load import MODEL, PENDANT
+from q2r2_control.robot.robot import Robot
+from tests.pipeline.slow_cell import StuckArm, slow_run
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config("config/dual_iiwa7_fri.yaml")
+
+
+@pytest.fixture(scope="module")
+def robot(config: Config) -> Robot:
+    return Robot.from_config(config)
+
+
+def test_a_joint_goes_a_degree_and_back_alone(config: Config) -> None:
+    with slow_run(config) as run:
+        start = run.reference
+        motion = measure_joint(run, 8)
+        assert np.abs(run.reference - start).max() < 0.004
+    assert motion.joint == "right_A2"
+    assert abs(motion.commanded_deg) == pytest.approx(1.0, abs=0.02)
+    assert motion.measured_deg == pytest.approx(motion.commanded_deg, abs=0.01)
+    assert motion.others_deg < 0.01
+
+
+def test_a_joint_that_does_not_move_is_named(config: Config) -> None:
+    with slow_run(config, StuckArm) as run, pytest.raises(PlantError, match=r"left_A1: commanded .* measured 0\.00"):
+        measure_joint(run, 0)
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        JointMotion("A1", 1.0, 0.7, 0.1, 0.0),
+        JointMotion("A1", 1.0, 1.0, 0.9, 0.0),
+        JointMotion("A1", 1.0, 1.0, 0.1, 0.3),
+        JointMotion("A1", 1.0, -1.0, 0.1, 0.0),
+    ],
+    ids=["too short", "far behind", "not alone", "the other way"],
+)
+def test_a_joint_has_to_follow_and_to_move_alone(motion: JointMotion) -> None:
+    JointMotion("A1", 1.0, 0.9, 0.5, 0.1).check()
+    with pytest.raises(PlantError, match="A1: commanded 1"):
+        motion.check()
+
+
+def test_the_load_of_each_arm_is_found_and_a_heavier_tool_is_told_from_the_model(config: Config) -> None:
+    truth = Robot.from_config(config)
+    truth.model.appendBodyToJoint(14, pin.Inertia(0.8, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
+    with slow_run(config, truth=truth) as run:
+        start = run.reference
+        reports = LoadSurvey(run).measure()
+        assert np.abs(run.reference - start).max() < 0.01
+    assert reports is not None
+    assert [report.against for report in reports] == [MODEL, PENDANT] * 2
+    left, right = reports[::2]
+    assert left.identified_kg == pytest.approx(left.expected_kg, abs=0.01)
+    assert right.identified_kg == pytest.approx(right.expected_kg + 0.8, abs=0.01)
+
+
+def test_an_arm_that_a_hand_leads_stops_within_its_certified_stop_and_the_latency(config: Config) -> None:
+    with slow_run(config) as run:
+        report = measure_stop(run, "left")
+    assert report.tool_speed_mm_s == pytest.approx(30.0, abs=1.0)
+    assert 0.0 < report.stopped_mm < report.allowed_mm
+    assert report.stopped_s < report.allowed_s
+
+
+def moments(robot: Robot, on: float, engaged: bool = True) -> list[Moment]:
+    """The left arm goes at 0.1 rad/s in A2 for a second, and ``on`` [s] longer than its hand asks for."""
+    v = np.zeros(robot.model.nv)
+    v[1] = 0.1
+    none, slow = np.zeros_like(v), np.full_like(v, 5.0)
+    times = np.arange(0.0, 3.0, 0.01)
+    return [
+        Moment(
+            t,
+            robot.home - v * min(t, 1.0 + on),
+            none,
+            none,
+            robot.home - v * t,
+            -v,
+            slow,
+            {"left": bool(engaged and t < 1.0)},
+        )
+        for t in times
+    ]
+
+
+def test_a_stop_that_is_later_or_longer_than_it_may_be_is_told(robot: Robot) -> None:
+    stop_report(robot, "left", moments(robot, 0.1)).check()
+    with pytest.raises(PlantError, match=r"the left arm stopped after .* mm and 0\.2. s; allowed"):
+        stop_report(robot, "left", moments(robot, 0.3)).check()
+    late = replace(stop_report(robot, "left", moments(robot, 0.1)), stopped_s=0.3)
+    with pytest.raises(PlantError, match="stopped after"):
+        late.check()
+
+
+def test_an_arm_that_did_not_follow_tells_nothing(robot: Robot) -> None:
+    with pytest.raises(PlantError, match="the left arm did not follow the hand"):
+        stop_report(robot, "left", moments(robot, 0.0, engaged=False))
+    still = replace(stop_report(robot, "left", moments(robot, 0.1)), tool_speed_mm_s=1.0)
+    with pytest.raises(PlantError, match="did not go up"):
+        still.check()

@@ -1,0 +1,76 @@
+"""Arms that are led slowly: how fast, how they rest, and what ends a motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.errors import PlantError
+from q2r2_control.pipeline.slow_run import SPEED
+from tests.pipeline.slow_cell import PendantCabinets, StuckArm, slow_run
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config("config/dual_iiwa7_fri.yaml")
+
+
+def test_no_joint_is_faster_than_a_twentieth_of_its_limit_and_at_the_end_all_rest(config: Config) -> None:
+    cabinets: list[PendantCabinets] = []
+    with slow_run(config, prepare=cabinets.append) as run:
+        goal = run.reference + 0.2 * np.tile([0, 0, 0, 1, 1, 1, -1], 2)
+        there = run.lead_to(goal)
+        assert there is not None
+        led = run.let_go("right", 1.0)
+    speeds = np.abs([moment.v for moment in there + led]) / run.robot.velocity_limit
+    assert 0.8 * SPEED < speeds.max() <= SPEED * (1.0 + 1e-9)
+    assert np.abs(there[-1].reference - goal).max() < 0.004
+    for moments in (there, led):
+        assert np.abs(moments[-1].q - moments[-1].reference).max() < 1e-3
+    assert any(moment.engaged["right"] for moment in led)
+    assert not any(moment.engaged["left"] for moment in led)
+    assert [cabinet.trips for cabinet in cabinets[0].cabinets.values()] == [[], []]
+    assert run.is_over
+
+
+def test_a_straight_way_that_is_not_free_is_not_gone(config: Config) -> None:
+    with slow_run(config) as run:
+        start = run.reference
+        into_the_table = start.copy()
+        into_the_table[run.robot.arms["left"].joints[1]] += 0.6
+        assert run.lead_to(into_the_table) is None
+        assert np.abs(run.reference - start).max() < 1e-9
+
+
+def test_a_session_that_ends_is_told_and_the_motion_may_be_asked_for_again(config: Config) -> None:
+    cabinets: list[PendantCabinets] = []
+    with slow_run(config, prepare=cabinets.append) as run:
+        goal = run.reference.copy()
+        goal[0] += 0.3
+
+        def end_once(arm: str, now: float) -> None:
+            its = cabinets[0].cabinets["left"]
+            if abs(its.arm.q[0] - goal[0]) < 0.2:
+                its.stop()
+                cabinets[0].on_message = lambda arm, now: None
+
+        cabinets[0].on_message = end_once
+        with pytest.raises(PlantError, match="left: the cabinet "):
+            run.lead_to(goal)
+        assert run.lead_to(goal) is not None
+
+
+def test_cabinets_that_do_not_let_a_client_command_are_named(config: Config) -> None:
+    def lock(cabinets: PendantCabinets) -> None:
+        cabinets.locked = True
+
+    with pytest.raises(PlantError, match="left: the cabinet is in monitoring ready"), slow_run(config, prepare=lock):
+        pytest.fail("nothing may be led")
+
+
+def test_arms_that_do_not_follow_at_all_end_the_run_which_says_why(config: Config) -> None:
+    with slow_run(config, StuckArm) as run:
+        with pytest.raises(PlantError, match=r"left_A7"):
+            run.lead_to(run.reference + 0.4 * (np.arange(len(run.reference)) == 6))
+        assert run.is_over

@@ -1,0 +1,68 @@
+"""Whether the sign-off beside a cell is still of that cell."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.config.cell import Config, parse_config
+from q2r2_control.robot.commissioned import fingerprint, not_commissioned, sign_off_file
+
+TEXT = Path("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
+REAL = TEXT.replace("127.0.0.1", "192.170.10.2")
+
+
+def cell(old: str = "", new: str = "", text: str = REAL) -> Config:
+    assert old in text
+    return parse_config(text.replace(old, new, 1), "cell.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("192.170.10.2", "192.170.10.3"),
+        ("port: 30201", "port: 30202"),
+        ("[0.0, -0.4, 0.0]", "[0.0, -0.41, 0.0]"),
+        ("      frame: tool_frame\n", "      frame: tool_frame\n      mount: {position: [0.0, 0.0, 0.01]}\n"),
+        ("velocity_scale: 0.95", "velocity_scale: 0.9"),
+        ("A2: 4.3", "A2: 4.2"),
+        ("tool_tool: 0.01", "tool_tool: 0.02"),
+    ],
+)
+def test_addresses_mounts_tools_and_limits_are_in_the_fingerprint(old: str, new: str) -> None:
+    assert fingerprint(cell(old, new)) != fingerprint(cell())
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("size: [0.8, 1.6, 0.2]", "size: [0.8, 1.5, 0.2]"),
+        ("velocity_scale: 0.95 ", "position_gain: 5.0\n  velocity_scale: 0.95"),
+        ("home: [0.0204", "home: [0.03"),
+        ("mass: 0.1", "mass: 0.2"),
+    ],
+)
+def test_obstacles_gains_home_and_the_simulation_are_not(old: str, new: str) -> None:
+    assert fingerprint(cell(old, new)) == fingerprint(cell())
+
+
+def test_cabinets_on_this_computer_need_no_commissioning(tmp_path: Path) -> None:
+    assert not_commissioned(cell(text=TEXT), tmp_path / "cell.yaml") is None
+
+
+def test_a_sign_off_counts_for_the_cell_it_was_made_of(tmp_path: Path) -> None:
+    file = tmp_path / "my_cell.yaml"
+    assert not_commissioned(cell(), file) == "there is no my_cell.commissioned.json"
+    sign_off_file(file).write_text(json.dumps({"fingerprint": fingerprint(cell()), "date": "2026-01-02"}))
+    assert not_commissioned(cell(), file) is None
+    changed = not_commissioned(cell("port: 30201", "port: 30205"), file)
+    assert changed == "addresses, mounts, tools or limits were changed since 2026-01-02"
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}"])
+def test_a_sign_off_that_is_none_says_so(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "my_cell.yaml"
+    sign_off_file(file).write_text(text)
+    assert "my_cell.commissioned.json cannot be read" in (not_commissioned(cell(), file) or "")

@@ -1,0 +1,74 @@
+"""The load of an arm from torques measured at rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config.cell import load_config
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.load import MODEL, PENDANT, LoadReport, identify_load
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+ADDED, AT = 0.7, np.array([0.02, -0.03, 0.1])  # [kg], in the frame of the tool's base, which is the flange [m]
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config("config/dual_iiwa7_fri.yaml"))
+
+
+def measured(robot: Robot, count: int, spread: float) -> tuple[Array, Array]:
+    """Postures, and torques that the model does not explain, since the right arm carries something more."""
+    random, true = np.random.default_rng(1), robot.model.copy()
+    base = robot.model.frames[robot.model.getFrameId("right_hand_e_base")]
+    true.appendBodyToJoint(base.parentJoint, pin.Inertia(ADDED, AT, np.zeros((3, 3))), base.placement)
+    data = true.createData()
+    postures = robot.home + random.uniform(-spread, spread, (count, robot.model.nv))
+    mine = robot.model.createData()
+    missing = [
+        pin.computeGeneralizedGravity(true, data, q) - pin.computeGeneralizedGravity(robot.model, mine, q)
+        for q in postures
+    ]
+    return postures, np.array(missing)
+
+
+def test_what_an_arm_carries_more_than_its_model_is_found_in_the_flanges_frame(robot: Robot) -> None:
+    right, left = (identify_load(robot, arm, *measured(robot, 8, 0.4), MODEL) for arm in ("right", "left"))
+    masses = np.array([right.expected_kg, ADDED])
+    centre = masses @ np.array([right.expected_centre_mm, 1e3 * AT]) / masses.sum()
+    assert right.expected_kg == pytest.approx(0.983 + 2 * 0.038)
+    assert right.identified_kg == pytest.approx(masses.sum())
+    assert right.identified_centre_mm == pytest.approx(centre.tolist(), abs=0.1)
+    assert right.residual_nm < 1e-6
+    left.check()
+    with pytest.raises(RobotError, match=r"the right arm carries 1\.76 kg at .* allowed: off by 0\.3 kg and 50 mm"):
+        right.check()
+
+
+def test_a_centre_that_is_off_is_refused_where_the_mass_is_right() -> None:
+    with pytest.raises(RobotError, match="60 mm away"):
+        LoadReport("left", MODEL, 1.0, 1.0, [0.0, 60.0, 50.0], [0.0, 0.0, 50.0], 0.1).check()
+
+
+def test_a_load_is_not_judged_by_an_arms_model_that_does_not_explain_the_torques() -> None:
+    heavy = 4.0, 1.0, [0.0, 0.0, 50.0], [0.0, 0.0, 50.0], 2.0
+    LoadReport("left", MODEL, *heavy).check()
+    with pytest.raises(
+        RobotError, match=r"4\.00 kg at 0, 0, 50 mm; the pendant, if its load data are the model's, has 1\.00"
+    ):
+        LoadReport("left", PENDANT, *heavy).check()
+
+
+@pytest.mark.parametrize(
+    ("count", "spread", "told"),
+    [
+        pytest.param(7, 0.4, "7 postures: allowed: 8 or more", id="too few"),
+        pytest.param(8, 0.0, "too alike", id="the same one"),
+    ],
+)
+def test_postures_that_tell_too_little_are_refused(robot: Robot, count: int, spread: float, told: str) -> None:
+    with pytest.raises(RobotError, match=told):
+        identify_load(robot, "left", *measured(robot, count, spread), MODEL)
