@@ -1,0 +1,436 @@
+"""Sessions of two KUKA drivers that end in every way there is: ``python -m tests.ros.lbr_soak --sessions 1000``.
+
+The node ``cartesian_controller`` is called directly, in a time of its own: no message crosses a network.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import itertools
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pinocchio as pin
+import rclpy
+import yaml
+from rclpy.clock_type import ClockType
+from rclpy.logging import LoggingSeverity
+from rclpy.time import Time
+
+from q2r2_control import Robot
+from q2r2_control.config.cell import load_config
+from q2r2_control.plants.fri.wire import Drives, Operation, Quality, Safety, Session
+from q2r2_control.robot.compose import WORLD
+from q2r2_control.ros.bridge import joint_outputs
+from q2r2_control.ros.bridge.messages import stamped_pose
+from q2r2_control.ros.launch.processes import nodes_of
+from q2r2_control.ros.nodes.cartesian_controller import CartesianControllerNode
+from q2r2_control.supervision.supervisor import Phase
+from q2r2_control.types import SIDES, Array
+from tests.ros.fake_lbr import SAME, TAU, TOPICS, FakeLbr
+from tests.support.external_cell import external
+
+_TARGETS = 0.01  # between two of them [s]
+_NEAR = 1e-9  # relative, of limits
+_UNEVEN = 0.004  # relative, of the times between ticks, which follow their clock
+_REST = 1e-4  # of commands [rad/s]
+_ALLOWANCE = 0.1  # after the braking time, for a state that is late and the next joint state [s]
+_SOON, _LATE, _LATE_SHARE = 0.002, 0.015, 0.01  # delivery of messages [s], and how many take longer
+_STUCK = 20.0  # a session that does not begin to move in this time never will [s]
+
+
+def lbr_cell(folder: Path, **changes: Any) -> str:
+    """A file with the shipped cell behind a driver for each arm."""
+    cell = external()
+    arms = {
+        arm: {
+            "ctrl_prefix": f"/{arm}/lbr_joint_position_command_controller",
+            "base_frame": f"{arm}_link_0",
+            "joint_states_topic": f"/{arm}/joint_states",
+        }
+        for arm in SIDES
+    }
+    cell["external"] |= {"preset": "lbr_position", "mode": "filtered", "arms": arms, "world_frame": WORLD}
+    (file := folder / "lbr.yaml").write_text(yaml.safe_dump(cell | changes))
+    return str(file)
+
+
+class DirectPublisher:
+    """In place of a :class:`WatchedPublisher`: what is sent goes to a driver, by ``VirtualLbrs.send``."""
+
+    def __init__(self, node: Any, kind: type, topic: str, timeout: float) -> None:
+        self.topic_name, self.sent = topic, 0
+        self.deliver: Callable[[Any], None] | None = None
+
+    @property
+    def listeners(self) -> int:
+        return int(self.deliver is not None)
+
+    def publish(self, message: Any, decided: float) -> bool:
+        self.sent += 1
+        if self.deliver is not None:
+            self.deliver(message)
+        return True
+
+    def begin(self, acknowledged: bool = False) -> None:
+        """There are no acknowledgements."""
+
+    def waits(self) -> bool:
+        return False
+
+    def silence(self) -> None:
+        return None
+
+
+class VirtualLbrs:
+    """The controller's node and a driver for each arm, in virtual time; each has its own clock."""
+
+    def __init__(
+        self, node: CartesianControllerNode, robot: Robot, release: str, period: float, tau: float, seed: int
+    ) -> None:
+        self.node, self.robot, self.random = node, robot, np.random.default_rng(seed)
+        self.drivers = {arm: FakeLbr(robot, arm, period, tau) for arm in SIDES}
+        self.now = 1.0  # [s]
+        self._clock: Any = node.get_clock()
+        self.frozen_until = 0.0  # the node [s]
+        self.change: Callable[[str, Any], Any] = lambda topic, message: message  # of what drivers say; None: it is lost
+        self.on_command: Callable[[str, Array], None] = lambda arm, q: None
+        self._queue: list[tuple[float, int, Callable[[], None]]] = []
+        self._numbers = itertools.count()
+        self._last: dict[str, float] = {}  # delivery on each topic [s]
+        self._waiting: list[Callable[[], None]] = []  # messages for a frozen node
+        self._callbacks = {one.topic_name: one.callback for one in node.subscriptions}
+        command, self._state = TOPICS[release]
+        outputs: dict[str, Any] = {one.publisher.topic_name: one.publisher for one in node._output._channels}
+        for arm in SIDES:
+            outputs[f"/{arm}/command/{command}"].deliver = partial(self._command, arm)
+            own = period * (1.0 + float(self.random.uniform(-2e-4, 2e-4)))
+            self._every(own, 0.0, partial(self._advance, arm))
+        self._every(node._period, 0.1 * node._period, self._tick)
+
+    def at(self, t: float, act: Callable[[], None]) -> None:
+        heapq.heappush(self._queue, (t, next(self._numbers), act))
+
+    def run(self, done: Callable[[], bool]) -> None:
+        while not done():
+            self.now, _, act = heapq.heappop(self._queue)
+            self._clock.set_ros_time_override(Time(seconds=self.now, clock_type=ClockType.ROS_TIME))
+            act()
+
+    def target(self, arm: str, pose: pin.SE3) -> None:
+        """Of the operator, who sends in order and at once."""
+        received = int(1e9 * self.now)
+        info = {"publication_sequence_number": None, "source_timestamp": received, "received_timestamp": received}
+        take = self._callbacks[f"/q2r2/{arm}/target_frame"]
+        self._to_node(lambda: take(stamped_pose(pose, WORLD, 0.0), info))
+
+    def measured(self) -> Array:
+        return np.concatenate([self.drivers[arm].q for arm in SIDES])
+
+    def _every(self, period: float, jitter: float, act: Callable[[], None]) -> None:
+        start = self.now + float(self.random.uniform(0.0, period))
+
+        def again(number: int) -> None:
+            act()
+            due = start + (number + 1) * period + float(self.random.uniform(0.0, jitter))
+            self.at(max(due, self.now), partial(again, number + 1))
+
+        self.at(start, partial(again, 0))
+
+    def _sent(self, topic: str, act: Callable[[], None]) -> None:
+        """Messages of a topic arrive in order, mostly within 2 ms."""
+        longest = _LATE if self.random.random() < _LATE_SHARE else _SOON
+        self._last[topic] = max(self._last.get(topic, 0.0), self.now + float(self.random.uniform(1e-4, longest)))
+        self.at(self._last[topic], act)
+
+    def _to_node(self, act: Callable[[], None]) -> None:
+        if self.now < self.frozen_until:
+            self._waiting.append(act)
+        else:
+            act()
+
+    def _tick(self) -> None:
+        if self.now < self.frozen_until:
+            return
+        for act in self._waiting:
+            act()
+        self._waiting.clear()
+        self.node._tick()
+
+    def _command(self, arm: str, message: Any) -> None:
+        self.on_command(arm, np.array(message.joint_position))
+        self._sent(f"to {arm}", lambda: self.drivers[arm].take(message))
+
+    def _advance(self, arm: str) -> None:
+        driver = self.drivers[arm]
+        driver.advance()
+        for name, message in ((self._state, driver.state()), ("joint_states", driver.joint_state())):
+            topic = f"/{arm}/{name}"
+            if (changed := self.change(topic, message)) is not None:
+                self._sent(topic, partial(self._to_node, partial(self._callbacks[topic], changed)))
+
+
+class Operator:
+    """Presses again a moment after both arms are ready, and lets go a moment after they are not."""
+
+    def __init__(self, virtual: VirtualLbrs) -> None:
+        self._virtual, self._random = virtual, virtual.random
+        self.moves = False
+        self.not_before = 0.0  # the next press [s]
+        self._began = self._ready_since = 0.0
+        self._starts: dict[str, pin.SE3] = {}
+        self._ways: dict[str, tuple[Array, Array, float]] = {}
+        virtual.at(virtual.now, self._send)
+
+    def _send(self) -> None:
+        virtual, random = self._virtual, self._random
+        virtual.at(virtual.now + _TARGETS, self._send)
+        supervisor = virtual.node._supervisor
+        ready, followed = supervisor.phase is Phase.ACTIVE, all(map(supervisor.follows, SIDES))
+        if self.moves and not followed and random.random() < 0.1:
+            self.moves, self.not_before = False, max(self.not_before, virtual.now + 0.2)
+        elif not self.moves and ready and virtual.now >= self.not_before and random.random() < 0.1:
+            self.moves, self._began = True, virtual.now
+            self._starts = {arm: virtual.robot.tool_pose(virtual.measured(), arm) for arm in SIDES}
+            far = random.random() < 0.3  # out of reach, to the joints' ends, or as fast as they go
+            scale = (0.8, 1.5) if far else (0.12, 0.3)
+            self._ways = {
+                arm: (scale[0] * random.uniform(-1, 1, 3), scale[1] * random.uniform(-1, 1, 3), random.uniform(0.3, 1))
+                for arm in SIDES
+            }
+        for arm in SIDES if self.moves else ():
+            way, turn, frequency = self._ways[arm]
+            share = math.sin(2.0 * math.pi * frequency * (virtual.now - self._began))
+            start = self._starts[arm]
+            virtual.target(arm, pin.SE3(start.rotation @ pin.exp3(share * turn), start.translation + share * way))
+
+
+@dataclass
+class LbrSoak:
+    """Begins both sessions, lets the arms move for a while, and ends them in some way."""
+
+    virtual: VirtualLbrs
+    sessions: int
+    ended: int = 0
+    activations: int = 0
+    moved: float = 0.0  # the fastest joint of a driver [rad/s]
+    faults: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.operator, self.random = Operator(self.virtual), self.virtual.random
+        self._how, self._ends_at, self._progress = "start", math.inf, self.virtual.now
+        self._phase, self._seen = Phase.INACTIVE, dict.fromkeys(SIDES, 0)
+        self._commands: dict[str, tuple[int, int, Array, Array]] = {}  # the newest: session, tick, q, v
+        self._late = 0  # the last tick that was late
+        self._disturbed = 0.0  # until when messages are lost or changed, or the node is frozen [s]
+        self.virtual.on_command = self._on_command
+        robot, node = self.virtual.robot, self.virtual.node
+        self._fastest = robot.velocity_limit * node._controller.settings.velocity_scale * (1.0 + _NEAR)
+        self._acceleration = node._loop.acceleration_limit * (1.0 + _UNEVEN)
+        self._rearm(*SIDES)
+        self._look()
+
+    def run(self) -> LbrSoak:
+        self.virtual.run(lambda: self.ended >= self.sessions or self._progress + _STUCK < self.virtual.now)
+        if self.ended < self.sessions:
+            self._fault(f"nothing moves for {_STUCK:g} s: {self.virtual.node._supervisor.fault}")
+        return self
+
+    def _fault(self, what: str) -> None:
+        self.faults.append(f"{self.virtual.now:.3f} s, session {self.ended}, {self._how}: {what}")
+
+    def _on_command(self, arm: str, q: Array) -> None:
+        """As it is sent: one period after the other within the limits of the reference, and without a jump."""
+        node, joints, session = self.virtual.node, self.virtual.robot.arms[arm].joints, self.virtual.drivers[arm].begun
+        tick, v = node._advances, np.full(len(q), math.nan)
+        if arm in self._commands:
+            before, last, last_q, last_v = self._commands[arm]
+            if last == tick - 1:
+                v = (q - last_q) / node._period
+                a, allowed = (
+                    (v - last_v) / node._period,
+                    self._acceleration[joints] + _UNEVEN * np.abs(v) / node._period,
+                )
+                if (np.abs(v) > self._fastest[joints]).any():
+                    self._fault(f"{arm} is commanded to move at {v}")
+                if tick - self._late > 2 and (np.abs(a) > allowed).any():
+                    self._fault(f"{arm} is commanded to accelerate at {a}")
+            elif before == session and np.abs(q - last_q).max() > SAME:
+                self._fault(f"{arm} is commanded to {q}, and was left at {last_q}")
+        self._commands[arm] = session, tick, q, v
+
+    def _look(self) -> None:
+        """A hundred times a second."""
+        virtual, now = self.virtual, self.virtual.now
+        virtual.at(now + 0.01, self._look)
+        for arm, driver in virtual.drivers.items():
+            for trip in driver.trips[self._seen[arm] :]:
+                self._fault(f"{arm} shuts the connection: {trip}")
+            self._seen[arm] = len(driver.trips)
+            if driver.session is Session.COMMANDING_ACTIVE:
+                self.moved = max(self.moved, float(np.abs(driver.v).max()))
+        phase = virtual.node._supervisor.phase
+        self.activations += phase is Phase.ACTIVE and self._phase is not Phase.ACTIVE
+        self._phase = phase
+        if self._ends_at == math.inf and self.operator.moves and all(map(virtual.node._supervisor.follows, SIDES)):
+            self._ends_at, self._progress = max(now, self._disturbed) + float(self.random.uniform(0.2, 1.2)), now
+        elif now >= self._ends_at:
+            self._ends_at = math.inf
+            self._end_session()
+            self.ended += 1
+
+    def _end_session(self) -> None:
+        virtual, random = self.virtual, self.random
+        self._how = str(random.choice(_ENDS))
+        arm, pause = str(random.choice(SIDES)), float(random.uniform(0.02, 0.5))
+        self._disturbed = virtual.now + pause
+        if self._how == "the node freezes":
+            virtual.frozen_until = self._disturbed
+            virtual.at(self._disturbed + 1e-6, self._note_late)
+        elif self._how in _CHANGES:
+            topics, change = _CHANGES[self._how]
+            where = [f"/{one}/{name}" for one in (arm, *(SIDES if pause > 0.3 else ())) for name in topics]
+            virtual.change = lambda topic, message: change(message) if topic in where else message
+            virtual.at(self._disturbed, self._change_nothing)
+        else:
+            self._drop(arm)
+
+    def _note_late(self) -> None:
+        self._late = self.virtual.node._advances + 1
+
+    def _change_nothing(self) -> None:
+        self.virtual.change = lambda topic, message: message
+
+    def _drop(self, arm: str) -> None:
+        virtual, random, node = self.virtual, self.random, self.virtual.node
+        v, deceleration = node._loop._velocity, node._controller.stop_deceleration
+        arms = SIDES if self._how in ("both sessions end", "both arms are moved") else (arm,)
+        for one in arms:
+            driver = virtual.drivers[one]
+            driver.drop(Session.MONITORING_WAIT if self._how == "the quality falls" else Session.MONITORING_READY)
+            if self._how == "the quality falls":
+                driver.quality = Quality(int(random.integers(0, 2)))
+            elif self._how == "a safety stop":
+                driver.safety, driver.drives = Safety.STOP_1_ON_PATH, Drives.OFF
+            elif self._how == "T1":
+                driver.operation = Operation(0 if driver.operation else 2)
+        rests = virtual.now + float((np.abs(v) / deceleration).max()) + _ALLOWANCE
+        virtual.at(rests, self._check_rest)
+        self.operator.not_before = rests + float(random.uniform(0.0, 0.3))
+        if self._how == "both arms are moved":
+            virtual.at(rests, partial(self._move, random.uniform(-0.3, 0.3, (2, 7)) / 30, 30))
+            virtual.at(rests + 0.4, partial(self._rearm, *SIDES))
+        else:
+            self._rearm(*arms)
+
+    def _move(self, by: Array, times: int) -> None:
+        """Hand guiding, by so much again and again, within what the controller may command."""
+        margin, robot = self.virtual.node._controller.settings.position_margin, self.virtual.robot
+        for (arm, driver), step in zip(self.virtual.drivers.items(), by, strict=True):
+            joints = robot.arms[arm].joints
+            driver.q = np.clip(
+                driver.q + step, robot.position_lower[joints] + margin, robot.position_upper[joints] - margin
+            )
+        if times > 1:
+            self.virtual.at(self.virtual.now + 0.01, partial(self._move, by, times - 1))
+
+    def _rearm(self, *arms: str) -> None:
+        """One before the other; a cabinet begins when its arm is at rest."""
+        for arm in arms:
+            self.virtual.at(self.virtual.now + float(self.random.uniform(0.05, 0.6)), partial(self._begin, arm))
+
+    def _begin(self, arm: str) -> None:
+        driver = self.virtual.drivers[arm]
+        if driver.v.any():
+            self.virtual.at(self.virtual.now + 0.01, partial(self._begin, arm))
+        elif driver.session is not Session.COMMANDING_WAIT:
+            driver.session = Session.COMMANDING_WAIT
+            self.virtual.at(self.virtual.now + float(self.random.uniform(0.01, 0.1)), partial(self._begin, arm))
+        else:
+            driver.begin()
+
+    def _check_rest(self) -> None:
+        """Of the commands, at the end of the time to brake."""
+        for arm, (_, tick, _, v) in self._commands.items():
+            if self.virtual.node._advances - tick <= 1 and np.abs(v).max() > _REST:
+                self._fault(f"{arm} is commanded to move at {np.abs(v).max():.4f} rad/s after the time to brake")
+
+
+def _lost(message: Any) -> Any:
+    return None
+
+
+def _with(**changes: Any) -> Callable[[Any], Any]:
+    def change(message: Any) -> Any:
+        for name, value in changes.items():
+            setattr(message, name, value)
+        return message
+
+    return change
+
+
+_STATES = [name for _, name in TOPICS.values()]
+_CHANGES = {
+    "a driver is silent": ([*_STATES, "joint_states"], _lost),
+    "session states cease": (_STATES, _lost),
+    "joint states cease": (["joint_states"], _lost),
+    "joint states are no numbers": (["joint_states"], _with(position=[math.nan] * 7)),
+    "joint states lack joints": (["joint_states"], _with(name=["lbr_A1"] * 7)),
+    "session states are no numbers": (_STATES, _with(ipo_joint_position=[math.nan] * 7)),
+    "session states cannot be read": (_STATES, _with(session_state=7, connection_quality=-1)),
+}
+_ENDS = (
+    *("a session ends", "both sessions end", "the quality falls", "a safety stop", "T1", "both arms are moved"),
+    *("the node freezes", *_CHANGES),
+)
+
+
+@contextmanager
+def virtual_lbrs(
+    release: str = "for Jazzy", period: float = 0.005, tau: float = TAU, seed: int = 0, domain: int | None = None
+) -> Iterator[VirtualLbrs]:
+    with tempfile.TemporaryDirectory() as folder:
+        cell = lbr_cell(Path(folder))
+        given = dict(nodes_of(cell)[0].parameters) | {"use_sim_time": True}
+        arguments = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
+        rclpy.init(args=["--ros-args", *arguments], domain_id=domain)
+        try:
+            with patch.object(joint_outputs, "WatchedPublisher", DirectPublisher):
+                node = CartesianControllerNode()
+            node.get_logger().set_level(LoggingSeverity.FATAL)  # a session's end is none
+            yield VirtualLbrs(node, Robot.from_config(load_config(cell)), release, period, tau, seed)
+            node.get_logger().set_level(LoggingSeverity.UNSET)
+            node.destroy_node()
+        finally:
+            rclpy.try_shutdown()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sessions", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    faults = 0
+    for number, release in enumerate(TOPICS):
+        with virtual_lbrs(release, seed=given.seed + number) as virtual:
+            soak = LbrSoak(virtual, given.sessions // len(TOPICS)).run()
+        print(
+            f"{release}: {soak.ended} sessions, {soak.activations} activations, {soak.moved:.2f} rad/s at most, ",
+            end="",
+        )
+        print(f"{len(soak.faults)} faults", *soak.faults[:20], sep="\n")
+        faults += len(soak.faults)
+    raise SystemExit(1 if faults else 0)
+
+
+if __name__ == "__main__":
+    main()
