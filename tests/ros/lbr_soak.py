@@ -39,18 +39,20 @@ from q2r2_control.types import SIDES, Array
 from tests.ros.fake_lbr import SAME, TAU, TOPICS, FakeLbr
 from tests.support.external_cell import external
 
-_TARGETS = 0.01  # between two of them [s]
+_TARGETS, _PERIOD = 0.01, 0.005  # between two of the operator's, and of a driver [s]
 _NEAR = 1e-9  # relative, of limits
 _UNEVEN = 0.004  # relative, of the times between ticks, which follow their clock
 _REST = 1e-4  # of commands [rad/s]
-_ALLOWANCE = 0.1  # after the braking time, for a state that is late and the next joint state [s]
-_SOON, _LATE, _LATE_SHARE = 0.002, 0.015, 0.01  # delivery of messages [s], and how many take longer
+_ALLOWANCE = 0.15  # after the braking time, for states that are late, and the speed that joints gain meanwhile [s]
+_SOON, _LATE_SHARE = 0.002, 0.01  # delivery of messages [s], and how many take longer
+_LATE = 0.25  # at most, of the filter's time constant, which bounds what the driver bears
 _STUCK = 20.0  # a session that does not begin to move in this time never will [s]
 
 
-def lbr_cell(folder: Path, **changes: Any) -> str:
-    """A file with the shipped cell behind a driver for each arm."""
+def lbr_cell(folder: Path, **control: Any) -> str:
+    """A file with the shipped cell behind a driver for each arm, with changed keys of ``control``."""
     cell = external()
+    cell["control"] |= control
     arms = {
         arm: {
             "ctrl_prefix": f"/{arm}/lbr_joint_position_command_controller",
@@ -60,7 +62,7 @@ def lbr_cell(folder: Path, **changes: Any) -> str:
         for arm in SIDES
     }
     cell["external"] |= {"preset": "lbr_position", "mode": "filtered", "arms": arms, "world_frame": WORLD}
-    (file := folder / "lbr.yaml").write_text(yaml.safe_dump(cell | changes))
+    (file := folder / "lbr.yaml").write_text(yaml.safe_dump(cell))
     return str(file)
 
 
@@ -94,13 +96,12 @@ class DirectPublisher:
 class VirtualLbrs:
     """The controller's node and a driver for each arm, in virtual time; each has its own clock."""
 
-    def __init__(
-        self, node: CartesianControllerNode, robot: Robot, release: str, period: float, tau: float, seed: int
-    ) -> None:
+    def __init__(self, node: CartesianControllerNode, robot: Robot, release: str, tau: float, seed: int) -> None:
         self.node, self.robot, self.random = node, robot, np.random.default_rng(seed)
-        self.drivers = {arm: FakeLbr(robot, arm, period, tau) for arm in SIDES}
+        self.drivers = {arm: FakeLbr(robot, arm, _PERIOD, tau) for arm in SIDES}
         self.now = 1.0  # [s]
         self._clock: Any = node.get_clock()
+        self._late = _LATE * tau
         self.frozen_until = 0.0  # the node [s]
         self.change: Callable[[str, Any], Any] = lambda topic, message: message  # of what drivers say; None: it is lost
         self.on_command: Callable[[str, Array], None] = lambda arm, q: None
@@ -113,7 +114,7 @@ class VirtualLbrs:
         outputs: dict[str, Any] = {one.publisher.topic_name: one.publisher for one in node._output._channels}
         for arm in SIDES:
             outputs[f"/{arm}/command/{command}"].deliver = partial(self._command, arm)
-            own = period * (1.0 + float(self.random.uniform(-2e-4, 2e-4)))
+            own = _PERIOD * (1.0 + float(self.random.uniform(-2e-4, 2e-4)))
             self._every(own, 0.0, partial(self._advance, arm))
         self._every(node._period, 0.1 * node._period, self._tick)
 
@@ -148,7 +149,7 @@ class VirtualLbrs:
 
     def _sent(self, topic: str, act: Callable[[], None]) -> None:
         """Messages of a topic arrive in order, mostly within 2 ms."""
-        longest = _LATE if self.random.random() < _LATE_SHARE else _SOON
+        longest = self._late if self.random.random() < _LATE_SHARE else _SOON
         self._last[topic] = max(self._last.get(topic, 0.0), self.now + float(self.random.uniform(1e-4, longest)))
         self.at(self._last[topic], act)
 
@@ -396,10 +397,10 @@ _ENDS = (
 
 @contextmanager
 def virtual_lbrs(
-    release: str = "for Jazzy", period: float = 0.005, tau: float = TAU, seed: int = 0, domain: int | None = None
+    release: str, tau: float = TAU, seed: int = 0, domain: int | None = None, **control: Any
 ) -> Iterator[VirtualLbrs]:
     with tempfile.TemporaryDirectory() as folder:
-        cell = lbr_cell(Path(folder))
+        cell = lbr_cell(Path(folder), **control)
         given = dict(nodes_of(cell)[0].parameters) | {"use_sim_time": True}
         arguments = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
         rclpy.init(args=["--ros-args", *arguments], domain_id=domain)
@@ -407,7 +408,7 @@ def virtual_lbrs(
             with patch.object(joint_outputs, "WatchedPublisher", DirectPublisher):
                 node = CartesianControllerNode()
             node.get_logger().set_level(LoggingSeverity.FATAL)  # a session's end is none
-            yield VirtualLbrs(node, Robot.from_config(load_config(cell)), release, period, tau, seed)
+            yield VirtualLbrs(node, Robot.from_config(load_config(cell)), release, tau, seed)
             node.get_logger().set_level(LoggingSeverity.UNSET)
             node.destroy_node()
         finally:
@@ -418,10 +419,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tau", type=float, default=TAU, help="of the driver's filter [s]")
+    parser.add_argument("--velocity-scale", type=float, default=1.0, help="of the cell, which takes 0.9 at most")
     given = parser.parse_args()
     faults = 0
     for number, release in enumerate(TOPICS):
-        with virtual_lbrs(release, seed=given.seed + number) as virtual:
+        with virtual_lbrs(release, given.tau, given.seed + number, velocity_scale=given.velocity_scale) as virtual:
             soak = LbrSoak(virtual, given.sessions // len(TOPICS)).run()
         print(
             f"{release}: {soak.ended} sessions, {soak.activations} activations, {soak.moved:.2f} rad/s at most, ",

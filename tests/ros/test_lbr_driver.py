@@ -32,7 +32,8 @@ from q2r2_control.ros.base_node import COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.lbr_driver import LbrDrivers
 from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.launch.processes import nodes_of
-from tests.ros.fake_lbr import PERIOD, TOPICS, FakeLbr
+from tests.ros.fake_lbr import PERIOD, TAU, TOPICS, FakeLbr
+from tests.ros.lbr_delay import measure
 from tests.ros.lbr_soak import LbrSoak, lbr_cell, virtual_lbrs
 from tests.ros.test_intakes import Arrivals
 
@@ -121,6 +122,16 @@ def test_sessions_that_end_in_every_way_there_is_trip_no_guard_and_jump_nowhere(
     assert soak.faults == []
     assert soak.activations > 0.4 * sessions
     assert soak.moved > 1.0
+
+
+def test_the_drivers_filter_delays_by_its_time_constant_and_bears_commands_that_are_late(robot: Robot) -> None:
+    with_it, without = measure(robot, TAU), measure(robot, 0.0)
+    assert with_it.delay == pytest.approx(TAU, abs=0.5 * PERIOD)
+    assert without.delay == pytest.approx(0.0, abs=1e-9)
+    assert without.late_speed == pytest.approx(3.0)  # three periods' way in one
+    # Which is why presets lbr_* leave a tenth of the velocity limits.
+    assert 1.05 < measure(robot, TAU, late=0.015).late_speed < 1.0 / 0.9
+    assert 1.0 < measure(robot, 0.02, late=0.005).late_speed < 1.0 / 0.9
 
 
 def test_external_torques_are_told_once_both_drivers_have_and_none_that_are_no_numbers(

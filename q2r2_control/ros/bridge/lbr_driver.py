@@ -16,7 +16,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.types import Array, CommandMode
 
-_NAMES = "lbr_state", "state"  # of the topic, in releases for Jazzy and in those of 2024
+STATE_TOPICS = "lbr_state", "state"  # of a driver, in releases for Jazzy and in those of 2024
 _SILENT = 0.5  # a driver that has been heard and says nothing for longer is gone [s]
 _SAG = 0.05  # of measured joints below what is commanded; beyond it somebody else has moved the arm [rad]
 _WANTED = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
@@ -38,7 +38,7 @@ class LbrDrivers:
         on_torques: Callable[[Array], None],
     ) -> None:
         """``namespaces`` of the drivers, by arm. ``on_torques`` gets external torques (nv,) [Nm] of all arms."""
-        self._node, self._robot, self._namespaces, self._wanted = node, robot, dict(namespaces), _WANTED[mode]
+        self._node, self._robot, self._namespaces, self._mode = node, robot, dict(namespaces), mode
         self._on_torques, self._torques = on_torques, np.zeros(robot.model.nv)
         self._held = np.full(robot.model.nv, np.nan)  # NaN: no session, or nothing is known [rad]
         self._newest: dict[str, tuple[Any, float]] = {}  # of each arm, and when it came [s]
@@ -46,7 +46,7 @@ class LbrDrivers:
         self.withheld: set[str] = set()
         kind = import_module("lbr_fri_idl.msg").LBRState
         for arm, namespace in self._namespaces.items():
-            for name in _NAMES:
+            for name in STATE_TOPICS:
                 topic = f"{namespace}/{name}"
                 node.create_subscription(kind, topic, partial(self._on_state, arm, topic), STREAM_QOS)
 
@@ -56,18 +56,8 @@ class LbrDrivers:
         for arm, (state, heard) in self._newest.items():
             if not -_SILENT <= now - heard <= _SILENT:
                 return Reason.of(ReasonKind.FRI_SILENT, arm=arm, source=f"the driver in {self._namespaces[arm]}")
-            if state.session_state != Session.COMMANDING_ACTIVE:
-                return Reason.of(
-                    ReasonKind.FRI_SESSION,
-                    arm=arm,
-                    session=_word(Session, state.session_state),
-                    quality=_word(Quality, state.connection_quality),
-                    safety=_word(Safety, state.safety_state),
-                    drives=_word(Drives, state.drive_state),
-                )
-            if state.client_command_mode != self._wanted:
-                asked, wanted = _word(CommandKind, state.client_command_mode), _word(CommandKind, self._wanted)
-                return Reason.of(ReasonKind.FRI_COMMAND_MODE, arm=arm, asked=asked, wanted=wanted)
+            if (fault := session_fault(arm, state, self._mode)) is not None:
+                return fault
         return None
 
     def held(self, q: Array) -> Array | None:
@@ -75,7 +65,7 @@ class LbrDrivers:
 
         An arm of which nothing near its measured ``q`` (nv,) [rad] is known is held there.
         """
-        if self._wanted is not CommandKind.POSITION:
+        if self._mode is not CommandMode.POSITION:
             return None
         held = q.copy()
         for arm in self._namespaces:
@@ -115,6 +105,23 @@ class LbrDrivers:
             self._torques[joints] = torques
             if len(self._newest) == len(self._namespaces):
                 self._on_torques(self._torques.copy())
+
+
+def session_fault(arm: str, state: Any, mode: CommandMode) -> Reason | None:
+    """Why an arm in this state follows no commands of this mode, or None."""
+    if state.session_state != Session.COMMANDING_ACTIVE:
+        return Reason.of(
+            ReasonKind.FRI_SESSION,
+            arm=arm,
+            session=_word(Session, state.session_state),
+            quality=_word(Quality, state.connection_quality),
+            safety=_word(Safety, state.safety_state),
+            drives=_word(Drives, state.drive_state),
+        )
+    if state.client_command_mode != _WANTED[mode]:
+        asked, wanted = _word(CommandKind, state.client_command_mode), _word(CommandKind, _WANTED[mode])
+        return Reason.of(ReasonKind.FRI_COMMAND_MODE, arm=arm, asked=asked, wanted=wanted)
+    return None
 
 
 def _word(kind: type[IntEnum], value: int) -> str:
