@@ -79,7 +79,7 @@ class ControllerSettings(StrictModel):
     limits: Literal["driver", "model"] = Field(
         "driver",
         description="driver: with plant fri or a preset lbr_*, position_margin is 0.105 rad at least; with a preset "
-        "lbr_*, velocity_scale is 0.9 at most",
+        "lbr_*, velocity_scale is 0.85 at most",
     )
     recovery_velocity: float = Field(0.2, gt=0, le=1, description="inward speed when outside a limit [rad/s]")
 

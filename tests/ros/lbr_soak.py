@@ -43,7 +43,7 @@ _TARGETS, _PERIOD = 0.01, 0.005  # between two of the operator's, and of a drive
 _NEAR = 1e-9  # relative, of limits
 _UNEVEN = 0.004  # relative, of the times between ticks, which follow their clock
 _REST = 1e-4  # of commands [rad/s]
-_ALLOWANCE = 0.15  # after the braking time, for states that are late, and the speed that joints gain meanwhile [s]
+_ALLOWANCE = 0.2  # after the braking time, for states that are late, and the speed that joints gain meanwhile [s]
 _SOON, _LATE_SHARE = 0.002, 0.01  # delivery of messages [s], and how many take longer
 _LATE = 0.25  # at most, of the filter's time constant, which bounds what the driver bears
 _STUCK = 20.0  # a session that does not begin to move in this time never will [s]
@@ -420,7 +420,7 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tau", type=float, default=TAU, help="of the driver's filter [s]")
-    parser.add_argument("--velocity-scale", type=float, default=1.0, help="of the cell, which takes 0.9 at most")
+    parser.add_argument("--velocity-scale", type=float, default=1.0, help="of the cell, which takes 0.85 at most")
     given = parser.parse_args()
     faults = 0
     for number, release in enumerate(TOPICS):

@@ -1,4 +1,4 @@
-"""What q2r2 ros doctor finds of KUKA drivers, and the cures."""
+"""Findings of q2r2 ros doctor about KUKA drivers, and their cures."""
 
 from __future__ import annotations
 
@@ -90,11 +90,11 @@ CASES = {
     ),
     "narrower velocities": (
         {"description": urdf(speed_of_a1=0.8)},
-        "left_A1 is commanded up to 88.2 deg/s; its driver shuts the connection beyond 78.4 deg/s",
+        "left_A1 is commanded up to 83.3 deg/s; its driver shuts the connection beyond 78.4 deg/s",
         "control.velocity_scale: 0.800",
     ),
     "other joints": (
-        {"description": urdf(prefix="joint_")},
+        {"description": urdf(prefix="right_A")},
         "/left/robot_description has no joints for left_A1, left_A2",
         "ctrl_prefix name the driver of this arm",
     ),
