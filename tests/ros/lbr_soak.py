@@ -43,9 +43,11 @@ _TARGETS, _PERIOD = 0.01, 0.005  # between two of the operator's, and of a drive
 _NEAR = 1e-9  # relative, of limits
 _UNEVEN = 0.004  # relative, of the times between ticks, which follow their clock
 _REST = 1e-4  # of commands [rad/s]
-_ALLOWANCE = 0.2  # after the braking time, for states that are late, and the speed that joints gain meanwhile [s]
+_NOTICED = 0.1  # a session's end, by states that may be late [s]
+_ALLOWANCE = 0.05  # after the braking time [s]
 _SOON, _LATE_SHARE = 0.002, 0.01  # delivery of messages [s], and how many take longer
 _LATE = 0.25  # at most, of the filter's time constant, which bounds what the driver bears
+_LONGEST_STOP = 1.0  # from a session's end on [s]
 _STUCK = 20.0  # a session that does not begin to move in this time never will [s]
 
 
@@ -281,6 +283,9 @@ class LbrSoak:
                 self.moved = max(self.moved, float(np.abs(driver.v).max()))
         phase = virtual.node._supervisor.phase
         self.activations += phase is Phase.ACTIVE and self._phase is not Phase.ACTIVE
+        if phase is Phase.BRAKING and self._phase is not Phase.BRAKING:
+            braking = np.abs(virtual.node._loop._velocity) / virtual.node._controller.stop_deceleration
+            virtual.at(now + float(braking.max()) + _ALLOWANCE, self._check_rest)
         self._phase = phase
         if self._ends_at == math.inf and self.operator.moves and all(map(virtual.node._supervisor.follows, SIDES)):
             self._ends_at, self._progress = max(now, self._disturbed) + float(self.random.uniform(0.2, 1.2)), now
@@ -312,8 +317,7 @@ class LbrSoak:
         self.virtual.change = lambda topic, message: message
 
     def _drop(self, arm: str) -> None:
-        virtual, random, node = self.virtual, self.random, self.virtual.node
-        v, deceleration = node._loop._velocity, node._controller.stop_deceleration
+        virtual, random = self.virtual, self.random
         arms = SIDES if self._how in ("both sessions end", "both arms are moved") else (arm,)
         for one in arms:
             driver = virtual.drivers[one]
@@ -324,9 +328,8 @@ class LbrSoak:
                 driver.safety, driver.drives = Safety.STOP_1_ON_PATH, Drives.OFF
             elif self._how == "T1":
                 driver.operation = Operation(0 if driver.operation else 2)
-        rests = virtual.now + float((np.abs(v) / deceleration).max()) + _ALLOWANCE
-        virtual.at(rests, self._check_rest)
-        self.operator.not_before = rests + float(random.uniform(0.0, 0.3))
+        virtual.at(virtual.now + _NOTICED, self._check_noticed)
+        self.operator.not_before = rests = virtual.now + _LONGEST_STOP
         if self._how == "both arms are moved":
             virtual.at(rests, partial(self._move, random.uniform(-0.3, 0.3, (2, 7)) / 30, 30))
             virtual.at(rests + 0.4, partial(self._rearm, *SIDES))
@@ -358,6 +361,10 @@ class LbrSoak:
             self.virtual.at(self.virtual.now + float(self.random.uniform(0.01, 0.1)), partial(self._begin, arm))
         else:
             driver.begin()
+
+    def _check_noticed(self) -> None:
+        if self.virtual.node._supervisor.phase is Phase.ACTIVE:
+            self._fault(f"the controller is active {_NOTICED:g} s after that")
 
     def _check_rest(self) -> None:
         """Of the commands, at the end of the time to brake."""
