@@ -35,8 +35,9 @@ from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.launch.processes import nodes_of
 from tests.ros.fake_lbr import PERIOD, TAU, TOPICS, FakeLbr
 from tests.ros.lbr_delay import measure
-from tests.ros.lbr_soak import LbrSoak, Operator, lbr_cell, virtual_lbrs
+from tests.ros.lbr_soak import LbrSoak
 from tests.ros.test_intakes import Arrivals
+from tests.ros.virtual_lbrs import Operator, lbr_cell, virtual_lbrs
 
 
 class PublishedLbr(FakeLbr):

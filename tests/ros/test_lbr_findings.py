@@ -24,8 +24,8 @@ from std_msgs.msg import String
 
 from q2r2_control.ros.base_node import LATCHED_QOS
 from q2r2_control.ros.watching.lbr_drivers import DriverListener, examine_drivers
-from tests.ros.lbr_soak import lbr_cell
 from tests.ros.test_set_listener import COMMAND, LONG
+from tests.ros.virtual_lbrs import lbr_cell
 
 STATE, COMMAND_TYPE = "lbr_fri_idl/msg/LBRState", "lbr_fri_idl/msg/LBRJointPositionCommand"
 ENDS, SPEEDS = (170, 120, 170, 120, 170, 120, 175), (98, 98, 100, 130, 140, 180, 180)  # of an iiwa 7 [deg], [deg/s]
