@@ -32,6 +32,7 @@ class FakeLbr:
         self.q, self.v = robot.home[joints].copy(), np.zeros(len(joints))  # as commanded to the cabinet [rad], [rad/s]
         self.session, self.quality, self.safety = Session.MONITORING_READY, Quality.EXCELLENT, Safety.NORMAL
         self.drives, self.operation = Drives.ACTIVE, Operation.AUTOMATIC
+        self.silent = False  # its process has ended
         self.begun, self.trips = 0, list[str]()
         self.target: Array | None = None  # the newest command of this session
         self.share = 1.0 - math.exp(-period / tau) if tau > 0.0 else 1.0
@@ -44,7 +45,7 @@ class FakeLbr:
         """Commanding active, as after a press on the pendant; the driver was started anew."""
         self.quality, self.safety, self.drives = Quality.EXCELLENT, Safety.NORMAL, Drives.ACTIVE
         self.target, self.v, self.ipo = None, np.zeros_like(self.q), self.q
-        self.session = Session.COMMANDING_ACTIVE
+        self.session, self.silent = Session.COMMANDING_ACTIVE, False
         self.begun += 1
 
     def drop(self, session: Session = Session.MONITORING_READY) -> None:

@@ -20,7 +20,8 @@ from tests.ros.virtual_lbrs import Operator, VirtualLbrs, virtual_lbrs
 _NEAR = 1e-9  # relative, of limits
 _UNEVEN = 0.004  # relative, of the times between ticks, which follow their clock
 _REST = 1e-4  # of commands [rad/s]
-_NOTICED = 0.1  # a session's end, by states that may be late [s]
+_NOTICED = 0.15  # a session's end, by states that may be late, or by a silence of 0.1 s [s]
+_RESTARTED = 0.6  # a driver's process, at the earliest [s]
 _ALLOWANCE = 0.05  # after the braking time [s]
 _LONGEST_STOP = 1.0  # from a session's end on [s]
 _STUCK = 20.0  # a session that does not begin to move in this time never will [s]
@@ -137,13 +138,14 @@ class LbrSoak:
                 driver.safety, driver.drives = Safety.STOP_1_ON_PATH, Drives.OFF
             elif self._how == "T1":
                 driver.operation = Operation(0 if driver.operation else 2)
+            driver.silent = self._how == "a driver ends"
         virtual.at(virtual.now + _NOTICED, self._check_noticed)
         self.operator.not_before = rests = virtual.now + _LONGEST_STOP
         if self._how == "both arms are moved":
             virtual.at(rests, partial(self._move, random.uniform(-0.3, 0.3, (2, 7)) / 30, 30))
             virtual.at(rests + 0.4, partial(self._rearm, *SIDES))
         else:
-            self._rearm(*arms)
+            virtual.at(virtual.now + (_RESTARTED if self._how == "a driver ends" else 0.0), partial(self._rearm, *arms))
 
     def _move(self, by: Array, times: int) -> None:
         """Hand guiding, by so much again and again, within what the controller may command."""
@@ -165,7 +167,7 @@ class LbrSoak:
         driver = self.virtual.drivers[arm]
         if driver.v.any():
             self.virtual.at(self.virtual.now + 0.01, partial(self._begin, arm))
-        elif driver.session is not Session.COMMANDING_WAIT:
+        elif not driver.silent and driver.session is not Session.COMMANDING_WAIT:
             driver.session = Session.COMMANDING_WAIT
             self.virtual.at(self.virtual.now + float(self.random.uniform(0.01, 0.1)), partial(self._begin, arm))
         else:
@@ -207,7 +209,7 @@ _CHANGES = {
 }
 _ENDS = (
     *("a session ends", "both sessions end", "the quality falls", "a safety stop", "T1", "both arms are moved"),
-    *("the node freezes", *_CHANGES),
+    *("a driver ends", "the node freezes", *_CHANGES),
 )
 
 

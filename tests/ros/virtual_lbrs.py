@@ -166,6 +166,8 @@ class VirtualLbrs:
     def _advance(self, arm: str) -> None:
         driver = self.drivers[arm]
         driver.advance()
+        if driver.silent:
+            return
         for name, message in ((self._state, driver.state()), ("joint_states", driver.joint_state())):
             topic = f"/{arm}/{name}"
             if (changed := self.change(topic, message)) is not None:

@@ -18,7 +18,7 @@ from q2r2_control.types import Array, CommandMode
 
 STATE_TOPICS = "lbr_state", "state"  # of a driver, in releases for Jazzy and in those of 2024
 _SILENT = 0.5  # a driver that has been heard and says nothing for longer is gone [s]
-_SAG = 0.05  # of measured joints below what is commanded; beyond it somebody else has moved the arm [rad]
+_SAG = 0.01  # of measured joints below what is commanded; beyond it somebody else has moved the arm [rad]
 _WANTED = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
@@ -94,12 +94,15 @@ class LbrDrivers:
         if state.session_state not in list(Session) or (active and not np.isfinite(ipo).all()):
             self._node.drop(topic, f"session_state {state.session_state}, ipo_joint_position {ipo}")
             return
+        now = self._node.now
+        if arm in self._newest and now - self._newest[arm][1] > _SILENT:
+            self._held[joints] = np.nan  # the driver may have been started anew, and does not tell
         if not active:
             self._held[joints] = np.nan
             self.withheld.add(self._namespaces[arm])
         elif np.isnan(self._held[joints]).any():
             self._held[joints] = ipo
-        self._newest[arm] = state, self._node.now
+        self._newest[arm] = state, now
         torques = np.asarray(state.external_torque)
         if np.isfinite(torques).all():
             self._torques[joints] = torques
