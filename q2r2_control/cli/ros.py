@@ -94,12 +94,17 @@ def watch(
     raise Exit(0 if view.nodes else 1)
 
 
-def _watched(cell: Config, duration: float | None, show: Callable[[SetView], None] = lambda view: None) -> SetView:
+def _watched(
+    cell: Config,
+    duration: float | None,
+    show: Callable[[SetView], None] = lambda view: None,
+    drivers: bool = False,
+) -> SetView:
     from q2r2_control.ros.watching.set_listener import watch_set
 
     stop = StopRequest()
     with stop_on_signals(stop.ask):
-        return watch_set(cell, duration, show, lambda: stop.asked)
+        return watch_set(cell, duration, show, lambda: stop.asked, drivers)
 
 
 def _watch_live(cell: Config, domain: str, duration: float | None) -> SetView:
@@ -127,7 +132,8 @@ def doctor(
     """Say what of ROS is missing, which domain and middleware are used, which nodes run and what is wrong with them.
 
     Each finding stands with what helps. Like watch it takes part in nothing. Exit 1 when something was found that
-    stops the arms; where no node of a set runs, only the environment is judged.
+    stops the arms; where no node of a set runs, only the environment is judged. With a preset lbr_* it also looks at
+    the KUKA drivers: their topics and sessions, and the limits of their robot_description beside the cell's.
     """
     positive("--duration", duration)
     cell = load_config(config)
@@ -135,9 +141,11 @@ def doctor(
     facts, findings = examine_environment(os.environ)
     nodes, others = list[str](), tuple[str, ...]()
     if not any(finding.stops_arms for finding in findings):
-        view = _watched(cell, duration)
+        from q2r2_control.ros.watching.lbr_drivers import examine_drivers
+
+        view = _watched(cell, duration, drivers=True)
         nodes, others = [node.name for node in view.nodes], view.others
-        findings += examine_set(view, expected)
+        findings += [*examine_set(view, expected), *examine_drivers(view, cell)]
     stops = any(finding.stops_arms for finding in findings)
     if json:
         print(as_json_text({**facts, "nodes": nodes, "others": others, "findings": findings, "stops_arms": stops}))

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
+import pinocchio as pin
 import pytest
 import yaml
 
+from q2r2_control import Robot
+from q2r2_control.config.cell import parse_config
+from q2r2_control.config.resources import find_resource
 from tests.config.cell_files import changed, fault, loaded
 from tests.support.external_cell import external
 
@@ -83,3 +89,33 @@ def test_limits_of_targets_are_for_presets_that_take_targets(tmp_path: Path) -> 
     assert "preset jtc gets joint positions within the limits of the block control" in fault(
         tmp_path, yaml.safe_dump(cell)
     )
+
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "kuka.md").read_text(encoding="utf-8")
+
+
+def test_the_blocks_of_the_page_about_kuka_are_those_of_a_cell() -> None:
+    lbr, kuka_drivers = (yaml.safe_load(dedent(block)) for block in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL))
+    cell = yaml.safe_load(find_resource("config/dual_iiwa14.yaml").read_text(encoding="utf-8"))
+    config = parse_config(yaml.safe_dump(cell | kuka_drivers), "cell.yaml")
+    assert config.external is not None
+    assert config.external.topic("left") == "/left/joint_trajectory_controller/joint_trajectory"
+    right = {key: value.replace("left", "right") for key, value in lbr["left"].items()}
+    driven = {"preset": "lbr_position", "mode": "filtered", "arms": lbr | {"right": right}}
+    config = parse_config(yaml.safe_dump(cell | {"controller": "external", "external": driven}), "cell.yaml")
+    assert config.external is not None
+    assert config.external.topic("left") == "/left/command/lbr_joint_position_command"
+
+
+@pytest.mark.parametrize(("name", "frame", "base"), [("iiwa7", "link_ee", 1.266), ("iiwa14", "link_7", 1.261)])
+def test_the_tool_that_the_page_puts_on_tf_is_the_shipped_cells(name: str, frame: str, base: float) -> None:
+    """``base``: height of that frame above the arm's base in the driver's own model, where the arm is stretched [m]."""
+    text = find_resource(f"config/dual_{name}.yaml").read_text(encoding="utf-8")
+    robot = Robot.from_config(parse_config(text, "cell.yaml"))
+    stretched = pin.neutral(robot.model)
+    tool = (
+        robot.tool_pose(stretched, "left").translation
+        - robot.model.frames[robot.model.getFrameId("left_link_0")].placement.translation
+    )
+    (given,) = re.findall(rf"--frame-id left_{frame} --child-frame-id left_tool_frame --z ([\d.]+)", PAGE)
+    assert base + float(given) == pytest.approx(tool[2], abs=1e-6)

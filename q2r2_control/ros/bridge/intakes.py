@@ -163,9 +163,9 @@ class JointIntake:
         self.state: RobotState | None = None  # the newest of all arms
         self._own_names: set[str] = set()  # topics on which the arms' own names have come
         self.theirs: dict[str, str] = {}  # names of joints that an arm's driver calls otherwise, by ours
-        # From drivers that tell: why arms do not follow, and where they are held (nv,) [rad].
+        # From drivers that tell: why arms do not follow, and where they are held near measured ones, (nv,) [rad].
         self.driver_fault: Callable[[], Reason | None] = lambda: None
-        self.driver_held: Callable[[], Array | None] = lambda: None
+        self.driver_held: Callable[[Array], Array | None] = lambda q: None
 
     def subscribe(self, take: TakeState, look: Callable[[JointState], None]) -> None:
         """Pass states of all arms, or what is wrong, to ``take`` with the time [s], and each message to ``look``."""
@@ -205,7 +205,7 @@ class JointIntake:
             return
         silent = now - self._external_stamp > STREAM_TIMEOUT
         external = None if silent else self._external
-        self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest, held=self.driver_held())
+        self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest, held=self.driver_held(q))
         if silent and self._needs_external_torque:
             take(Reason.of(ReasonKind.NO_EXTERNAL_TORQUES, topic=self._external_topic), now)
         else:

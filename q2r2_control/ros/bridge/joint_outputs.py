@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from importlib import import_module
 from typing import Any, ClassVar, NamedTuple
 
@@ -150,6 +150,11 @@ class Channel(NamedTuple):
     publisher: WatchedPublisher
     optional: bool = False  # nothing is sent as long as nobody listens
 
+    @property
+    def namespace(self) -> str:
+        """Of a driver whose topic is <namespace>/command/<topic>; "" where it is none."""
+        return self.publisher.topic_name.rpartition("/command/")[0]
+
 
 class JointOutput:
     """Where references go. Without channels, ``output: none``, another controller moves the arms."""
@@ -157,6 +162,7 @@ class JointOutput:
     def __init__(self, drive: Drive, kind: Kind, channels: list[Channel]) -> None:
         self.drive, self._kind, self._channels, self._listeners = drive, kind, channels, 0
         self.theirs: Mapping[str, str] = {}  # names of joints that the receiver calls otherwise, by ours
+        self.withheld: Collection[str] = ()  # namespaces of drivers that get nothing
 
     def watch(self, node: BaseNode) -> CommandWatch:
         return CommandWatch(node, self._kind.message, [channel.publisher.topic_name for channel in self._channels])
@@ -164,7 +170,7 @@ class JointOutput:
     def send(self, command: Command, state: RobotState, t: float, decided: float) -> None:
         """Send a command of the tick at ``t`` [s] of the node's clock; ``decided``: see :func:`publish_in_time`."""
         for channel in self._channels:
-            if channel.optional and not channel.publisher.listeners:
+            if channel.namespace in self.withheld or (channel.optional and not channel.publisher.listeners):
                 continue
             names = [self.theirs.get(name, name) for name in channel.names]
             message = self._kind.encode(command, state, t, names, channel.joints)
@@ -184,10 +190,10 @@ class JointOutput:
         """Where the driver of each arm is in ROS, of drivers that a topic's name tells: <namespace>/command/<topic>."""
         found = {}
         for channel in self._channels:
-            namespace, command, _ = channel.publisher.topic_name.rpartition("/command/")
             for arm, its in robot.arms.items():
-                if self._kind.older is not None and command and np.array_equal(channel.joints, np.sort(its.joints)):
-                    found[arm] = namespace
+                same = np.array_equal(channel.joints, np.sort(its.joints))
+                if self._kind.older is not None and channel.namespace and same:
+                    found[arm] = channel.namespace
         return found
 
     def waits(self) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from enum import IntEnum
 from functools import partial
@@ -17,13 +16,18 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.types import Array, CommandMode
 
-_NAMES = "lbr_state", "state"  # of the topic, in releases for Jazzy and in those of 2024
+STATE_TOPICS = "lbr_state", "state"  # of a driver, in releases for Jazzy and in those of 2024
 _SILENT = 0.5  # a driver that has been heard and says nothing for longer is gone [s]
+_SAG = 0.01  # of measured joints below what is commanded; beyond it somebody else has moved the arm [rad]
 _WANTED = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
 class LbrDrivers:
-    """Listens to the drivers of the arms. Commands count in commanding active only, as with :class:`FriPlant`."""
+    """Listens to the drivers of the arms. Commands count in commanding active only, as with :class:`FriPlant`.
+
+    Commands overlay a motion of the cabinet's own, whose position (``ipo_joint_position``) stays where the session
+    began. The first command of a session equals it. Within a session the arm is held at the last command instead.
+    """
 
     def __init__(
         self,
@@ -34,47 +38,93 @@ class LbrDrivers:
         on_torques: Callable[[Array], None],
     ) -> None:
         """``namespaces`` of the drivers, by arm. ``on_torques`` gets external torques (nv,) [Nm] of all arms."""
-        self._robot, self._namespaces, self._wanted = robot, dict(namespaces), _WANTED[mode]
+        self._node, self._robot, self._namespaces, self._mode = node, robot, dict(namespaces), mode
         self._on_torques, self._torques = on_torques, np.zeros(robot.model.nv)
-        self._held = np.full(robot.model.nv, np.nan)  # by the cabinets' own interpolation [rad]
+        self._held = np.full(robot.model.nv, np.nan)  # NaN: no session, or nothing is known [rad]
         self._newest: dict[str, tuple[Any, float]] = {}  # of each arm, and when it came [s]
+        # Namespaces of drivers whose session has ended since commands began: what still comes is no first command.
+        self.withheld: set[str] = set()
         kind = import_module("lbr_fri_idl.msg").LBRState
         for arm, namespace in self._namespaces.items():
-            for name in _NAMES:
-                node.create_subscription(kind, f"{namespace}/{name}", partial(self._on_state, arm), STREAM_QOS)
+            for name in STATE_TOPICS:
+                topic = f"{namespace}/{name}"
+                node.create_subscription(kind, topic, partial(self._on_state, arm, topic), STREAM_QOS)
 
     def fault(self) -> Reason | None:
         """Why an arm cannot be commanded, or None; nothing is said of a driver that was never heard."""
-        now = time.monotonic()
+        now = self._node.now
         for arm, (state, heard) in self._newest.items():
-            if now - heard > _SILENT:
+            if not -_SILENT <= now - heard <= _SILENT:
                 return Reason.of(ReasonKind.FRI_SILENT, arm=arm, source=f"the driver in {self._namespaces[arm]}")
-            if state.session_state != Session.COMMANDING_ACTIVE:
-                return Reason.of(
-                    ReasonKind.FRI_SESSION,
-                    arm=arm,
-                    session=_word(Session, state.session_state),
-                    quality=_word(Quality, state.connection_quality),
-                    safety=_word(Safety, state.safety_state),
-                    drives=_word(Drives, state.drive_state),
-                )
-            if state.client_command_mode != self._wanted:
-                asked, wanted = _word(CommandKind, state.client_command_mode), _word(CommandKind, self._wanted)
-                return Reason.of(ReasonKind.FRI_COMMAND_MODE, arm=arm, asked=asked, wanted=wanted)
+            if (fault := session_fault(arm, state, self._mode)) is not None:
+                return fault
         return None
 
-    def held(self) -> Array | None:
-        """Where the cabinets hold the arms, (nv,) [rad], which the first command has to equal; None: not known."""
-        return self._held.copy() if np.isfinite(self._held).all() else None
+    def held(self, q: Array) -> Array | None:
+        """Where the arms are held, which the next command has to equal, (nv,) [rad]; None: torques move them.
 
-    def _on_state(self, arm: str, state: Any) -> None:
-        self._newest[arm] = state, time.monotonic()
-        self._held[self._robot.arms[arm].joints] = state.ipo_joint_position
+        An arm of which nothing near its measured ``q`` (nv,) [rad] is known is held there.
+        """
+        if self._mode is not CommandMode.POSITION:
+            return None
+        held = q.copy()
+        for arm in self._namespaces:
+            joints = self._robot.arms[arm].joints
+            if np.abs(self._held[joints] - q[joints]).max() < _SAG:
+                held[joints] = self._held[joints]
+        return held
+
+    def begin(self) -> None:
+        """The next command is the first one after the controller was activated."""
+        self.withheld.clear()
+        for arm, (state, _) in self._newest.items():
+            if state.session_state != Session.COMMANDING_ACTIVE:
+                self.withheld.add(self._namespaces[arm])
+
+    def commanded(self, q: Array) -> None:
+        """``q`` (nv,) [rad] was sent."""
+        for arm, namespace in self._namespaces.items():
+            if namespace not in self.withheld:
+                joints = self._robot.arms[arm].joints
+                self._held[joints] = q[joints]
+
+    def _on_state(self, arm: str, topic: str, state: Any) -> None:
+        active, joints = state.session_state == Session.COMMANDING_ACTIVE, self._robot.arms[arm].joints
+        ipo = state.ipo_joint_position
+        if state.session_state not in list(Session) or (active and not np.isfinite(ipo).all()):
+            self._node.drop(topic, f"session_state {state.session_state}, ipo_joint_position {ipo}")
+            return
+        now = self._node.now
+        if arm in self._newest and now - self._newest[arm][1] > _SILENT:
+            self._held[joints] = np.nan  # the driver may have been started anew, and does not tell
+        if not active:
+            self._held[joints] = np.nan
+            self.withheld.add(self._namespaces[arm])
+        elif np.isnan(self._held[joints]).any():
+            self._held[joints] = ipo
+        self._newest[arm] = state, now
         torques = np.asarray(state.external_torque)
         if np.isfinite(torques).all():
-            self._torques[self._robot.arms[arm].joints] = torques
+            self._torques[joints] = torques
             if len(self._newest) == len(self._namespaces):
                 self._on_torques(self._torques.copy())
+
+
+def session_fault(arm: str, state: Any, mode: CommandMode) -> Reason | None:
+    """Why an arm in this state follows no commands of this mode, or None."""
+    if state.session_state != Session.COMMANDING_ACTIVE:
+        return Reason.of(
+            ReasonKind.FRI_SESSION,
+            arm=arm,
+            session=_word(Session, state.session_state),
+            quality=_word(Quality, state.connection_quality),
+            safety=_word(Safety, state.safety_state),
+            drives=_word(Drives, state.drive_state),
+        )
+    if state.client_command_mode != _WANTED[mode]:
+        asked, wanted = _word(CommandKind, state.client_command_mode), _word(CommandKind, _WANTED[mode])
+        return Reason.of(ReasonKind.FRI_COMMAND_MODE, arm=arm, asked=asked, wanted=wanted)
+    return None
 
 
 def _word(kind: type[IntEnum], value: int) -> str:

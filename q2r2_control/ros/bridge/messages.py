@@ -151,14 +151,27 @@ def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotSta
 def called_otherwise(names: tuple[str, ...], given: tuple[str, ...], others: tuple[str, ...]) -> dict[str, str]:
     """By each of an arm's joints the one of the ``given`` names that differs in its beginning; {} unless all have one.
 
-    A joint left_A1 may be lbr_A1 or A1 elsewhere: its last part tells, where it tells one only. Names that begin with
-    one of ``others``, the other arms, are those of the wrong arm, and none is taken then.
+    A joint left_A1 may be lbr_A1 or A1 elsewhere: its last part tells, where it tells one only. It may be left_joint_1
+    too, where names that are alike but for their number have all the numbers. Names that begin with one of ``others``,
+    the other arms, are those of the wrong arm, and none is taken then.
     """
     if any(name.startswith(f"{other}_") for name in given for other in others):
         return {}
     ends = {name: name.partition("_")[2] or name for name in names}
     found = {name: [one for one in given if one == end or one.endswith(f"_{end}")] for name, end in ends.items()}
-    return {name: ones[0] for name, ones in found.items()} if all(len(ones) == 1 for ones in found.values()) else {}
+    if all(len(ones) == 1 for ones in found.values()):
+        return {name: ones[0] for name, ones in found.items()}
+    numbers, alike = [_stem_and_number(name)[1] for name in names], dict[str, dict[str, str]]()
+    for one in given:
+        stem, number = _stem_and_number(one)
+        alike.setdefault(stem, {})[number] = one
+    whole = [ones for ones in alike.values() if ones.keys() == set(numbers) and len(ones) == len(names)]
+    return {name: whole[0][number] for name, number in zip(names, numbers, strict=True)} if len(whole) == 1 else {}
+
+
+def _stem_and_number(name: str) -> tuple[str, str]:
+    stem = name.rstrip("0123456789")
+    return stem, name[len(stem) :]
 
 
 @lru_cache(maxsize=64)  # publishers send the same names again and again

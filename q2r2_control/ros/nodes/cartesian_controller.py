@@ -68,9 +68,11 @@ class CartesianControllerNode(ManagedNode):
         drivers = self._output.driver_namespaces(robot)
         self._joints = JointIntake(self, robot, needs_external_torque=feels, told_by_drivers=bool(drivers))
         self._output.theirs = self._joints.theirs
+        self._drivers: LbrDrivers | None = None
         if drivers:
-            told = LbrDrivers(self, robot, drivers, self._output.drive.mode, self._joints.take_external)
+            self._drivers = told = LbrDrivers(self, robot, drivers, self._output.drive.mode, self._joints.take_external)
             self._joints.driver_fault, self._joints.driver_held = told.fault, told.held
+            self._output.withheld = told.withheld
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
         # A message with a bad number among good ones is another publisher's: no reason to bridge it.
@@ -145,7 +147,11 @@ class CartesianControllerNode(ManagedNode):
         step = self._loop.step(state, {}, now, dt, self._grippers.wanted, openings)
         self._grippers.answer()
         if step.reference is not None and step.command is not None and state is not None:
+            if self._drivers is not None and not self._commanding:
+                self._drivers.begin()
             self._output.send(step.command, state, now, decided)
+            if self._drivers is not None:
+                self._drivers.commanded(step.command.q)
             self._reference = step.reference
             self._feedback.publish(step.reference, state, now, dt, decided)
         elif self._commanding and state is not None:

@@ -23,6 +23,8 @@ from q2r2_control.teleop.arm_states import ArmState
 _ONE = "end all but one (a killed one counts for some seconds)"
 _START_CONTROLLER = "start the arm's controller, or set preset or ctrl_prefix to the one that runs"
 _START_HANDS = "start tcp_endpoint and connect the headset, or SimulationInput"
+# Its controllers keep their last command, and its hardware cannot be activated again.
+FRI_CURE = "start the application on the pendant, and the driver's launch file anew: it ends with each session"
 _BAD_STATES = (
     *(ReasonKind.NO_STATES_YET, ReasonKind.STATES_SILENT, ReasonKind.STATE_NOT_FINITE, ReasonKind.STATE_JUMPED),
     *(ReasonKind.BAD_JOINT_STATES, ReasonKind.NO_EXTERNAL_TORQUES),
@@ -37,11 +39,7 @@ _CURES = {
     ReasonKind.NO_TRANSFORM: "start what publishes that frame; parameters base_frame_id, world_frame_id",
     **dict.fromkeys((ReasonKind.HAND_SILENT, ReasonKind.HAND_UNKNOWN), _START_HANDS),
     **dict.fromkeys((ReasonKind.SEVERAL_PUBLISHERS, ReasonKind.FRAME_DISPUTED), _ONE),
-    **dict.fromkeys(
-        (ReasonKind.FRI_SESSION, ReasonKind.FRI_SILENT, ReasonKind.FRI_COMMAND_MODE),
-        "start the application on the pendant; then let the driver begin anew: ros2 control "
-        "set_hardware_component_state COMPONENT inactive, and active",
-    ),
+    **dict.fromkeys((ReasonKind.FRI_SESSION, ReasonKind.FRI_SILENT, ReasonKind.FRI_COMMAND_MODE), FRI_CURE),
     **dict.fromkeys(_BAD_STATES, "look at the robot's driver, and at joint_states_topic of cartesian_controller"),
 }
 # Whose sentences say what helps, as those of a stopped arm do.

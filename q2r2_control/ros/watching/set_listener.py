@@ -21,6 +21,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.monitoring import NodeStates, node_of
+from q2r2_control.ros.watching.lbr_drivers import DriverListener
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
 
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]
@@ -35,8 +36,9 @@ class WatchError(Q2R2Error):
 class SetListener:
     """Looks at the graph of one domain, and hears nodes that report on ``~/state``. Has to be spun."""
 
-    def __init__(self, node: Node, cell: Config) -> None:
+    def __init__(self, node: Node, cell: Config, drivers: bool = False) -> None:
         self._node, self._cell = node, cell
+        self._drivers = DriverListener(node, cell) if drivers else None
         self._states = NodeStates(node, self._note)
         self._sent: dict[tuple[str, str], deque[tuple[float, int]]] = {}  # node and topic: when it was told, how many
         self._topics: dict[str, tuple[str, ...]] = {}  # with their types
@@ -51,6 +53,8 @@ class SetListener:
             self._publishers[topic] = _names(node.get_publishers_info_by_topic(topic), own)
             self._subscribers[topic] = _names(node.get_subscriptions_info_by_topic(topic), own)
         self._states.look()
+        if self._drivers is not None:
+            self._drivers.look()
         found = (f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces())
         self._names = tuple(sorted(name for name in found if name != own))
 
@@ -66,7 +70,8 @@ class SetListener:
             for name, types in sorted(self._topics.items())
             if self._is_shown(name, members)
         )
-        return SetView(nodes, topics, self._names, arm_views(nodes, self._cell))
+        drivers = () if self._drivers is None else tuple(self._drivers.views)
+        return SetView(nodes, topics, self._names, arm_views(nodes, self._cell), drivers)
 
     def _note(self, name: str, state: dict[str, Any]) -> None:
         sent = state.get("sent")
@@ -97,9 +102,16 @@ class SetListener:
 
 
 def watch_set(
-    cell: Config, duration: float | None, show: Callable[[SetView], None], stop: Callable[[], bool]
+    cell: Config,
+    duration: float | None,
+    show: Callable[[SetView], None],
+    stop: Callable[[], bool],
+    drivers: bool = False,
 ) -> SetView:
-    """Listen for ``duration`` [s] or until ``stop``; ``show`` gets views. The last one. Raises :class:`WatchError`."""
+    """Listen for ``duration`` [s] or until ``stop``; ``show`` gets views. The last one. Raises :class:`WatchError`.
+
+    ``drivers``: KUKA drivers are listened to as well.
+    """
     set_up_middleware(os.environ)
     try:
         rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
@@ -107,7 +119,7 @@ def watch_set(
         raise WatchError(f"ROS does not start: {error}") from None
     try:
         node = Node(f"q2r2_watch_{os.getpid()}", enable_rosout=False, start_parameter_services=False)
-        listener, executor = SetListener(node, cell), SingleThreadedExecutor()
+        listener, executor = SetListener(node, cell, drivers), SingleThreadedExecutor()
         executor.add_node(node)
         begin = looked = time.monotonic()
         listener.look()

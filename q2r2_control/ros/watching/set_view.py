@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from q2r2_control.config.bindings import Action
@@ -93,12 +93,29 @@ class ArmView:
     why: str
 
 
+@dataclass(slots=True)
+class DriverView:
+    """A KUKA driver, as its topics are."""
+
+    arm: str
+    command: str  # topic of the arm's commands
+    states: dict[str, set[str]] = field(default_factory=dict)  # types that are published, by topic
+    takers: set[str] = field(default_factory=set)  # types that nodes take on the topics of commands
+    state: Any = None  # the newest LBRState
+    description: str = ""  # the newest URDF
+
+    @property
+    def namespace(self) -> str:
+        return self.command.rpartition("/command/")[0]
+
+
 @dataclass(frozen=True, slots=True)
 class SetView:
     nodes: tuple[NodeView, ...]
     topics: tuple[TopicView, ...]
     names: tuple[str, ...]  # of all nodes in the domain, one that runs twice twice
     arms: tuple[ArmView, ...]
+    drivers: tuple[DriverView, ...] = ()  # where they were listened to
 
     @property
     def others(self) -> tuple[str, ...]:
