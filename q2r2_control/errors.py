@@ -36,7 +36,9 @@ def shown(value: object, length: int = 60) -> str:
     return " ".join(repr(value).split())[:length]
 
 
-def check_kind(name: str, value: object, kind: type, allowed: str, error: type[Q2R2Error] = ConfigError) -> None:
+def check_kind(
+    name: str, value: object, kind: type | tuple[type, ...], allowed: str, error: type[Q2R2Error] = ConfigError
+) -> None:
     """Raise an ``error`` that says what is ``allowed`` unless ``value`` is of a ``kind``."""
     if not isinstance(value, kind):
         raise error(f"{name} = {shown(value)}: allowed: {allowed}")

@@ -109,6 +109,11 @@ def _rows(summary: RunSummary) -> Iterator[tuple[str, str]]:
     yield "input to command", _percentiles(summary.input_to_command_ms, "ms", 2)
     for name, arm in summary.arms.items():
         yield f"{name} arm", ", ".join(_arm_figures(arm))
+        if not arm.followed:
+            yield (
+                f"{name} arm at the end",
+                f"[red]{arm.end_error_mm:.0f} mm from its reference[/]: the tool did not follow",
+            )
         if arm.gripper_held_by is not None:
             yield f"{name} gripper held for", f"{arm.gripper_held_s:.2f} s, by {' | '.join(arm.gripper_held_by)}"
         if arm.object_held_s is not None:

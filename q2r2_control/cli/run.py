@@ -72,6 +72,7 @@ def run(
 
     A cell in which q2r2 check finds a fault is refused with the same line and exit code 2, unless --force is given.
     One with real cabinets that is not commissioned is refused too, unless --i-know is given.
+    Exit 1 where a tool is more than 100 mm from its reference at the end.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
     cell = load_config(config)
@@ -101,7 +102,10 @@ def run(
         record=record,
         notes=notes_of(task, operator, record),
     )
-    print_summary(run_cell(cell, options), json)
+    done = run_cell(cell, options)
+    print_summary(done, json)
+    if not all(arm.followed for arm in done.summary.arms.values()):
+        raise Exit(1)
 
 
 def demo(

@@ -9,7 +9,7 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.floor import FLOOR
+from q2r2_control.robot.near_pairs import remedy
 from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -40,15 +40,18 @@ def kept_by_objects(robot: Robot, settings: ControllerSettings) -> KeptDistances
     return _of_all_pairs(robot, settings)[1]
 
 
-def too_close_at_home(robot: Robot, kept: KeptDistances) -> list[str]:
-    """A line for each pair that is nearer at home than it has to be, the nearest first."""
+def too_close_at_home(robot: Robot, kept: KeptDistances, *, remedies: bool = False) -> list[str]:
+    """A line for each pair that is nearer at home than it has to be, the nearest first.
+
+    ``remedies``: with what to write into the cell's YAML, for which postures are sampled.
+    """
     pairs = zip(robot.distances(robot.home), kept.values.tolist(), kept.keys, strict=True)
     lines = []
     for pair, least, key in sorted(pairs, key=lambda found: found[0].distance):
         if pair.distance < least:
             apart = f"{pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart"
-            with_floor = FLOOR in (link_of(pair.name_a), link_of(pair.name_b))
-            hint = "; the key floor takes another height, or null for no floor" if with_floor else ""
+            names = pair.name_a, pair.name_b
+            hint = f"; {remedy(robot, names, pair.distance, least)}" if remedies else ""
             lines.append(f"home: {apart}; allowed: at least {key}, {1e3 * least:.1f} mm{hint}")
     return lines
 

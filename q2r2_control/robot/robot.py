@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,12 +16,14 @@ import pinocchio as pin
 from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
+from q2r2_control.robot.cell_parts import check_position
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.finger_bodies import sweep_fingers
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
 from q2r2_control.robot.held_objects import HeldObjects, held_objects
+from q2r2_control.robot.near_pairs import warning_at_home
 from q2r2_control.robot.pairs import (
     KnownParts,
     LinkClass,
@@ -36,6 +39,7 @@ from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.robot.urdf_parts import acceleration_limit
 from q2r2_control.types import Array
 
+_logger = logging.getLogger(__name__)
 _SAME_FRAME = 1e-3  # two frames that are one in two files differ by less [m], [rad]
 
 
@@ -139,15 +143,20 @@ class Robot:
 
     @classmethod
     def from_urdf(
-        cls, path_or_xml: str | os.PathLike[str], arms: Mapping[str, str], srdf: str | os.PathLike[str] | None = None
+        cls,
+        path_or_xml: str | os.PathLike[str],
+        arms: Mapping[str, str],
+        srdf: str | os.PathLike[str] | None = None,
+        home: Mapping[str, float] | None = None,
     ) -> Robot:
         """A robot from any URDF, given as file or text.
 
         ``arms`` maps an arm's name to its tool frame, a link of the URDF. Other joints that an arm carries move its
-        fingers, and the links that these hang on are its tool. No link is known as an obstacle. Home is 0 for each
-        joint, or the middle of its range where 0 is outside. ``srdf`` (file or text) says which pairs need no watching;
-        without one, links of one arm that overlap at home are taken to overlap by construction. Raises
-        :class:`RobotError`.
+        fingers, and the links that these hang on are its tool. No link is known as an obstacle. ``home`` has
+        positions by joint [rad or m]; other joints are at 0, or in the middle of their range where 0 is outside.
+        ``srdf`` (file or text) says which pairs need no watching; without one, links of one arm that overlap at home
+        are taken to overlap by construction. Pairs at home that would hold the arm up, or overlap there only, are
+        named in a warning. Raises :class:`RobotError`.
         """
         text, where, folder = _text_of(path_or_xml, "URDF text")
         urdf = parse_urdf(text, where, folder)
@@ -158,9 +167,10 @@ class Robot:
             raise RobotError(f"{where}: {given}; expected a mapping such as {{'left': 'left_tool_frame'}}")
         if len(set(arms.values())) < len(arms):
             raise RobotError(f"{where}: arms = {shown(arms, 200)}: allowed: a tool frame of its own for each arm")
-        limits = {joint.get("name", ""): joint_limits(joint) for joint in urdf.findall("joint")}
-        home = {name: 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2 for name, (lower, upper) in limits.items()}
-        return cls(urdf, exclusions, dict(arms), home, where)
+        robot = cls(urdf, exclusions, dict(arms), _home_of(urdf, home or {}, where), where)
+        if (warning := warning_at_home(robot)) is not None:
+            _logger.warning(warning)
+        return robot
 
     def capped_acceleration(self, cap: float) -> Array:
         """Acceleration limits (nv,) with ``cap`` [rad/s^2] for every joint: the smaller one of it and the robot's.
@@ -268,6 +278,23 @@ class Robot:
                     "the cell's tool, which mode filtered moves; "
                     f"allowed: a frame at the tool, or null with {tool} on /tf"
                 )
+
+
+def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[str, float]:
+    """Position of every joint. Raises :class:`RobotError` that begins with ``where`` for a wrong one of ``given``."""
+    check_kind(f"{where}: home", given, Mapping, "positions by joint [rad or m]", RobotError)
+    joints = {joint.get("name", ""): joint for joint in urdf.findall("joint") if joint.get("type") != "fixed"}
+    for name, position in given.items():
+        if name not in joints:
+            raise RobotError(f"{where}: home: no joint {shown(name)} that moves; joints: {', '.join(joints)}")
+        check_kind(f"{where}: home of {name}", position, (float, int, np.number), "a number [rad or m]", RobotError)
+        try:
+            check_position(joints[name], float(position), f"home of {name}")
+        except ConfigError as error:
+            raise RobotError(f"{where}: {error}") from None
+    limits = {name: joint_limits(joint) for name, joint in joints.items()}
+    usual = {name: 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2 for name, (lower, upper) in limits.items()}
+    return usual | {name: float(position) for name, position in given.items()}
 
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:

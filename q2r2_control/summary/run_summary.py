@@ -21,6 +21,7 @@ from q2r2_control.wording import sentence
 
 _BINS = 100_000
 EVENTS_KEPT = 10_000  # the newest ones; a broken button can cause more
+_FOLLOWED = 100.0  # as far as the impedance lets a tool be pushed with a force that grows [mm]
 _REST = 1e-3  # [rad/s]
 
 
@@ -106,6 +107,12 @@ class ArmSummary:
     slip_deg_max: float = 0.0
     yielded_mm_max: float = 0.0  # largest displacement of the target by the admittance, in position mode
     yielded_deg_max: float = 0.0
+    end_error_mm: float | None = None  # of the measured tool from the reference's at the end; None: not measured
+
+    @property
+    def followed(self) -> bool:
+        """Whether the tool was where it should be at the end, or as near as arms are that yield."""
+        return self.end_error_mm is None or self.end_error_mm <= _FOLLOWED
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +234,13 @@ class RunStatistics:
         if samples:
             self._latency.add(now - max(max(sample.pose_stamp, sample.inputs_stamp) for sample in samples))
 
+    def _end_error(self, arm: str) -> float | None:
+        if self._newest is None or not np.isfinite(self._newest.reference.q).all():
+            return None
+        led = self.robot.tool_pose(self._newest.reference.q, arm)
+        error = 1e3 * float(np.linalg.norm(self._newest.tools[arm].translation - led.translation))
+        return error if math.isfinite(error) else None
+
     def summary(self, wall_time: float) -> RunSummary:
         """The run so far, which took ``wall_time`` [s], as if no tick had been late."""
         robot, control = self.robot, self._control
@@ -240,7 +254,9 @@ class RunStatistics:
             tick_us=self._compute_times.percentiles(1e-6),
             lateness_us=NOTHING_MEASURED,
             input_to_command_ms=self._latency.percentiles(1e-3),
-            arms={name: arm.finished() for name, arm in self._arms.items()},
+            arms={
+                name: replace(arm.finished(), end_error_mm=self._end_error(name)) for name, arm in self._arms.items()
+            },
             min_distance_mm=1e3 * self._distance if self._distance < math.inf else None,
             closest_pair=self._pair if self._distance < math.inf else None,
             max_velocity_ratio=float((self._speed / (control.velocity_scale * robot.velocity_limit)).max()),

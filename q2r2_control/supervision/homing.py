@@ -250,7 +250,7 @@ def preflight_faults(
         for name, q, least, most in zip(robot.joint_names, robot.home, lower, upper, strict=True)
         if not least <= q <= most
     ]
-    too_close = too_close_at_home(robot, kept_distances(robot, settings))
+    too_close = too_close_at_home(robot, kept_distances(robot, settings), remedies=True)
     faults += too_close
     if controller is not None and not too_close:  # a pair that is too close leaves no certificate, and says more
         controller.reset(robot.home)

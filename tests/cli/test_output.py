@@ -133,3 +133,9 @@ def test_lost_pictures_are_said_with_the_reason() -> None:
     ended = replace(recorded, pictures_fault="no pictures: no OpenGL")
     assert recording_line(ended).endswith("[red]3 lost[/]: no pictures: no OpenGL)")
     assert recording_line(replace(recorded, pictures=0, lost_pictures=0)).endswith("(100 ticks)")
+
+
+def test_a_tool_that_did_not_follow_is_said(summary: RunSummary) -> None:
+    assert "did not follow" not in text_of(summary)
+    away = replace(summary, arms=summary.arms | {"left": replace(summary.arms["left"], end_error_mm=256.4)})
+    assert "256 mm from its reference: the tool did not follow" in text_of(away)

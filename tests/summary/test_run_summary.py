@@ -18,7 +18,7 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import EVENTS_KEPT, NOTHING_MEASURED, Histogram, RunStatistics, TorqueSummary
-from q2r2_control.types import SIDES, ArmTarget, StepReport, StepStatus
+from q2r2_control.types import SIDES, ArmTarget, StepReport, StepStatus, moved_by
 from tests.support.processes import cell
 from tests.viewer.conftest import tick_at
 
@@ -30,7 +30,7 @@ KEYS = (
 )
 ARM_KEYS = (
     "engaged_s position_error_mm_rms rotation_error_deg_rms gripper_changes gripper_held_s gripper_held_by "
-    "object_held_s slip_mm_max slip_deg_max yielded_mm_max yielded_deg_max"
+    "object_held_s slip_mm_max slip_deg_max yielded_mm_max yielded_deg_max end_error_mm"
 )
 REPORT = StepReport(StepStatus.OK, (), (), ("left_a", "right_b"), 0.2, True, False, 0.0, 1e-5)
 
@@ -222,3 +222,14 @@ def test_any_number_can_be_added_and_one_beyond_the_range_counts_as_the_largest(
     for value in (-1e300, 0.2, 0.5, 3.0, 1e300):
         histogram.add(value)
     assert histogram.percentiles(1e-3).p50 == pytest.approx(1e303)
+
+
+@pytest.mark.parametrize(("off", "followed"), [(0.0, True), (0.256, False)])
+def test_an_arm_whose_tool_is_far_from_its_reference_at_the_end_did_not_follow(
+    statistics: RunStatistics, off: float, followed: bool
+) -> None:
+    led = {arm: statistics.robot.tool_pose(statistics.robot.home, arm) for arm in SIDES}
+    add(statistics, tools=led | {"left": moved_by(led["left"], np.array([0.0, off, 0.0]))}, q=statistics.robot.home)
+    arms = statistics.summary(1.0).arms
+    assert arms["left"].end_error_mm == pytest.approx(1e3 * off, abs=1e-6)
+    assert (arms["left"].followed, arms["right"].followed) == (followed, True)

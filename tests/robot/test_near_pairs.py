@@ -1,0 +1,91 @@
+"""Pairs that are too near at home are named, with what to change, where a robot is made and where a cell is checked."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, ControllerSettings, Robot
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.description import load_description
+from q2r2_control.supervision.homing import preflight_faults
+
+NEVER = '<disable_collisions link1="wrist_1_link" link2="wrist_3_link" reason="Never"/>'
+KEPT = ControllerSettings.model_validate({"pairs": [{"pair": ("wrist_1_link", "wrist_3_link"), "distance": 0.003}]})
+
+
+@pytest.fixture(scope="module")
+def ur5() -> Path:
+    return load_description("example-robot-data:ur5").file
+
+
+def made(file: Path, caplog: pytest.LogCaptureFixture, **options: object) -> tuple[Robot, list[str]]:
+    """A robot of this file, and what was said of it."""
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        robot = Robot.from_urdf(file, {"left": "ee_link"}, **options)  # type: ignore[arg-type]
+    return robot, [record.getMessage() for record in caplog.records]
+
+
+def test_own_links_that_hold_an_arm_up_are_named_with_lines_that_let_it_go(
+    ur5: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot, (said,) = made(ur5, caplog)
+    assert "wrist_1_link and wrist_3_link are 10.6 mm apart and 10.6 mm at most in 50 other postures" in said
+    assert f"srdf='<robot name=\"ur5\">{NEVER}</robot>'" in said
+    assert "ControllerSettings(pairs=[{'pair': ('wrist_1_link', 'wrist_3_link'), 'distance': 0.003}])" in said
+    assert "home=" not in said, "no other home parts them"
+    assert "forearm_link" not in said, "these overlap by construction"
+    errors = []
+    for settings in (ControllerSettings(), KEPT):
+        controller = CartesianController(robot, settings)
+        controller.reset(np.array([0.0, -1.2, 1.5, -0.3, 1.0, 0.0]))
+        goal = controller.tool_pose("left") * pin.SE3(np.eye(3), np.array([0.05, 0.05, 0.0]))
+        for _ in range(2000):
+            controller.step({"left": goal}, 0.001)
+        errors.append(np.linalg.norm(controller.tool_pose("left").translation - goal.translation))
+    assert errors[1] < 1e-3 < errors[0]
+
+
+def test_an_srdf_that_names_the_pair_leaves_nothing_to_say(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+    both = NEVER + '<disable_collisions link1="forearm_link" link2="wrist_2_link" reason="Never"/>'
+    assert made(ur5, caplog, srdf=f'<robot name="ur5">{both}</robot>')[1] == []
+
+
+def test_a_pair_that_can_part_is_a_matter_of_home(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bent = {"elbow_joint": 2.9, "shoulder_lift_joint": -1.2}
+    robot, (said,) = made(ur5, caplog, home=bent)
+    assert robot.home[1:3].tolist() == [-1.2, 2.9]
+    assert "home={joint: position, ...} where pairs are apart" in said
+    assert "base_link and wrist_2_link are 10.8 mm apart;" in said
+    assert "base_link and forearm_link overlap, and are not watched, though they can part" in said
+
+
+def test_a_start_that_is_refused_names_what_to_write_into_the_cell(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+    robot, _ = made(ur5, caplog)
+    (fault,) = preflight_faults(robot, ControllerSettings(), None)
+    assert fault == (
+        "home: wrist_1_link_0 and wrist_3_link_0 are 10.6 mm apart; allowed: at least min_distance, 20.0 mm; "
+        "they hardly part anywhere; to change: control.pairs: [{pair: [wrist_1_link, wrist_3_link], distance: 0.003}], "
+        f"or a file for srdf, such as q2r2 check --pairs writes, with the line {NEVER}"
+    )
+    assert preflight_faults(robot, KEPT, None) == ()
+
+
+@pytest.mark.parametrize(
+    ("home", "said"),
+    [
+        ({"elbow": 0.1}, "home: no joint 'elbow' that moves; joints: shoulder_pan_joint"),
+        ({"elbow_joint": 90}, "allows -3.14159 .. 3.14159 rad; 90 degrees are 1.571 rad"),
+        ({"elbow_joint": "up"}, "home of elbow_joint = 'up': allowed: a number"),
+        ([0.0] * 6, "allowed: positions by joint"),
+    ],
+)
+def test_a_home_that_is_none_is_refused(ur5: Path, home: object, said: str) -> None:
+    with pytest.raises(RobotError, match=r".*") as error:
+        Robot.from_urdf(ur5, {"left": "ee_link"}, home=home)  # type: ignore[arg-type]
+    assert said in str(error.value)
