@@ -21,8 +21,8 @@ _NEAR = 1e-9  # relative, of limits
 _UNEVEN = 0.004  # relative, of the times between ticks, which follow their clock
 _REST = 1e-4  # of commands [rad/s]
 _NOTICED = 0.15  # a session's end, by states that may be late, or by a silence of 0.1 s [s]
-_RESTARTED = 0.6  # a driver's process, at the earliest [s]
-_ALLOWANCE = 0.05  # after the braking time [s]
+_RESTARTED = 1.0  # a driver's process, at the earliest [s]
+_ALLOWANCE = 0.1  # after the braking time of the certified stop, which braking may be a little slower than [s]
 _LONGEST_STOP = 1.0  # from a session's end on [s]
 _STUCK = 20.0  # a session that does not begin to move in this time never will [s]
 

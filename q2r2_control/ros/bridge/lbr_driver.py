@@ -18,6 +18,7 @@ from q2r2_control.types import Array, CommandMode
 
 STATE_TOPICS = "lbr_state", "state"  # of a driver, in releases for Jazzy and in those of 2024
 _SILENT = 0.5  # a driver that has been heard and says nothing for longer is gone [s]
+_RESTART = 1.0  # a driver's process takes longer to be started anew [s]
 _SAG = 0.01  # of measured joints below what is commanded; beyond it somebody else has moved the arm [rad]
 _WANTED = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
@@ -95,7 +96,7 @@ class LbrDrivers:
             self._node.drop(topic, f"session_state {state.session_state}, ipo_joint_position {ipo}")
             return
         now = self._node.now
-        if arm in self._newest and now - self._newest[arm][1] > _SILENT:
+        if arm in self._newest and now - self._newest[arm][1] > _RESTART:
             self._held[joints] = np.nan  # the driver may have been started anew, and does not tell
         if not active:
             self._held[joints] = np.nan
