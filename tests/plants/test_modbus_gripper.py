@@ -94,6 +94,21 @@ def test_one_that_is_active_is_not_activated_so_that_it_keeps_what_it_holds(
     assert simulated.written == [(9, 0, 0, 0, 255, 128)]
 
 
+def test_one_that_loses_its_power_while_it_is_activated_is_activated_again(
+    connect: Connect, simulated: SimulatedGripper
+) -> None:
+    simulated.activation = 10**9
+    gripper = connect()
+    gripper.command(0.4)
+    eventually(lambda: simulated.written == [ACTIVATE])
+    simulated.stop()
+    simulated.activation = 3
+    simulated.power_off()
+    simulated.start()
+    measures(gripper, 0.4)
+    assert simulated.activations == 1
+
+
 @pytest.mark.parametrize(
     ("fault", "begins"),
     [
