@@ -120,7 +120,8 @@ class ModbusGripper:
                 self._client.close()
                 self.status = self._measured = None
                 self._sent, pause = b"", _AGAIN
-                self._tell(f"does not answer at {self._where}", f", and is asked again every {_AGAIN:g} s: {error}")
+                self._tell(f"does not answer at {self._where}", f", and is asked again every {_AGAIN:g} s")
+                _logger.debug("%s gripper: %s", self._arm, error)
             self._closing.wait(max(pause, 0.0))
         self._client.close()
 

@@ -94,6 +94,21 @@ def test_one_that_is_active_is_not_activated_so_that_it_keeps_what_it_holds(
     assert simulated.written == [(9, 0, 0, 0, 255, 128)]
 
 
+def test_one_that_loses_its_power_while_it_is_activated_is_activated_again(
+    connect: Connect, simulated: SimulatedGripper
+) -> None:
+    simulated.activation = 10**9
+    gripper = connect()
+    gripper.command(0.4)
+    eventually(lambda: simulated.written == [ACTIVATE])
+    simulated.stop()
+    simulated.activation = 3
+    simulated.power_off()
+    simulated.start()
+    measures(gripper, 0.4)
+    assert simulated.activations == 1
+
+
 @pytest.mark.parametrize(
     ("fault", "begins"),
     [
@@ -152,8 +167,8 @@ def test_a_lost_connection_is_said_once_and_comes_back_with_the_newest_opening(
     simulated.start()
     measures(gripper, 0.6)
     assert simulated.written == [(9, 0, 0, 102, 255, 128)]
-    (said,) = warnings(caplog)
-    assert said.startswith(f"left gripper: does not answer at 127.0.0.1:{simulated.port}, unit 9, and is asked again")
+    lost = f"does not answer at 127.0.0.1:{simulated.port}, unit 9, and is asked again every 0.01 s"
+    assert warnings(caplog) == [f"left gripper: {lost}"]
 
 
 def test_an_opening_is_not_known_any_more_before_the_gripper_counts_as_lost(

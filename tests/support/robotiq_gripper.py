@@ -13,7 +13,7 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 UNIT = 9
-_ACTIVATION, _STEP = 3, 25  # how often it is read until it is active, and its position's steps
+_STEP = 25  # of its position
 
 
 class SimulatedGripper:
@@ -22,7 +22,7 @@ class SimulatedGripper:
     def __init__(self, framer: FramerType = FramerType.SOCKET) -> None:
         self._framer, self.port = framer, 0
         self.silent = False  # it takes what comes and answers nothing
-        self.reads = 0
+        self.reads, self.activation = 0, 3  # how often it was read, and is until it is active
         self.power_off()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
@@ -34,7 +34,7 @@ class SimulatedGripper:
         self.position, self.fault = getattr(self, "position", 120), 0
         self.object_at = 255  # which the fingers cannot close beyond
         self.request: tuple[int, ...] = (0,) * 6
-        self._waits = _ACTIVATION
+        self._waits = self.activation
 
     def activate(self) -> None:
         """Be active from an earlier run."""
@@ -90,7 +90,7 @@ class SimulatedGripper:
     def _take(self, request: tuple[int, ...]) -> None:
         self.written.append(request)
         if not request[0] & 1:
-            self._waits, self.fault = _ACTIVATION, 0
+            self._waits, self.fault = self.activation, 0
         self.request = request
 
     def _move(self) -> tuple[int, ...]:
