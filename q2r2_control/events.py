@@ -160,6 +160,12 @@ class ReasonKind(StrEnum):
         "{joint} is {deviation:.3f} rad from its reference for {time:.1f} s; "
         "allowed: {allowed:g} rad for {allowed_time:g} s",
     )
+    TOO_HEAVY = (
+        "too_heavy",
+        "{joint} is {deviation:.3f} rad from its reference for {time:.1f} s, "
+        "and gravity alone asks it for {needed:.1f} Nm; "
+        "allowed: {allowed:g} rad for {allowed_time:g} s, and its torque limit, {limit:g} Nm",
+    )
     TOO_CLOSE = (
         "too_close",
         "measured: {pair} are {distance:.4f} m apart; "

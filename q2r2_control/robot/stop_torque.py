@@ -53,6 +53,13 @@ class StopTorque:
     bearable: float  # share of all these decelerations that asks no joint for more than it has in any of the postures
 
 
+def joints_that_cannot_hold(robot: Robot, q: Array) -> dict[str, tuple[float, float]]:
+    """Joints that gravity at ``q`` (nv,) asks for more than they have: the torque, and the joint's limit [Nm or N]."""
+    gravity = np.abs(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))
+    over = np.flatnonzero(gravity > robot.torque_limit)
+    return {robot.joint_names[j]: (float(gravity[j]), float(robot.torque_limit[j])) for j in over}
+
+
 def stop_torques(robot: Robot, acceleration: Array, postures: int = 5000, seed: int = 0) -> tuple[StopTorque, ...]:
     """One :class:`StopTorque` an arm, for decelerations (nv,) [rad/s^2] of the joints."""
     random, data = np.random.default_rng(seed), robot.model.createData()

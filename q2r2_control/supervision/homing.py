@@ -14,6 +14,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.stop_torque import joints_that_cannot_hold
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.types import Array, Reference
 
@@ -241,7 +242,8 @@ def preflight_faults(
 ) -> tuple[str, ...]:
     """One line for each reason why ``robot`` should not start at home; empty for a cell that may run.
 
-    Position limits are checked with their margin, and every monitored pair against the distance that it keeps. The
+    Position limits are checked with their margin, gravity against torque limits, and every monitored pair against the
+    distance that it keeps. The
     ``controller`` has to know a certified stop at home, where it is left reset; None: it moves nothing here.
     """
     lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
@@ -249,6 +251,11 @@ def preflight_faults(
         f"home: {name} = {q:g}; allowed: {least:g} .. {most:g} rad, position_margin included"
         for name, q, least, most in zip(robot.joint_names, robot.home, lower, upper, strict=True)
         if not least <= q <= most
+    ]
+    faults += [
+        f"home: {name} needs {needed:.1f} Nm against gravity alone; allowed: its torque limit, {limit:g} Nm; "
+        "to change: another home, or the model's torque limits and masses"
+        for name, (needed, limit) in joints_that_cannot_hold(robot, robot.home).items()
     ]
     too_close = too_close_at_home(robot, kept_distances(robot, settings), remedies=True)
     faults += too_close

@@ -20,6 +20,7 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.stop_torque import joints_that_cannot_hold
 from q2r2_control.supervision.homing import Homing
 from q2r2_control.supervision.joint_watch import ExternalArms, JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
@@ -166,13 +167,21 @@ class Supervisor:
         away, state = self._watch.deviates(reference.q, now), self._watch.state
         if self._external is None or state is None:
             if away is not None:
-                self.stop(away)
+                self.stop(self._with_gravity(away, reference))
         elif too_close := self._external.too_close(state):
             self.stop(too_close)
         else:
             holding = [arm for arm in self._robot.arms if not self.targets.follows(arm)]
             if behind := away or self._external.left_behind(state, holding, now):
                 self.start_over(behind, now)
+
+    def _with_gravity(self, away: Reason, reference: Reference) -> Reason:
+        """The same, with the torque against gravity where that is more than the joint has."""
+        torques = joints_that_cannot_hold(self._robot, reference.q).get(away.detail["joint"])
+        if torques is None:
+            return away
+        needed, limit = torques
+        return Reason.of(ReasonKind.TOO_HEAVY, **away.detail, needed=needed, limit=limit)
 
     def pause(self, paused: bool) -> None:
         """Hold all arms where they come to rest, or allow new streams of targets."""

@@ -8,6 +8,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
@@ -184,6 +185,17 @@ def test_a_home_outside_a_limit_is_named_with_what_is_allowed(robot: Robot, monk
     monkeypatch.setattr(robot, "home", home)
     (fault,) = [line for line in preflight_faults(robot, SETTINGS, None) if "left_A2" in line]
     assert fault == "home: left_A2 = 2.09; allowed: -2.0844 .. 2.0844 rad, position_margin included"
+
+
+def test_a_home_that_a_joint_cannot_hold_against_gravity_is_a_fault(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gravity = np.abs(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home))
+    limits = robot.torque_limit.copy()
+    limits[1] = gravity[1] - 0.2
+    monkeypatch.setattr(robot, "torque_limit", limits)
+    (fault,) = preflight_faults(robot, SETTINGS, None)
+    assert fault.startswith(f"home: left_A2 needs {gravity[1]:.1f} Nm against gravity alone; allowed: its torque limit")
 
 
 def test_every_pair_closer_than_min_distance_is_named_once_and_nearest_first(robot: Robot) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -11,6 +13,7 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings, TargetStream
 from q2r2_control.types import Array, RobotState
+from q2r2_control.wording import sentence
 from tests.supervision.conftest import STRICT
 from tests.support.reasons import kinds
 
@@ -158,6 +161,19 @@ def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(world: 
     assert np.allclose(world.q, rest, atol=1e-9)
     assert [kinds(event) for event in world.supervisor.events].count("joint_states: states_silent") == 1
     assert kinds(world.supervisor.events[1]) == "joint_states: states_silent"
+
+
+def test_a_joint_that_cannot_hold_against_gravity_is_stopped_with_the_torque(
+    world: World, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(robot, "torque_limit", np.full_like(robot.torque_limit, 1e-3))
+    tool = world.engage()
+    world.blocked = True
+    world.run(2.0, raised(tool, 0.2))
+    assert kinds(world.supervisor.fault) == "too_heavy"
+    fault = world.supervisor.fault
+    assert fault is not None
+    assert re.search(r"gravity alone asks it for \d+\.\d Nm; .* its torque limit, 0\.001 Nm$", sentence(fault))
 
 
 def test_arms_that_do_not_follow_their_reference_are_stopped_until_a_reset(world: World) -> None:
