@@ -217,7 +217,9 @@ def virtual_lbrs(
         cell = lbr_cell(Path(folder), **control)
         given = dict(nodes_of(cell)[0].parameters) | {"use_sim_time": True}
         arguments = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
-        rclpy.init(args=["--ros-args", *arguments], domain_id=domain)
+        rclpy.init(
+            args=["--ros-args", *arguments], domain_id=domain, signal_handler_options=rclpy.SignalHandlerOptions.NO
+        )
         try:
             with patch.object(joint_outputs, "WatchedPublisher", DirectPublisher):
                 node = CartesianControllerNode()
