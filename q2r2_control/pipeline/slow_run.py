@@ -6,6 +6,7 @@ Its controller knows 5 % of the joints' speeds as their limits, so that nothing 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from threading import Thread
@@ -19,7 +20,7 @@ from q2r2_control.config.bindings import Action, BindingSettings
 from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import PlantError
-from q2r2_control.events import ReasonKind
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.played import EvenSampling, PlayedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
@@ -88,6 +89,7 @@ class SlowRun:
         self._newest: Moment | None = None
         self._rest: Moment  # since which the arms rest
         self._moments: list[Moment] | None = None  # of a motion that goes on
+        self._lost: Reason | None = None  # why the arms ceased to be commanded in it
 
     def __enter__(self) -> SlowRun:
         self._thread.start()
@@ -148,6 +150,7 @@ class SlowRun:
         return self._end()
 
     def _begin(self) -> None:
+        self._moments = self._lost = None
         self._wait_for_sessions()
         assert self._newest is not None
         self._rest, self._moments = self._newest, [self._newest]
@@ -187,6 +190,8 @@ class SlowRun:
         )
         self._newest = moment
         if self._moments is not None:
+            if self._phase is not Phase.ACTIVE and self._lost is None:  # a session may be back before anybody looks
+                self._lost = self._pipeline.supervisor.fault
             self._moments.append(moment)
             moved = np.abs((moment.q - self._rest.q, moment.reference - self._rest.reference)).max()
             if moved > _STILL:
@@ -201,13 +206,14 @@ class SlowRun:
         return 0.0 if self._newest is None else self._newest.now
 
     def _wait(self, until: Callable[[], bool]) -> None:
-        end, was_active = None, self._phase is Phase.ACTIVE
-        while not until():
-            lost = was_active and self._phase is not Phase.ACTIVE
-            if end is None and self._newest is not None:
+        end = math.inf
+        while True:
+            if end == math.inf and self._newest is not None:
                 end = self._now + _PATIENCE
-            if lost or self.is_over or (end is not None and self._now > end):
+            if self._lost is not None or self.is_over or self._now > end:
                 self._fail(f"not done within {_PATIENCE:g} s")
+            if until():
+                return
             time.sleep(_LOOKS)
 
     def _fail(self, otherwise: str) -> None:
@@ -216,7 +222,7 @@ class SlowRun:
             time.sleep(_LOOKS)
         if self.is_over:
             raise PlantError(str(self._error)) from self._error
-        fault = self._pipeline.supervisor.fault
+        fault = self._lost or self._pipeline.supervisor.fault
         raise PlantError(otherwise if fault is None else sentence(fault))
 
 
