@@ -208,12 +208,14 @@ class SlowRun:
     def _wait(self, until: Callable[[], bool]) -> None:
         end = math.inf
         while True:
-            if end == math.inf and self._newest is not None:
-                end = self._now + _PATIENCE
-            if self._lost is not None or self.is_over or self._now > end:
-                self._fail(f"not done within {_PATIENCE:g} s")
+            if self._lost is not None or self.is_over:
+                self._fail("the run has ended")
             if until():
                 return
+            if self._now > end:
+                self._fail(f"not done within {_PATIENCE:g} s")
+            if end == math.inf and self._newest is not None:
+                end = self._now + _PATIENCE
             time.sleep(_LOOKS)
 
     def _fail(self, otherwise: str) -> None:
