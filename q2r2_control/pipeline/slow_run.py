@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from threading import Thread
 from types import TracebackType
 from typing import NamedTuple
@@ -171,7 +172,8 @@ class SlowRun:
 
     def _run(self, realtime: bool) -> None:
         try:
-            with real_time():
+            # A loop that never sleeps may not come first: it would leave nobody a processor.
+            with real_time() if realtime else nullcontext():
                 self._pipeline.run(realtime=realtime)
         except BaseException as error:
             self._error = error

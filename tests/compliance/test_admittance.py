@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from pydantic import ValidationError
 
 from q2r2_control.compliance.admittance import Admittance, estimate_wrench, oscillate
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import AdmittanceSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
+from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 from q2r2_control.verification.contract import Contract
@@ -208,7 +208,7 @@ def test_reset_forgets_wrench_and_displacement() -> None:
 
 @pytest.mark.parametrize("key", ["stiffness", "rotation_stiffness", "damping_ratio", "mass", "inertia"])
 def test_settings_that_would_drift_or_add_energy_are_refused(key: str) -> None:
-    with pytest.raises(ValidationError, match=key):
+    with pytest.raises(ConfigError, match=key):
         AdmittanceSettings(**{key: 0.0})
 
 

@@ -8,11 +8,11 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from pydantic import ValidationError
 
 from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings, WallSettings
+from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.finger_bodies import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
@@ -189,7 +189,7 @@ def test_numbers_that_are_not_finite_give_no_torque_and_no_distance(bad: float) 
 
 @pytest.mark.parametrize("key", ["stiffness", "damping_ratio", "maximum_force"])
 def test_settings_that_would_not_push_apart_or_would_add_energy_are_refused(key: str) -> None:
-    with pytest.raises(ValidationError, match=key):
+    with pytest.raises(ConfigError, match=key):
         WallSettings(**{key: 0.0})
 
 

@@ -84,7 +84,7 @@ def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the
         pytest.param({"tool": {"frame": "link_0"}}, "no movable joint", id="a tool frame that nothing moves"),
         pytest.param({"tool": {"model": "iiwa7"}}, "occur in the arm as well", id="a tool with the arm's names"),
         pytest.param({"home": [0] * 6}, "6 value(s), expected 7: A1, A2, A3", id="too few home values"),
-        pytest.param({"home": [0, 2.5, *[0] * 5]}, "home[1] = 2.5: A2 allows -2.0944 .. 2.0944 rad", id="home outside"),
+        pytest.param({"home": [0, 2.5, *[0] * 5]}, "2.5: joint A2 allows -2.0944 .. 2.0944 rad", id="home outside"),
         pytest.param({"home": [0, 20.0, *[0] * 5]}, "2.0944 rad; 20 degrees are 0.3491 rad", id="home in degrees"),
         pytest.param({"home": [0, 200.0, *[0] * 5]}, "joint A2 allows -2.0944 .. 2.0944 rad", id="home far outside"),
         pytest.param({"gripper": FINGERS}, "no such finger joint; allowed: none", id="fingers without a hand"),
