@@ -178,6 +178,13 @@ class CabinetServer:
         self._serial += 1
         heapq.heappush(self._queue, (t, self._serial, act))
 
+    def _after(self, late: float, t: float, act: Callable[[], None]) -> None:
+        """``act`` at once, or ``late`` after ``t`` [s]. An answer that has come may not queue behind a late message."""
+        if late > 0.0:
+            self._at(t + late, act)
+        else:
+            act()
+
     def _send(self, arm: str, due: float, tick: Callable[[float], None]) -> None:
         cabinet, opened, client = self.cabinets[arm], self._sockets[arm], self._clients[arm]
         # A client that commands is not to have less time because this process was late.
@@ -194,7 +201,7 @@ class CabinetServer:
                 cabinet.inputs[gripper.input] = self.cell.plant.gripper_openings()[arm]
         datagram = write_monitoring(cabinet.send(due))
         for late in self._ways(self._network.duplicate):
-            self._at(due + late, lambda: _sent(opened, datagram, client))
+            self._after(late, due, lambda: _sent(opened, datagram, client))
         self._sent_at[arm] = now = time.monotonic() - self._began
         # The period stays on its grid: messages of a moment in which this process was late follow one another sooner.
         following = max(due + cabinet.settings.period, now - (_LONGEST_STALL if commands else 0.0))
@@ -209,7 +216,7 @@ class CabinetServer:
                 return
             if source[:2] == self._clients[arm]:
                 for late in self._ways(0.0):
-                    self._at(now + late, partial(self.cabinets[arm].receive, datagram))
+                    self._after(late, now, partial(self.cabinets[arm].receive, datagram))
 
     def _ways(self, duplicate: float) -> Iterable[float]:
         """How late each copy of a datagram is [s]; none: it is lost."""

@@ -72,3 +72,30 @@ def test_cabinets_that_were_late_catch_up_as_fast_as_they_are_answered(fri_confi
     finally:
         plant.close()
     assert caught_up
+
+
+def test_an_answer_that_came_while_the_cabinets_stood_still_is_heard(fri_config: Config, robot: Robot) -> None:
+    cell, plant = SimulatedArms(robot, fri_config), FriPlant.from_config(robot, fri_config)
+    settings = {arm: settings_of(robot, arm, CommandKind.POSITION, 2, PERIOD) for arm in SIDES}
+    clients = {str(arm): ("127.0.0.1", its.port) for arm, its in fri_config.fri.items()}
+    server = CabinetServer(cell, settings, clients, {}, Network())
+    rounds, missed = 0, [0]  # answers, at the end of each time
+
+    def until(now: float) -> bool:
+        nonlocal rounds
+        rounds += all(one.session >= Session.COMMANDING_WAIT for one in server.cabinets.values())
+        if rounds % 20 == 1:
+            missed.append(sum(one.missed for one in server.cabinets.values()))
+            time.sleep(3.0 * PERIOD)
+        return len(missed) > 20 or now > PATIENCE
+
+    for cabinet in server.cabinets.values():
+        cabinet.start_overlay()
+    serving = threading.Thread(target=server.run, args=(until,))
+    serving.start()
+    try:
+        plant.reset()
+        serving.join()
+    finally:
+        plant.close()
+    assert missed[-1] < 5, "before, a third of the answers was missed"
