@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -19,6 +17,7 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.events import Reason
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.plants.fri.wire import Monitoring, in_words
+from q2r2_control.process.machine_notes import machine_notes, network_notes
 from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, real_time, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, CommandMode
@@ -72,24 +71,6 @@ def cabinet_report(arm: str, heard: Sequence[tuple[Monitoring, float]], lost: in
     )
 
 
-def machine_notes() -> list[str]:
-    """Reasons why this computer may answer late, each with what helps."""
-    notes = []
-    with real_time() as refused:
-        if refused:
-            notes.append(refused)
-    if sys.platform == "linux" and _text("/sys/kernel/realtime") != "1":
-        notes.append("the kernel has no PREEMPT_RT: answers may be late by milliseconds; install a real-time kernel")
-    governor = _text("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
-    if governor not in ("", "performance"):
-        notes.append(f"the processors' governor is {governor}; cpupower frequency-set -g performance")
-    return notes
-
-
-def _text(file: str) -> str:
-    return Path(file).read_text().strip() if Path(file).exists() else ""
-
-
 @dataclass(frozen=True, slots=True)
 class Heard:
     """Messages of the cabinets over some seconds, and how they were answered."""
@@ -117,7 +98,8 @@ def listen(plant: FriPlant, duration: float, asked: Callable[[], bool] = lambda:
     plant.due(now)
     fault, answers = plant.fault(), np.array(plant.answer_times)
     reports = [cabinet_report(arm, messages, plant.cell.sessions[arm].lost) for arm, messages in heard.items()]
-    notes = [f"{arm}: gripper {gripper.in_words()}" for arm, gripper in plant.grippers.items()] + machine_notes()
+    notes = [f"{arm}: gripper {gripper.in_words()}" for arm, gripper in plant.grippers.items()]
+    notes += machine_notes() + network_notes(plant.addresses)
     for its in reports:
         if its.jitter_ms_p99 > _LARGE_JITTER * its.period_ms:
             notes.append(f"{its.arm}: messages come uneven by over half a period: the network, or a busy computer")

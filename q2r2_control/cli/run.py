@@ -16,10 +16,24 @@ from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
 from q2r2_control.cli.fri import rehearsal
-from q2r2_control.cli.output import DEMO_CONFIG, ConfigFile, Json, Operator, Task, notes_of, positive, print_report, say
+from q2r2_control.cli.output import (
+    DEMO_CONFIG,
+    ConfigFile,
+    Json,
+    Operator,
+    Task,
+    as_json_text,
+    notes_of,
+    notice_of_compiling,
+    positive,
+    print_progress,
+    print_report,
+    say,
+)
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
+from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, AssemblyTask, tasks_named
+from q2r2_control.demo.trials import try_tasks
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import options_of
 from q2r2_control.inputs.headset import HeadsetServer
@@ -123,6 +137,9 @@ def demo(
     headless: Headless = False,
     human: Human = False,
     seed: Seed = 0,
+    seeds: Annotated[
+        int | None, Option(min=1, help="Try each task so often with --human, in simulated time; count successes.")
+    ] = None,
     record: Record = None,
     rt: RealTime = False,
     json: Json = False,
@@ -131,12 +148,20 @@ def demo(
 
     Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
     With --record, whether all succeeded is in the recording, of which q2r2 report makes plots.
+    With --seeds, exit code 1 where a task succeeded in less than 19 of 20 trials.
     """
     _check_times(fast, rt)
     if plant not in ("mujoco", "fri"):
         raise ConfigError(f"--plant {plant!r:.40}: allowed: mujoco, fri")
     mode = mode or (CommandMode.POSITION if plant == "fri" else CommandMode.TORQUE)
     chosen = tasks_named(tasks or ("handover", "stack"))
+    if seeds is not None:
+        unfit = {"--plant fri": plant == "fri", "--viewer": viewer, "--record": record is not None, "--rt": rt}
+        unfit |= {"--duration": duration is not None, "--seed": seed != 0}
+        if refused := [option for option, given in unfit.items() if given]:
+            raise ConfigError(f"{refused[0]} cannot be used with --seeds")
+        _try_tasks(chosen, mode, seeds, json)
+        return
     trajectory = "+".join(task.name for task in chosen)
     options = RunOptions(
         name="demo",
@@ -161,6 +186,18 @@ def demo(
         done = run_cell(load_config(DEMO_CONFIG), options)
     print_summary(done, json)
     if not all(task.succeeded for task in done.tasks):
+        raise Exit(1)
+
+
+def _try_tasks(tasks: tuple[AssemblyTask, ...], mode: CommandMode, seeds: int, json: bool) -> None:
+    with notice_of_compiling():
+        reports = try_tasks(load_config(DEMO_CONFIG), tasks, mode, seeds, print_progress)
+    if json:
+        print(as_json_text(reports))
+    for report in () if json else reports:
+        reasons = "".join(f"; seed {seed}: {reason}" for seed, reason in report.failures.items())
+        print(f"{report.task}: {report.succeeded} of {report.trials}{reasons}")
+    if not all(report.is_reliable for report in reports):
         raise Exit(1)
 
 

@@ -15,7 +15,7 @@ class LoopClock:
     """Ticks on a grid of ``period`` [s], in real time or as fast as they come, which is never late."""
 
     def __init__(self, period: float, realtime: bool) -> None:
-        self._period, self._realtime = period, realtime
+        self.period, self._realtime = period, realtime
         self._ticks = 0
         self.start = self.now = self._due = time.monotonic() if realtime else 0.0  # [s]
         self._wall_start = time.perf_counter()
@@ -26,23 +26,23 @@ class LoopClock:
         """Let the next tick come; returns the time since the last one [s], however long that was."""
         self._ticks += 1
         if not self._realtime:
-            self.now = self._ticks * self._period
-            return self._period
-        self._due += self._period
+            self.now = self._ticks * self.period
+            return self.period
+        self._due += self.period
         rest = self._due - time.monotonic()
         if rest > 0.0:
             time.sleep(rest)
         before, self.now = self.now, time.monotonic()
         late = self.now - self._due
         self.lateness.add(late)
-        self.overruns += late > self._period
+        self.overruns += late > self.period
         # Late wake-ups do not add up, since ticks are due on a grid; ticks that were missed are not made up for.
-        self._due = max(self._due, self.now - self._period)
+        self._due = max(self._due, self.now - self.period)
         return max(self.now - before, _SHORTEST_DT)
 
     def after(self, duration: float) -> bool:
         """Whether ``duration`` [s] is over; half a period early, so that rounding adds or loses no tick."""
-        return self.now - self.start >= duration - 0.5 * self._period
+        return self.now - self.start >= duration - 0.5 * self.period
 
     def read(self) -> float:
         """Time of this very moment; in simulated time that of the tick [s]."""

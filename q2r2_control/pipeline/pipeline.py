@@ -38,6 +38,7 @@ from q2r2_control.wording import sentence
 STOPPING = "stopping"  # state of every arm while the run ends
 _STOP_ALLOWANCE = 1.0  # after full braking, for an arm that still recovers into its limits [s]
 _REST = 1e-6  # of the reference [rad/s]
+_LONGEST_TORQUE = 0.005  # that one torque may push for: in 0.1 s it drives the arms into each other [s]
 _logger = logging.getLogger(__name__)
 
 
@@ -181,6 +182,8 @@ class Pipeline:
             self.supervisor.events.clear()
         else:
             self.loop.wait(self._state)
+        is_torque = self.drive.mode is CommandMode.TORQUE
+        self._longest_advance = max(_LONGEST_TORQUE, self._clock.period) if is_torque else LONGEST_DT
         self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop)
         self._operator = OperatorSide(self.teleop, self.input, self.supervisor, self.controller, self.requests)
         self.teleop.marks.recorded = self._recorder.keeps_episodes
@@ -241,7 +244,7 @@ class Pipeline:
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
         # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
-        advance = min(gap, LONGEST_DT)
+        advance = min(gap, self._longest_advance)
         self.plant.advance(advance)
         self._plant_clock.give(advance)
         tick = Tick(

@@ -95,6 +95,14 @@ def test_a_fast_run_prints_one_json_object_and_nothing_else_and_repeats_itself()
     assert summaries[0] == summaries[1]
 
 
+@pytest.mark.parametrize("option", ["--plant fri", "--viewer", "--rt", "--duration 4", "--seed 3", "--record rec"])
+def test_trials_of_a_demo_refuse_what_is_for_one_run(option: str) -> None:
+    done = q2r2("demo", "grasp", "--seeds", "2", *option.split())
+    assert done.exit_code == 2
+    assert f"{option.split()[0]}" in done.stderr
+    assert "cannot be used with --seeds" in done.stderr
+
+
 @pytest.mark.slow
 def test_the_demo_says_of_each_task_whether_it_succeeded_and_so_does_its_exit_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

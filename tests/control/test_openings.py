@@ -116,7 +116,7 @@ def test_a_reset_forgets_openings(controller: CartesianController) -> None:
 @pytest.mark.parametrize(
     ("arm", "interval", "complaint"),
     [
-        ("middle", (0.0, 1.0), "no such arm; arms: left, right"),
+        ("middle", (0.0, 1.0), "no arm 'middle'; arms: left, right"),
         ("left", (0.6, 0.5), "the least first"),
         ("left", (float("nan"), 1.0), "finite numbers"),
         ("left", (0.0, float("inf")), "finite numbers"),

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.tick import Tick
 from tests.support.processes import cell, speed
@@ -30,3 +31,23 @@ def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
             action()
 
     return listener
+
+
+class FreezingClock(LoopClock):
+    """Simulated time in which the loop now and then stands still."""
+
+    freeze = 0.0  # before the next tick [s]
+
+    def wait(self) -> float:
+        gap, self.freeze = self.period + self.freeze, 0.0
+        self.now += gap
+        return gap
+
+
+class FreezingLoop(Pipeline):
+    def make_clock(self, realtime: bool) -> LoopClock:
+        return FreezingClock(1.0 / self.config.loop_rate_hz, realtime)
+
+    def freeze(self, duration: float) -> None:
+        assert isinstance(self._clock, FreezingClock)
+        self._clock.freeze = duration

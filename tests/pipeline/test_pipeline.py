@@ -12,9 +12,11 @@ from q2r2_control.config.control import ContactPair
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.types import SIDES, HandInputs, HandSample
-from tests.pipeline.loops import pipeline
+from tests.pipeline.loops import FreezingLoop, pipeline
 from tests.support.processes import Watch, assert_torque_bounds, cell, changes, speed
 
 
@@ -205,3 +207,14 @@ def test_ten_thousand_ticks_of_hostile_samples_break_no_limit_and_raise_nothing(
     }
     for arm in SIDES:
         assert_begins_at_the_tool(watch, arm)
+
+
+def test_a_torque_that_is_not_renewed_in_time_does_not_throw_a_simulated_arm() -> None:
+    config = cell().model_copy(update={"loop_rate_hz": 500.0})
+    robot = Robot.from_config(config)
+    hands = ScriptedInput("circle", frequency_hz=0.5)
+    loop = FreezingLoop(config, robot, hands, MujocoPlant(robot, config), "torque")
+    watch = Watch(loop)
+    loop.listeners.append(lambda tick: loop.freeze(0.09 if len(watch.ticks) % 100 == 0 else 0.0))
+    loop.run(3.0, realtime=False)
+    assert max(np.abs(tick.state.q - tick.reference.q).max() for tick in watch.ticks) < 0.02

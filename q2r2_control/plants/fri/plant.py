@@ -59,6 +59,11 @@ class FriPlant:
     def from_config(cls, robot: Robot, config: Config) -> FriPlant:
         return cls(robot, config)
 
+    @property
+    def addresses(self) -> list[str]:
+        """Of the cabinets."""
+        return [cabinet.address for cabinet in self._cabinets.values()]
+
     def begin(self, mode: CommandMode) -> None:
         """Commands of this ``mode`` are to come after the next :meth:`reset`."""
         self._mode = mode

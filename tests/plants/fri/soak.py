@@ -11,7 +11,6 @@ import numpy as np
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
 from q2r2_control.plants.fri.cabinet import CabinetSettings, Trip
@@ -20,6 +19,7 @@ from q2r2_control.plants.fri.wire import CommandKind, Safety, write_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, Array, CommandMode, HandInputs, HandSample
+from tests.pipeline.loops import FreezingLoop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 ACCELERATION = 4.0  # of the reference [rad/s^2]
@@ -47,26 +47,6 @@ class PressingHands(ScriptedInput):
         if self.pipeline.teleop.engaged[hand]:
             self._since[hand] = now
         return HandInputs(button_lower=(now - self._since[hand]) % 0.3 > 0.2)
-
-
-class FreezingClock(LoopClock):
-    """Simulated time in which the loop now and then stands still."""
-
-    freeze = 0.0  # before the next tick [s]
-
-    def wait(self) -> float:
-        gap, self.freeze = self._period + self.freeze, 0.0
-        self.now += gap
-        return gap
-
-
-class FreezingLoop(Pipeline):
-    def make_clock(self, realtime: bool) -> LoopClock:
-        return FreezingClock(1.0 / self.config.loop_rate_hz, realtime)
-
-    def freeze(self, duration: float) -> None:
-        assert isinstance(self._clock, FreezingClock)
-        self._clock.freeze = duration
 
 
 def make_loop(

@@ -19,7 +19,8 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, CommandMode
-from tests.plants.fri.soak import FreezingLoop, Soak, make_loop
+from tests.pipeline.loops import FreezingLoop
+from tests.plants.fri.soak import Soak, make_loop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 

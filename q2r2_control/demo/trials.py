@@ -1,0 +1,77 @@
+"""Tasks tried again and again in simulated time, each by hands that tremble in their own way."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+
+from q2r2_control.config.cell import Config
+from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, tasks_named
+from q2r2_control.errors import PlantError
+from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import CommandMode
+
+_WANTED = 0.95  # of the trials
+
+
+@dataclass(frozen=True, slots=True)
+class TrialReport:
+    """Trials of one task, of seeds 0, 1, ..."""
+
+    task: str
+    trials: int
+    failures: dict[int, str]  # by seed, what fell short
+
+    @property
+    def succeeded(self) -> int:
+        return self.trials - len(self.failures)
+
+    @property
+    def is_reliable(self) -> bool:
+        """Whether 19 of 20 trials succeed, or more."""
+        return self.succeeded >= _WANTED * self.trials
+
+
+def try_tasks(
+    config: Config,
+    tasks: Sequence[AssemblyTask],
+    mode: CommandMode,
+    seeds: int,
+    progress: Callable[[str], None] = lambda line: None,
+) -> list[TrialReport]:
+    """Try each task by itself ``seeds`` times, in as many processes as there are processors."""
+    jobs = [(task.name, seed) for task in tasks for seed in range(seeds)]
+    failures: dict[str, dict[int, str]] = {task.name: {} for task in tasks}
+    ignored = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, and this one ends the others
+    workers = min(os.cpu_count() or 1, len(jobs))
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=signal.signal, initargs=ignored)
+    try:
+        for (task, seed), failure in zip(jobs, pool.map(partial(try_task, config, mode), jobs), strict=True):
+            if failure:
+                failures[task][seed] = failure
+            progress(f"{task}, seed {seed}: {failure or 'succeeded'}")
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return [TrialReport(task, seeds, failed) for task, failed in failures.items()]
+
+
+def try_task(config: Config, mode: CommandMode, job: tuple[str, int]) -> str:
+    """Try a task of a name with a seed; returns what fell short, empty where it succeeded."""
+    name, seed = job
+    robot = Robot.from_config(config)
+    plant = MujocoPlant(robot, config)
+    pipeline = Pipeline(config, robot, ScriptedInput(name, human=True, seed=seed), plant, mode)
+    pipeline.listeners.append(watch := TaskWatch(tasks_named([name]), plant, robot, config))
+    try:
+        pipeline.run(trajectory_named(name).duration, realtime=False)
+    except PlantError as error:
+        return str(error)
+    return watch.results()[0].reason

@@ -1,0 +1,68 @@
+"""Reasons why this computer may answer a robot late, each with the command that helps."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from q2r2_control.process.scheduling import real_time
+
+_LEAST_MTU = 1500  # that takes every message of a cabinet in one piece [bytes]
+_GATHERS = re.compile(r"^(Adaptive RX: on|rx-usecs: *[1-9]\d*)", re.MULTILINE)
+_RING = re.compile(r"^RX:\s*(\d+)", re.MULTILINE)
+
+
+def machine_notes() -> list[str]:
+    """Of the kernel, its scheduler and the processors."""
+    notes = []
+    with real_time() as refused:
+        if refused:
+            notes.append(refused)
+    if sys.platform == "linux" and _text("/sys/kernel/realtime") != "1":
+        notes.append("the kernel has no PREEMPT_RT: answers may be late by milliseconds; install a real-time kernel")
+    governor = _text("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    if governor not in ("", "performance"):
+        notes.append(f"the processors' governor is {governor}; cpupower frequency-set -g performance")
+    return notes
+
+
+def network_notes(addresses: Iterable[str]) -> list[str]:
+    """Of the network cards by which ``addresses`` are reached. This computer's own addresses have none."""
+    if sys.platform != "linux":
+        return []
+    routes = (_output("ip", "-j", "route", "get", address) for address in sorted(set(addresses)))
+    cards = {json.loads(route)[0]["dev"] for route in routes if route}
+    notes = [note for card in sorted(cards) for note in card_notes(card)]
+    if any(Path(f"/sys/class/net/{card}/device").exists() for card in cards) and not _output("ethtool", "--version"):
+        notes.append("how the network card gathers interrupts is not known: install ethtool")
+    return notes
+
+
+def card_notes(card: str) -> list[str]:
+    """Of one network card, as far as ``ethtool`` tells."""
+    notes = []
+    mtu = _text(f"/sys/class/net/{card}/mtu")
+    if mtu and int(mtu) < _LEAST_MTU:
+        notes.append(f"{card}: MTU {mtu}, so messages may come in pieces; ip link set {card} mtu {_LEAST_MTU}")
+    if found := _GATHERS.search(_output("ethtool", "-c", card)):
+        notes.append(f"{card} gathers messages ({found[0].lower()}); ethtool -C {card} adaptive-rx off rx-usecs 0")
+    ring = [int(size) for size in _RING.findall(_output("ethtool", "-g", card))]  # the greatest, and today's
+    if len(ring) == 2 and ring[1] < ring[0]:
+        notes.append(f"{card}: a ring buffer of {ring[1]} messages; ethtool -G {card} rx {ring[0]}")
+    return notes
+
+
+def _text(file: str) -> str:
+    return Path(file).read_text().strip() if Path(file).exists() else ""
+
+
+def _output(*words: str) -> str:
+    """Of a command; empty where it is not there or fails."""
+    try:
+        return subprocess.run(words, capture_output=True, text=True, check=True, timeout=5).stdout
+    except (OSError, subprocess.SubprocessError):
+        return ""

@@ -1,0 +1,57 @@
+"""Hints about a network card, of what ``ip`` and ``ethtool`` print."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.process.machine_notes import card_notes, machine_notes, network_notes
+
+QUIET = "Adaptive RX: off  TX: off\nrx-usecs: 0\nrx-frames: 1\n"
+RING = "Pre-set maximums:\nRX:\t\t4096\nTX:\t\t4096\nCurrent hardware settings:\nRX:\t\t{}\nTX:\t\t256\n"
+
+
+@pytest.fixture
+def prints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Puts an ``ethtool`` that prints ``gathers`` and ``rings`` in the place of a computer's."""
+
+    def put(gathers: str = QUIET, rings: str = RING.format(4096)) -> None:
+        (tmp_path / "-c").write_text(gathers)
+        (tmp_path / "-g").write_text(rings)
+        (tool := tmp_path / "ethtool").write_text(f'#!/bin/sh\nexec cat "{tmp_path}/$1"\n')
+        tool.chmod(0o755)
+        monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+
+    return put
+
+
+def test_a_card_that_sends_every_message_on_at_once_needs_nothing(prints: Callable[..., None]) -> None:
+    prints()
+    assert card_notes("lo") == []
+
+
+@pytest.mark.parametrize("gathers", ["Adaptive RX: off  TX: off\nrx-usecs: 50\n", "Adaptive RX: on  TX: off\n"])
+def test_a_card_that_gathers_messages_is_named_with_the_command(prints: Callable[..., None], gathers: str) -> None:
+    prints(gathers)
+    (note,) = card_notes("lo")
+    assert note.endswith("ethtool -C lo adaptive-rx off rx-usecs 0")
+
+
+def test_a_card_with_a_short_ring_buffer_is_named_with_the_command(prints: Callable[..., None]) -> None:
+    prints(rings=RING.format(256))
+    assert card_notes("lo") == ["lo: a ring buffer of 256 messages; ethtool -G lo rx 4096"]
+
+
+def test_a_card_that_tells_nothing_gives_no_note(prints: Callable[..., None]) -> None:
+    prints("rx-usecs: n/a\n", "RX:\t\tn/a\nRX:\t\tn/a\n")
+    assert card_notes("no_such_card") == []
+
+
+def test_this_computers_own_addresses_need_no_card() -> None:
+    assert network_notes(["127.0.0.1", "::1"]) == []
+
+
+def test_every_note_about_this_computer_says_what_helps() -> None:
+    assert all("; " in note for note in machine_notes())
