@@ -14,12 +14,12 @@ from typing import Annotated
 from packaging.requirements import Requirement
 from typer import Argument, Exit
 
-from q2r2_control.cli.fri_check import machine_notes
 from q2r2_control.cli.output import DEMO_CONFIG, Json, as_json_text
 from q2r2_control.cli.ros import print_findings
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.inputs.listener import access_lines
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
+from q2r2_control.process.machine_notes import machine_notes, network_notes
 from q2r2_control.ros.launch.build import interface_packages
 from q2r2_control.ros.watching.findings import Finding, error
 
@@ -46,7 +46,8 @@ def doctor(
         "headset": "; ".join(access_lines(cell.headset.host, cell.headset.port, cell.headset.networks)),
     }
     findings = [*_packages(requires(_PACKAGE) or ()), *_ros(), *_ports(cell), *_display(os.environ)]
-    findings += [Finding(False, *_what_and_cure(note)) for note in machine_notes()]
+    notes = machine_notes() + network_notes(cabinet.address for cabinet in cell.fri.values())
+    findings += [Finding(False, *_what_and_cure(note)) for note in notes]
     lacks = any(finding.stops_arms for finding in findings)
     if json:
         print(as_json_text({**facts, "findings": findings, "lacks": lacks}))
@@ -101,5 +102,5 @@ def _display(environment: Mapping[str, str]) -> Iterator[Finding]:
 
 
 def _what_and_cure(note: str) -> tuple[str, str]:
-    what, _, cure = note.rpartition("; ")
-    return what or note, cure
+    what, _, cure = note.rpartition("; " if "; " in note else ": ")
+    return what, cure
