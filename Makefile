@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak test-lerobot lint bench docs picture soak clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak test-lerobot lint bench docs picture soak wheel release-check clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -81,6 +81,26 @@ docs: setup
 # The README's moving picture, docs/demo.webp.
 picture: setup
 	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python docs/moving_picture.py
+
+# What is published, under dist/.
+wheel: setup
+	$(BIN)/python -m pip install --quiet --editable '.[release]'
+	rm -rf dist
+	$(BIN)/python -m build
+
+# The metadata; then the wheel in a fresh environment, used from an empty folder.
+FRESH := build/fresh
+
+release-check: wheel
+	$(BIN)/twine check --strict dist/*
+	rm -rf $(FRESH)
+	$(PYTHON) -m venv $(FRESH)/venv
+	$(FRESH)/venv/bin/python -m pip install --quiet dist/*.whl
+	mkdir $(FRESH)/empty
+	cd $(FRESH)/empty && ../venv/bin/q2r2 doctor
+	cd $(FRESH)/empty && ../venv/bin/q2r2 check config/dual_iiwa7.yaml
+	cd $(FRESH)/empty && ../venv/bin/q2r2 run config/dual_panda.yaml --fast --headless --duration 3
+	cd $(FRESH)/empty && ../venv/bin/q2r2 demo --fast --headless
 
 soak: setup
 	$(BIN)/q2r2 soak

@@ -32,7 +32,8 @@ IMPORTS = {
     "pillow": "PIL",
     "protobuf": "google",
 }
-WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core"}  # come with pin, mujoco, lerobot and pydantic
+# These come with pin, mujoco, lerobot, pydantic and matplotlib.
+WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core", "packaging"}
 NODES = set(ROS.rglob("*.py"))
 OTHERS = set((ROOT / PACKAGE).rglob("*.py")) - NODES
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("[qb]*/**/*.md")])

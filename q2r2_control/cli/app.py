@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 from q2r2_control.cli.bench import bench, soak
 from q2r2_control.cli.check import check
 from q2r2_control.cli.commission import commission
+from q2r2_control.cli.doctor import doctor
 from q2r2_control.cli.fri import fri_cabinet
 from q2r2_control.cli.fri_check import fri_check
 from q2r2_control.cli.fri_mounts import fri_mounts
@@ -52,7 +53,6 @@ class ErrorHandlingGroup(TyperGroup):
 
 app = typer.Typer(
     cls=ErrorHandlingGroup,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="Bimanual VR teleoperation: a headset's hands move two robot arms, safely.",
@@ -63,6 +63,7 @@ app.command(epilog="Example: q2r2 replay recordings/20260101-120000-dual_iiwa7 -
 app.command(epilog="Example: q2r2 judge recordings --json")(judge)
 app.command(epilog="Example: q2r2 report recordings --output report.html")(report)
 app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf")(check)
+app.command(epilog="Example: q2r2 doctor my_cell.yaml")(doctor)
 app.command(epilog="Example: q2r2 commission my_cell.yaml --duration 60")(commission)
 app.command("fri-cabinet", epilog="Example: q2r2 fri-cabinet config/dual_iiwa7_fri.yaml --period 2")(fri_cabinet)
 app.command("fri-check", epilog="Example: q2r2 fri-check config/dual_iiwa7_fri.yaml --duration 60")(fri_check)

@@ -151,19 +151,20 @@ def doctor(
         print(as_json_text({**facts, "nodes": nodes, "others": others, "findings": findings, "stops_arms": stops}))
     else:
         running = {"nodes": ", ".join(nodes) or "none of a set runs", "others": ", ".join(others) or "none"}
-        _print({**facts, **running}, findings)
+        print_findings({**facts, **running}, findings)
     sys.stdout.flush()
     raise Exit(int(stops))
 
 
-def _print(facts: dict[str, str], findings: list[Finding]) -> None:
+def print_findings(facts: dict[str, str], findings: list[Finding], worst: str = "stops arms") -> None:
+    """Print facts and findings, first those that stop arms, which are called ``worst``."""
     console = Console(highlight=False, soft_wrap=True)
     for name, value in facts.items():
         console.print(Text(f"{name:<11} {value}"))
     if not findings:
         console.print(Text("nothing is wrong", style="green"))
     for finding in sorted(findings, key=lambda finding: not finding.stops_arms):
-        label, colour = ("stops arms", "red") if finding.stops_arms else ("warning", "yellow")
+        label, colour = (worst, "red") if finding.stops_arms else ("warning", "yellow")
         console.print(Text(f"{label:<11} ", style=colour) + Text(finding.what, style="default"))
         console.print(Text(f"{'':<11} cure: {finding.cure}"))
 

@@ -13,6 +13,8 @@ from q2r2_control.errors import ConfigError, check_kind
 EQUAL = "equal"
 _LIVE = "live"  # marks a setting that may change while a controller runs
 LiveFloat = Annotated[float, _LIVE]
+_Weight = Annotated[float, Field(ge=0, le=1)]
+Weights = tuple[_Weight, _Weight, _Weight]
 Distance = Annotated[float, Field(ge=0, le=0.2)]  # [m]
 ObjectDistance = Annotated[
     float, Field(ge=-0.05, le=0.2)
@@ -105,6 +107,8 @@ class ControllerSettings(StrictModel):
 
     position_gain: LiveFloat = Field(8.0, gt=0, le=50, description="[1/s]")
     rotation_gain: LiveFloat = Field(8.0, gt=0, le=50, description="[1/s]")
+    position_weights: Weights = Field((1.0, 1.0, 1.0), description="of a tool's error along the world's x, y, z")
+    rotation_weights: Weights = Field((1.0, 1.0, 1.0), description="of its error about its own x, y, z; 0: left free")
     max_linear_speed: LiveFloat = Field(1.0, gt=0, le=3, description="tool speed [m/s]")
     max_angular_speed: LiveFloat = Field(2.5, gt=0, le=10, description="tool speed [rad/s]")
     linear_deceleration: LiveFloat = Field(2.0, gt=0, le=50, description="planned when approaching a target [m/s^2]")

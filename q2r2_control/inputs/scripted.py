@@ -17,6 +17,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.assembly import HOME, WORKS, HandWork, WayPoint, WayPoints, minimum_jerk
 from q2r2_control.inputs.played import EvenSampling, HeadsetSampling, PlayedInput, SampleTiming
+from q2r2_control.robot.compose import compose
 from q2r2_control.types import SIDES, Array, HandInputs
 
 PRESS_DURATION = 0.15  # [s]
@@ -145,6 +146,9 @@ HANDS_AT_REST = {
 _DROPOUT_PROBABILITY = 0.005
 _DIFFERENCE = 1e-4  # half a central difference of the ideal pose [s]
 DEFAULT_TRAJECTORY = "meet"
+_FULL_LENGTH = (
+    1.12  # of an arm that does the motions as they are written, an iiwa 7's, from its first joint to its last [m]
+)
 
 
 class ScriptedInput(PlayedInput):
@@ -152,6 +156,7 @@ class ScriptedInput(PlayedInput):
 
     ``human`` hands are those of :class:`HeadsetSampling`, with tremor and dropouts. Others are sampled at an even rate,
     and received each later by up to ``jitter`` [s]. Circle, line and rotate repeat ``frequency_hz`` times a second.
+    Hands go ``scale`` times as far as the trajectory is written, and turn as far as it is.
     Raises :class:`ConfigError` for an unknown trajectory or hand, and for a number that is not allowed.
     """
 
@@ -167,11 +172,13 @@ class ScriptedInput(PlayedInput):
         rate_hz: float = 75.0,
         frequency_hz: float = 0.25,
         jitter: float = 0.0,
+        scale: float = 1.0,
     ) -> None:
         for hand in hands:
             if hand not in SIDES:
                 raise ConfigError(f"scripted hand {hand!r}: allowed are {', '.join(SIDES)}")
-        for name, value, limit in (("rate_hz", rate_hz, 2000.0), ("frequency_hz", frequency_hz, 2.0)):
+        limits = (("rate_hz", rate_hz, 2000.0), ("frequency_hz", frequency_hz, 2.0), ("scale", scale, 1.0))
+        for name, value, limit in limits:
             if not 0.0 < value <= limit:
                 raise ConfigError(f"scripted input: {name} = {value!r}: allowed is above 0 and up to {limit:g}")
         if not 0.0 <= jitter <= 0.5 / rate_hz:
@@ -179,7 +186,7 @@ class ScriptedInput(PlayedInput):
                 f"scripted input: jitter = {jitter!r}: allowed is 0 .. {0.5 / rate_hz:.3g}, half a sample"
             )
         self._trajectory = trajectory_named(trajectory)
-        self._frequency = frequency_hz
+        self._frequency, self._scale = frequency_hz, scale
 
         def sampling(hand: str) -> SampleTiming:
             if not human:
@@ -197,8 +204,12 @@ class ScriptedInput(PlayedInput):
         seed: int = 0,
         fast: bool = False,
     ) -> ScriptedInput:
-        """``fast`` changes nothing: samples come by the time that passes, simulated or not."""
-        return cls(trajectory, human=human, seed=seed)
+        """Motions as large as the shortest arm of the cell is long, if that is shorter than an iiwa 7.
+
+        ``fast`` changes nothing: samples come by the time that passes, simulated or not.
+        """
+        shortest = min(compose(config).arm_lengths().values())
+        return cls(trajectory, human=human, seed=seed, scale=min(shortest / _FULL_LENGTH, 1.0))
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """How ``hand`` ideally moves at ``t`` [s], in the axes that its poses have [m/s, rad/s]."""
@@ -210,4 +221,4 @@ class ScriptedInput(PlayedInput):
     def _ideal(self, hand: str, t: float) -> pin.SE3:
         displacement, turn = self._trajectory.displacement(hand, t, self._frequency)
         home = HANDS_AT_REST[hand]
-        return pin.SE3(pin.exp3(turn) @ home.rotation, home.translation + displacement)
+        return pin.SE3(pin.exp3(turn) @ home.rotation, home.translation + self._scale * displacement)

@@ -11,13 +11,16 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from q2r2_control.config.arms import PoseConfig, check_models
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import ArmAssembly, Model, check_position, load_model
+from q2r2_control.robot.description import LinkTree
 from q2r2_control.robot.floor import FLOOR, floor_link
 from q2r2_control.robot.pairs import KnownParts, exclusions_of_file
-from q2r2_control.robot.pinocchio_models import lock_joints, resting_position
+from q2r2_control.robot.pinocchio_models import joint_origin, lock_joints, resting_position
 from q2r2_control.robot.urdf_parts import (
     WORLD,
     fixed_joint,
@@ -44,6 +47,17 @@ class ComposedCell:
     home: dict[str, float]  # every movable joint's position: arms at home, grippers open
     obstacles: tuple[str, ...]  # link names
     parts: KnownParts  # what its links are
+
+    def arm_lengths(self) -> dict[str, float]:
+        """Of each arm, the way along its joints from the first to the last [m]."""
+        tree = LinkTree(ET.fromstring(self.urdf), self.name)
+        lengths = {}
+        for side, frame in self.tool_frames.items():
+            joints = [tree.joint_to[link] for link in tree.path(frame)[1:]]
+            moving = [index for index, joint in enumerate(joints) if joint.get("type") != "fixed"]
+            between = joints[moving[0] + 1 : moving[-1] + 1]
+            lengths[side] = sum(float(np.linalg.norm(joint_origin(joint).translation)) for joint in between)
+        return lengths
 
 
 def compose(config: Config) -> ComposedCell:

@@ -19,10 +19,8 @@ from tests.support.external_cell import external_text, robot_text
 
 
 @pytest.mark.parametrize("file", sorted(SHIPPED.glob("*.yaml")), ids=lambda file: file.stem)
-def test_every_shipped_cell_loads_and_composes(file: Path) -> None:
-    config = load_config(file)
-    assert config.name == file.stem
-    assert Robot.from_config(config).model.nv == 14
+def test_every_shipped_cell_loads_and_is_called_as_its_file(file: Path) -> None:
+    assert load_config(file).name == file.stem
 
 
 def models_in(annotation: object) -> Iterator[type[BaseModel]]:

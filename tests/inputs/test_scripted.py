@@ -109,6 +109,7 @@ def test_nothing_comes_before_start_nor_after_close_and_it_waits_while_nobody_po
         ({"hands": ("middle",)}, "allowed are left, right"),
         ({"rate_hz": 0.0}, "rate_hz = 0"),
         ({"frequency_hz": math.nan}, "frequency_hz = nan"),
+        ({"scale": 1.5}, r"scale = 1\.5: allowed is above 0 and up to 1"),
         ({"jitter": 0.01}, r"jitter = 0\.01: allowed is 0 \.\. 0\.00667"),
     ],
 )
@@ -116,6 +117,25 @@ def test_a_wrong_setting_is_refused_with_what_is_allowed(arguments: dict[str, ob
     with pytest.raises(ConfigError, match=message) as caught:
         ScriptedInput(**{"trajectory": "circle", **arguments})  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("trajectory", ["circle", "meet"])
+def test_an_iiwas_motion_is_the_written_one_to_the_bit(trajectory: str) -> None:
+    written = flat(play(ScriptedInput(trajectory), 4.0))
+    for name in ("dual_iiwa7", "dual_iiwa14", "iiwa7"):
+        assert flat(play(ScriptedInput.from_config(load_config(f"config/{name}.yaml"), trajectory), 4.0)) == written
+
+
+def test_shorter_arms_go_less_far_and_turn_as_far() -> None:
+    written, script = ScriptedInput("meet"), ScriptedInput.from_config(load_config("config/dual_xarm7.yaml"), "meet")
+    for hand in SIDES:
+        ways = []
+        for made in (written, script):
+            start, later = made.hand_pose(hand, 0.0), made.hand_pose(hand, 3.0)
+            ways.append(later.translation - start.translation)
+            np.testing.assert_array_equal(later.rotation, written.hand_pose(hand, 3.0).rotation)
+        assert np.linalg.norm(ways[0]) > 0.05
+        np.testing.assert_allclose(ways[1], 0.82 / 1.12 * ways[0], rtol=1e-3)
 
 
 def test_way_points_begin_where_the_shipped_cell_has_its_tools() -> None:

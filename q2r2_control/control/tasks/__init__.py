@@ -2,5 +2,5 @@
 
 ``frame`` follows a tool target, ``hold`` holds joints, ``posture`` uses those that no tool needs; which arm gives way
 is a matter of the weights in ``priority``. Each of these modules has its model, data and kernels, and a line in each
-part of ``built_in``. ``external`` loads the costs of other packages.
+part of ``built_in``. ``external`` loads costs by name: those of other packages, and of ``elbow`` and ``named_tasks``.
 """

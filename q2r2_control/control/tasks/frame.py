@@ -1,7 +1,8 @@
 """The cost of a tool that follows its target, as H and g of  1/2 v' H v + g' v, compiled.
 
 For each following arm:  |J v - u|^2_W + v' M v, u the wanted tool twist, W = diag(1, 1, 1, l^2, l^2, l^2) with the
-length l that makes a radian comparable to a metre.
+length l that makes a radian comparable to a metre, times the weights of the settings: along the world's axes, and about
+the tool's own. The posture may use an axis as far as its weight leaves it free.
 
 **Damping M.** Stretched out towards an unreachable target, the gradient of the reach with respect to the elbow angle
 vanishes like L theta. Under a wanted speed s the loop near that posture therefore has the gain L s / mu. Without
@@ -62,6 +63,7 @@ class Motion(NamedTuple):
     deceleration: Array  # (2,) [m/s^2, rad/s^2]
     full_speed: Array  # (2,) [m/s, rad/s]
     stretch_gain: Array  # (1,) k [1/s]
+    weight: Array  # (6,) of the error along the world's axes and about the tool's, 0 .. 1
 
 
 def motion_of(settings: ControllerSettings) -> Motion:
@@ -71,6 +73,7 @@ def motion_of(settings: ControllerSettings) -> Motion:
         deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
         full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
         stretch_gain=np.array([settings.stretch_gain]),
+        weight=np.array([*settings.position_weights, *settings.rotation_weights], dtype=np.float64),
     )
 
 
@@ -90,14 +93,25 @@ class FrameData(NamedTuple):
 def accumulate_frame_cost(model: TaskModel, data: TaskData, targets: TaskTargets) -> None:
     """Add the cost of every tool that follows its target, and write its Jacobian."""
     data.J[:] = 0.0
+    weight = model.motion.weight
     for i in range(targets.follows.shape[0]):
         if targets.follows[i] == 0:
             continue
-        J = data.J[6 * i : 6 * i + 6]
+        J, twist, feedback = data.J[6 * i : 6 * i + 6], data.frame.twist[i], data.frame.feedback[i]
         tool_jacobian(model.chain, data.placements, model.tools, i, data.translation[i], J)
         wanted_twist(model.motion, data, targets, i)
-        accumulate_tool_cost(J, data.frame.twist[i], model.priority.arm[i], data.H, data.g)
+        if not weight[3] == weight[4] == weight[5]:
+            for j in range(J.shape[1]):
+                express_in(data.rotation[i], J[3:6, j])
+            express_in(data.rotation[i], twist[3:6])
+            express_in(data.rotation[i], feedback[3:6])
+        accumulate_tool_cost(J, twist, weight, model.priority.arm[i], data.H, data.g)
+        for k in range(6):
+            feedback[k] *= weight[k]
         accumulate_stretch_damping(model, data, i)
+        for k in range(6):
+            for j in range(J.shape[1]):
+                J[k, j] *= np.sqrt(weight[k])
 
 
 @kernel
@@ -131,6 +145,14 @@ def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, tr
             for k in range(3):
                 J[3 + k, j] = axis[k]
         joint = chain.parent[joint]
+
+
+@kernel
+def express_in(rotation: Array, vector: Array) -> None:
+    """Turn the ``vector`` (3,) of world axes into one of the axes of ``rotation`` (3, 3), in place."""
+    x, y, z = vector[0], vector[1], vector[2]
+    for k in range(3):
+        vector[k] = rotation[0, k] * x + rotation[1, k] * y + rotation[2, k] * z
 
 
 @kernel
@@ -203,20 +225,20 @@ def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -
 
 
 @kernel
-def accumulate_tool_cost(J: Array, twist: Array, weight: float, H: Array, g: Array) -> None:
-    """Add ``weight`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,)."""
+def accumulate_tool_cost(J: Array, twist: Array, weight: Array, priority: float, H: Array, g: Array) -> None:
+    """Add ``priority`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,); ``weight`` (6,) of each row."""
     nv = g.shape[0]
-    square = weight * ROTATION_LENGTH * ROTATION_LENGTH
+    square = priority * ROTATION_LENGTH * ROTATION_LENGTH
     for i in range(nv):
         # Other arms' joints do not move this tool; a revolute one that does turns it, a sliding one shifts it.
         if J[0, i] == J[1, i] == J[2, i] == J[3, i] == J[4, i] == J[5, i] == 0.0:
             continue
         for k in range(6):
-            g[i] -= (weight if k < 3 else square) * J[k, i] * twist[k]
+            g[i] -= (priority if k < 3 else square) * weight[k] * J[k, i] * twist[k]
         for j in range(i + 1):
-            linear = J[0, i] * J[0, j] + J[1, i] * J[1, j] + J[2, i] * J[2, j]
-            angular = J[3, i] * J[3, j] + J[4, i] * J[4, j] + J[5, i] * J[5, j]
-            both = weight * linear + square * angular
+            linear = weight[0] * J[0, i] * J[0, j] + weight[1] * J[1, i] * J[1, j] + weight[2] * J[2, i] * J[2, j]
+            angular = weight[3] * J[3, i] * J[3, j] + weight[4] * J[4, i] * J[4, j] + weight[5] * J[5, i] * J[5, j]
+            both = priority * linear + square * angular
             H[i, j] += both
             if i != j:
                 H[j, i] += both

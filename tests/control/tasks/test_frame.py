@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from q2r2_control import CartesianController
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.targets import TaskTargets
 from q2r2_control.control.tasks.frame import (
@@ -21,8 +22,9 @@ from q2r2_control.control.tasks.frame import (
 )
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, kernel_data, kernel_model, placed, random_posture
+from tests.support.driven import Driven
 
-MOTION = Motion(np.array([6.0, 5.0]), np.array([2.0, 5.0]), np.array([1.0, 2.5]), np.array([0.02]))
+MOTION = Motion(np.array([6.0, 5.0]), np.array([2.0, 5.0]), np.array([1.0, 2.5]), np.array([0.02]), np.ones(6))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -111,10 +113,53 @@ def test_the_wanted_twist_never_exceeds_the_speed_limits() -> None:
 
 def test_a_tool_task_is_the_weighted_square_of_its_twist_error() -> None:
     random = np.random.default_rng(26)
-    J, twist = random.normal(size=(6, 14)), random.normal(size=6)
+    J, twist, weight = random.normal(size=(6, 14)), random.normal(size=6), random.uniform(size=6)
     J[:, 7:] = 0.0
     H, g = np.zeros((14, 14)), np.zeros(14)
-    accumulate_tool_cost(J, twist, 0.1, H, g)
-    W = np.diag([1.0] * 3 + [ROTATION_LENGTH**2] * 3)
+    accumulate_tool_cost(J, twist, weight, 0.1, H, g)
+    W = np.diag(weight * np.array([1.0] * 3 + [ROTATION_LENGTH**2] * 3))
     np.testing.assert_allclose(H, 0.1 * J.T @ W @ J, atol=1e-12)
     np.testing.assert_allclose(g, -0.1 * J.T @ W @ twist, atol=1e-12)
+
+
+# (position and rotation weights) -> what of the pose is reached: position along x, y, z, then the tool's own z axis.
+PARTS = {
+    "position only": ((1, 1, 1), (0, 0, 0), (True, True, True), False),
+    "rotation only": ((0, 0, 0), (1, 1, 1), (False, False, False), True),
+    "height and rotation": ((0, 0, 1), (1, 1, 1), (False, False, True), True),
+    "free about the tool's z": ((1, 1, 1), (1, 1, 0), (True, True, True), True),
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_tool_reaches_the_part_of_a_pose_that_has_weight_and_leaves_the_rest_to_the_posture(name: str) -> None:
+    along, about, reached, upright = PARTS[name]
+    settings = ControllerSettings(position_weights=along, rotation_weights=about)
+    controller = CartesianController(cell("dual_iiwa7").robot, settings)
+    driven = Driven(controller)
+    by = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 0.0) @ pin.rpy.rpyToMatrix(0.0, 0.0, 0.6), np.array([0.05, 0.06, 0.08]))
+    goals = {
+        arm: pin.SE3(pose.rotation @ by.rotation, pose.translation + by.translation)
+        for arm, pose in driven.start.items()
+    }
+    driven.drive(5.0, goals)
+    assert driven.contract.tail_acceleration() < 0.1
+    for arm, goal in goals.items():
+        tool = controller.tool_pose(arm)
+        found = np.abs(tool.translation - goal.translation) < 1e-3
+        assert found.tolist() == list(reached)
+        tilt = np.linalg.norm(np.cross(tool.rotation[:, 2], goal.rotation[:, 2]))
+        turn = np.linalg.norm(pin.log3(tool.rotation.T @ goal.rotation))
+        assert (tilt < 1e-3) == upright
+        assert (turn < 1e-3) == (about == (1, 1, 1))
+
+
+def test_a_tool_without_any_weight_leaves_all_joints_to_the_posture() -> None:
+    robot = cell("dual_iiwa7").robot
+    controller = CartesianController(robot, ControllerSettings(position_weights=(0, 0, 0), rotation_weights=(0, 0, 0)))
+    driven = Driven(controller)
+    wanted = robot.home + 0.1
+    for _ in range(4000):
+        reference = controller.step(driven.start, 0.002, wanted)
+        driven.contract.check(reference, 0.002)
+    np.testing.assert_allclose(reference.q, wanted, atol=1e-3)

@@ -1,0 +1,106 @@
+"""``q2r2 doctor``: what this computer lacks, and the command that cures it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import socket
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, requires, version
+from typing import Annotated
+
+from packaging.requirements import Requirement
+from typer import Argument, Exit
+
+from q2r2_control.cli.output import DEMO_CONFIG, Json, as_json_text
+from q2r2_control.cli.ros import print_findings
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.inputs.listener import access_lines
+from q2r2_control.plugins import INPUTS, PLANTS, load_class
+from q2r2_control.process.machine_notes import machine_notes, network_notes
+from q2r2_control.ros.launch.build import interface_packages
+from q2r2_control.ros.watching.findings import Finding, error
+
+_PACKAGE = "q2r2_control"
+
+
+def doctor(
+    config: Annotated[str, Argument(metavar="[CONFIG]", help="YAML of the cell.")] = DEMO_CONFIG,
+    json: Json = False,
+) -> None:
+    """Say what this computer lacks to run a cell, a line each with what cures it; exit 1 where it cannot run it.
+
+    It looks at Python and the packages, ROS, the ports of the cell, real-time scheduling, the display, and whether a
+    headset can reach this computer. It changes nothing. With ROS, q2r2 ros doctor looks at what runs.
+    """
+    cell = load_config(config)
+    for group, name in ((INPUTS, cell.input), (PLANTS, cell.plant)):
+        load_class(group, name)
+    facts = {
+        "python": platform.python_version(),
+        "version": version(_PACKAGE),
+        "system": platform.platform(terse=True),
+        "compiler": "not needed, but by q2r2 ros build-interfaces",
+        "headset": "; ".join(access_lines(cell.headset.host, cell.headset.port, cell.headset.networks)),
+    }
+    findings = [*_packages(requires(_PACKAGE) or ()), *_ros(), *_ports(cell), *_display(os.environ)]
+    notes = machine_notes() + network_notes(cabinet.address for cabinet in cell.fri.values())
+    findings += [Finding(False, *_what_and_cure(note)) for note in notes]
+    lacks = any(finding.stops_arms for finding in findings)
+    if json:
+        print(as_json_text({**facts, "findings": findings, "lacks": lacks}))
+    else:
+        print_findings(facts, findings, "missing")
+    sys.stdout.flush()
+    raise Exit(int(lacks))
+
+
+def _packages(required: Iterable[str]) -> Iterator[Finding]:
+    """Of the requirements in ``required``, those that are not met; extras aside."""
+    for requirement in map(Requirement, required):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            found = version(requirement.name)
+        except PackageNotFoundError:
+            found = "none"
+        if found == "none" or not requirement.specifier.contains(found, prereleases=True):
+            what = f"{requirement.name}: {found} is installed; needed: {requirement.specifier}"
+            yield error(what, f"{sys.executable} -m pip install '{requirement.name}{requirement.specifier}'")
+
+
+def _ros() -> Iterator[Finding]:
+    """Nothing but the nodes needs ROS."""
+    if importlib.util.find_spec("rclpy") is None:
+        cure = f"pip install '{_PACKAGE}[ros]', or source a ROS 2 Jazzy, if you want them"
+        yield Finding(False, "rclpy cannot be imported: no ROS nodes", cure)
+    elif lacking := [its.name for its in interface_packages() if importlib.util.find_spec(its.name) is None]:
+        yield Finding(False, f"no messages of {', '.join(lacking)}: no ROS nodes", "q2r2 ros build-interfaces")
+
+
+def _ports(cell: Config) -> Iterator[Finding]:
+    """Ports that the cell's input and plant listen on and that another program holds."""
+    wanted = [("headset", socket.SOCK_STREAM, cell.headset.host, cell.headset.port)]
+    wanted += [(f"fri.{arm}", socket.SOCK_DGRAM, "0.0.0.0", its.port) for arm, its in cell.fri.items()]
+    for key, kind, host, port in wanted:
+        try:
+            with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, kind) as probe:
+                if kind == socket.SOCK_STREAM:
+                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind((host, port))
+        except OSError as why:
+            cure = f"another {key}.port in the YAML, or end the program that `ss -lnp 'sport = :{port}'` names"
+            yield error(f"{key}: port {port} of {host} cannot be listened on: {why.strerror}", cure)
+
+
+def _display(environment: Mapping[str, str]) -> Iterator[Finding]:
+    """MuJoCo's window needs one, nothing else."""
+    if sys.platform == "linux" and not (environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY")):
+        yield Finding(False, "no display: no --viewer", "log in on the desktop or by ssh -X; a run without needs none")
+
+
+def _what_and_cure(note: str) -> tuple[str, str]:
+    what, _, cure = note.rpartition("; " if "; " in note else ": ")
+    return what, cure

@@ -1,0 +1,68 @@
+"""The doctor says what this computer lacks, what cures it, and whether a cell can be run."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.cli import doctor
+from tests.cli.command import changed_cell, one_object, q2r2
+
+
+@pytest.fixture
+def free_cell(tmp_path: Path) -> str:
+    """The shipped cell with a port that is free."""
+    return changed_cell(tmp_path, "port: 10000 ", "port: 0 ")
+
+
+def test_where_nothing_is_missing_it_says_so_and_exits_with_0(free_cell: str) -> None:
+    result = q2r2("doctor", free_cell, "--json")
+    found = one_object(result.stdout)
+    assert (result.exit_code, found["lacks"]) == (0, False)
+    assert not any(finding["stops_arms"] for finding in found["findings"])
+    assert "can be reached from this machine only" in found["headset"]
+    assert all(finding["what"] and finding["cure"] for finding in found["findings"])
+
+
+def test_a_port_that_another_program_holds_is_missing_and_has_a_cure(free_cell: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        file = Path(free_cell)
+        file.write_text(file.read_text().replace("port: 0 ", f"port: {port} "))
+        result = q2r2("doctor", free_cell)
+    assert result.exit_code == 1
+    assert f"missing     headset: port {port} of 127.0.0.1 cannot be listened on" in result.stdout
+    assert "cure: another headset.port in the YAML" in result.stdout
+
+
+def test_a_package_that_is_missing_or_too_old_has_its_pip_line() -> None:
+    wanted = ["numpy>=999", "no-such-package-of-ours>=1", "scipy>=1", "no-such-extra>=1; extra == 'dev'"]
+    found = list(doctor._packages(wanted))
+    assert [finding.what.partition(":")[0] for finding in found] == ["numpy", "no-such-package-of-ours"]
+    assert all(finding.stops_arms for finding in found)
+    assert found[0].cure.endswith("-m pip install 'numpy>=999'")
+
+
+def test_without_a_display_only_the_window_is_missing() -> None:
+    (finding,) = doctor._display({})
+    assert not finding.stops_arms
+    assert list(doctor._display({"DISPLAY": ":0"})) == []
+
+
+def test_what_the_kernel_refuses_stands_with_the_last_part_of_the_note_as_its_cure(
+    free_cell: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "machine_notes", lambda: ["real time: no SCHED_FIFO; the run goes on; give rtprio 40"])
+    lines = q2r2("doctor", free_cell).stdout.splitlines()
+    at = lines.index("warning     real time: no SCHED_FIFO; the run goes on")
+    assert lines[at + 1].strip() == "cure: give rtprio 40"
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_shell_gets_a_script_that_completes_q2r2(shell: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shellingham.detect_shell", lambda *_: (shell, shell))
+    result = q2r2("--show-completion")
+    assert result.exit_code == 0
+    assert "_COMPLETE" in result.stdout

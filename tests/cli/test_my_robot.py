@@ -1,0 +1,39 @@
+"""The page about a robot of one's own, followed step by step: a robot that no shipped cell has ends up moving."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.cli.command import q2r2
+from tests.config.cell_files import SHIPPED
+from tests.pipeline.test_plugins import merged
+from tests.support.modules import blocks_of
+
+PAGE = "docs/my_robot.md"
+
+
+def test_its_yaml_and_its_commands_lead_from_a_urdf_to_arms_that_follow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    cell: Any = {}
+    for block in blocks_of(PAGE, "yaml"):
+        cell = merged(cell, yaml.safe_load(block))
+    model = cell["arms"]["left"]["model"]
+    assert not any(model in file.read_text(encoding="utf-8") for file in SHIPPED.glob("*.yaml"))
+    Path("my_cell.yaml").write_text(yaml.safe_dump(cell))
+    doctor, check, run = (shlex.split(block)[1:] for block in blocks_of(PAGE, "sh"))
+    assert doctor == ["doctor"]  # test_doctor.py looks at what it says
+    checked = q2r2(*check)
+    assert checked.exit_code == 0, checked.output
+    assert "NOTE" not in checked.stdout
+    ran = q2r2(*run)
+    assert ran.exit_code == 0, ran.output
+    assert "at rest" in ran.stdout
+    assert os.listdir() == ["my_cell.yaml"]

@@ -1,0 +1,43 @@
+"""Every shipped cell may start, and follows scripted hands in MuJoCo with the contract kept at every tick."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from q2r2_control.config.cell import load_config
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.summary.tick import Tick
+from q2r2_control.supervision.homing import preflight_faults
+from q2r2_control.verification.contract import Contract
+from tests.config.cell_files import SHIPPED
+from tests.control.scenarios import into_the_table, overhead
+from tests.support.driven import Driven
+
+
+@pytest.mark.parametrize("file", sorted(SHIPPED.glob("*.yaml")), ids=lambda file: file.stem)
+def test_its_tools_follow_the_hands_around_a_circle_and_keep_the_contract_where_they_cannot(file: Path) -> None:
+    # The lowest rate with one substep a tick, since most of a test's time goes by ticks.
+    config = load_config(file).model_copy(update={"loop_rate_hz": 500.0})
+    pipeline = Pipeline.from_config(config, input=ScriptedInput.from_config(config, "circle"), plant="mujoco")
+    assert preflight_faults(pipeline.robot, pipeline.controller.settings, pipeline.controller) == ()
+    contract, heights = Contract(pipeline.controller), []
+
+    def look(tick: Tick) -> None:
+        contract.check(tick.reference, tick.step)
+        heights.append([tool.translation[2] for tool in tick.tools.values()])
+
+    pipeline.listeners.append(look)
+    summary = pipeline.run(2.8, realtime=False)
+    assert (np.ptp(heights, axis=0) > 0.02).all()
+    assert summary.at_rest
+    assert summary.uncertified_ticks == summary.rejected_targets == 0
+    for arm in summary.arms.values():
+        assert arm.position_error_mm_rms is not None
+        assert arm.position_error_mm_rms < 10.0
+        assert arm.slip_mm_max == 0.0
+    for out_of_reach in (overhead, into_the_table):
+        assert Driven(pipeline.controller, dt=0.005).drive(1.5, out_of_reach).report.certified
