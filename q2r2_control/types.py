@@ -145,7 +145,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a policy sees of one tick: the state before its command, on the loop's clock."""
+    """The view that a policy has of one tick: the state before its command, on the loop's clock."""
 
     time: float  # [s]
     state: RobotState

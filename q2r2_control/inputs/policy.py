@@ -1,4 +1,4 @@
-"""Actions of a policy as an input: what was recorded as a dataset's action moves the arms again.
+"""Actions of a policy as an input: those that a dataset has move the arms again.
 
 The numbers of an action are those of the features of datasets, in their order: :class:`ActionSpace`. They are checked
 where they come in, on the policy's own thread, and become tool poses there. Teleop follows these as it follows a hand.
@@ -65,7 +65,7 @@ class PolicyInput:
     :class:`ConfigError` for a space or a rate that is not allowed.
     """
 
-    options = ("policy", "takeover", "fast")
+    options = ("policy", "takeover", "fast", "say")
 
     def __init__(
         self,
@@ -93,12 +93,12 @@ class PolicyInput:
 
     @classmethod
     def from_config(
-        cls, config: Config, policy: str | None = None, takeover: str | None = None, fast: bool = False
+        cls, config: Config, policy: str | None = None, takeover: str | None = None, **options: object
     ) -> PolicyInput:
         """``policy`` is "module:name" of a policy, or a class of policies; ``takeover`` the name of an input."""
         if policy is None:
             raise ConfigError("input policy: --policy MODULE:NAME is missing, which names the policy")
-        operator = None if takeover is None else make_input(takeover, config, fast=fast)
+        operator = None if takeover is None else make_input(takeover, config, **options)
         return cls(_loaded(policy), operator=operator)
 
     @property
@@ -130,12 +130,10 @@ class PolicyInput:
     def observe(self, observation: Observation) -> None:
         """See :class:`PolicySource`."""
         self.observation = observation
-        if self._policy is None or observation.time < self._due:
-            return
-        if self._realtime:
-            self._wake.set()
-        else:
+        if not self._realtime:
             self._ask()
+        elif observation.time >= self._due:
+            self._wake.set()
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
         if self._operator is not None:
@@ -173,7 +171,7 @@ class PolicyInput:
 
     def _ask(self) -> None:
         observation = self.observation
-        if self._policy is None or observation is None:
+        if self._policy is None or observation is None or observation.time < self._due:
             return
         count = 1
         try:

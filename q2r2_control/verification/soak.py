@@ -43,7 +43,7 @@ COUNTED = {
     "grasps": "grasps and releases",
     "changes": "changes of settings",
 }
-SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
+_SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
 MEMORY_ALLOWED = 5.0  # [MB]
 
 
@@ -114,12 +114,12 @@ class Soak:
         """Run ``ticks`` ticks."""
         before = None
         for tick, (segment, since) in enumerate(self._ticks(ticks)):
-            if tick == int(SETTLED * ticks):
-                before = memory_mb()
+            if tick == int(_SETTLED * ticks):
+                before = _memory_mb()
             if tick % max(ticks // 20, 1) == 0:
                 progress(f"tick {tick} of {ticks}")
             self._tick(tick, segment, since)
-        after = memory_mb()
+        after = _memory_mb()
         return SoakReport(
             cell=self._cell,
             seed=self._seed,
@@ -202,7 +202,7 @@ class Soak:
             self._broken.setdefault(key, found)
 
 
-def memory_mb() -> float | None:
+def _memory_mb() -> float | None:
     """Resident memory of this process after collecting garbage [MB]; None where the system does not tell."""
     gc.collect()
     try:

@@ -1,4 +1,4 @@
-"""What a policy sends is checked where it comes in, and one line says what is wrong with it."""
+"""Actions of a policy are checked where they come in, and one line says what is wrong with them."""
 
 from __future__ import annotations
 

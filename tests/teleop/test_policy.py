@@ -150,6 +150,16 @@ def test_times_of_another_clock_are_refused() -> None:
     assert run.reasons() == ["policy_refused: policy_unusable"]
 
 
+def test_grippers_change_at_the_time_of_the_action() -> None:
+    run = Run()
+    openings = {"left": np.array([1.0, 0.25])}
+    run.ways(PERIOD - 2 * TICK, chunk([run.now, run.now + PERIOD], np.zeros(2), grippers=openings))
+    assert run.targets["left"].gripper == 1.0
+    run.ways(4 * TICK)
+    assert run.targets["left"].gripper == 0.25
+    assert run.targets["right"].gripper == 1.0
+
+
 def test_the_leash_holds_the_target_near_a_tool_that_something_blocks() -> None:
     run = Run()
     run.blocked = True
