@@ -31,7 +31,7 @@ SAMPLE_FIELDS = (
 )
 ARM_FIELDS = (
     *("opening", "engaged", "slip", "slip_angle", "wanted", "commanded", "rejected", "gripper_held", "holding"),
-    "intervention",
+    *("intervention", "policy"),
 )
 ARM_POSES = ("filtered_hand", "target", "tool")  # zeros: none; the tool is at the reference
 NOT_REPLAYED = ("compute_time", "solve_time", "tool")  # the writer adds the tool, which follows from the reference
@@ -130,7 +130,7 @@ class TickPacker:
         return (
             *(opening, tick.engaged[arm], target.slip, target.slip_angle, target.gripper, commanded),
             *(arm in tick.reference.report.rejected, arm in tick.held_grippers, tick.holding.get(arm, False)),
-            tick.interventions.get(arm, False),
+            *(tick.interventions.get(arm, False), tick.by_policy(arm)),
             *position,
             *rotation,
             *(_NO_POSE if target.command is None else pin.SE3ToXYZQUATtuple(target.command)),

@@ -16,7 +16,6 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.events import Event
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
-from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.types import ArmTarget, HandSample
 from q2r2_control.wording import sentence
 
@@ -166,7 +165,7 @@ class _ArmStatistics:
         intervenes = tick.interventions.get(name, False)
         summary.interventions += intervenes and not self._intervenes
         summary.intervention_s += tick.dt if intervenes else 0.0
-        summary.policy_s += tick.dt if tick.states[name] == ArmState.POLICY else 0.0
+        summary.policy_s += tick.dt if tick.by_policy(name) else 0.0
         self._intervenes = intervenes
         if (pair := tick.held_grippers.get(name)) is not None:
             summary.gripper_held_s += tick.dt

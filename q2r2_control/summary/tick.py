@@ -11,6 +11,7 @@ from q2r2_control.compliance.admittance import AdmittanceReport
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.events import Event
+from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.types import ActionChunk, ArmTarget, Command, HandSample, Reference, RobotState
 
 
@@ -53,6 +54,10 @@ class Tick:
     chunks: list[ActionChunk] = field(default_factory=list)  # of a policy, as they came
     interventions: dict[str, bool] = field(default_factory=dict)  # arm -> whether a hand moves it instead of a policy
     sessions: dict[str, str] = field(default_factory=dict)  # of arms that follow during sessions only, in words
+
+    def by_policy(self, arm: str) -> bool:
+        """Whether a policy moves the arm."""
+        return self.states[arm] == ArmState.POLICY
 
     def tracking_error(self, arm: str) -> tuple[float, float]:
         """Distance [m] and angle [rad] of an arm's tool from its target; NaN where it has none."""
