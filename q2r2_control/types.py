@@ -7,6 +7,7 @@ clock that is passed in. An arm or hand is named ``"left"`` or ``"right"``.
 from __future__ import annotations
 
 import math
+from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -166,26 +167,36 @@ class ActionChunk:
     fault: Reason | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """Data for ``json.dumps``, of which :meth:`from_json` makes the same chunk to the bit."""
+        """Data for ``json.dumps``, of which :meth:`from_json` makes the same chunk to the bit; made within a tick."""
         named = {"tools": self.tools, "motions": self.motions, "grippers": self.grippers}
         data: dict[str, Any] = {
-            name: {arm: value.tolist() for arm, value in values.items()} for name, values in named.items()
+            name: {arm: _packed(values) for arm, values in arms.items()} for name, arms in named.items()
         }
-        data |= {"times": self.times.tolist(), "period": self.period}
-        data["postures"] = None if self.postures is None else self.postures.tolist()
+        data |= {"times": _packed(self.times), "period": self.period}
+        data["postures"] = None if self.postures is None else _packed(self.postures)
         return data | {"fault": None if self.fault is None else self.fault.as_json()}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> ActionChunk:
         """Raises ValueError, KeyError or TypeError for other data."""
+        times = _unpacked(data["times"])
+        shapes = {"tools": (len(times), 7), "motions": (len(times), 6), "grippers": (len(times),)}
         named = {
-            name: {arm: np.array(values, dtype=np.float64) for arm, values in data[name].items()}
-            for name in ("tools", "motions", "grippers")
+            name: {arm: _unpacked(values).reshape(shape) for arm, values in data[name].items()}
+            for name, shape in shapes.items()
         }
-        postures = None if data["postures"] is None else np.array(data["postures"], dtype=np.float64)
+        postures = None if data["postures"] is None else _unpacked(data["postures"]).reshape(len(times), -1)
         fault = None if data["fault"] is None else Reason.from_json(data["fault"])
-        times = np.array(data["times"], dtype=np.float64)
         return cls(times, float(data["period"]), **named, postures=postures, fault=fault)
+
+
+def _packed(values: Array) -> str:
+    """The float64 of an array as base64; decimals of a long chunk would take a millisecond."""
+    return b64encode(values.tobytes()).decode("ascii")
+
+
+def _unpacked(text: str) -> Array:
+    return np.frombuffer(b64decode(text), dtype=np.float64)
 
 
 class StepStatus(StrEnum):
