@@ -33,7 +33,7 @@ COUNTED = {
 }
 STREAMS = ("walk", "limits", "other_arm", "oscillate", "random", "broken", "late", "stall")
 _MOST, _LONGEST = 8, 0.4  # actions in a chunk, and what lies between them [s]
-_STOPS = 1.5  # from the last action that counts until all rests [s]
+_STOPS = 1.0  # from the last action that counts until all rests [s]
 _PERIODS = (0.02, 0.1)  # between two actions [s]
 _TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # [m]
 
@@ -141,7 +141,7 @@ class PolicySoak:
     """Runs a cell with a hostile policy and no operator, on a plant that follows exactly."""
 
     def __init__(self, config: Config, seed: int, streams: Sequence[str] = STREAMS) -> None:
-        self._streams = streams
+        self._streams, self._round = streams, list[str]()  # each of them comes once a round
         config = config.model_copy(update={"control": config.control.model_copy(update={"solve_time_limit": None})})
         self._cell, self._seed, self._period = config.name, seed, 1.0 / config.loop_rate_hz
         self._input = PolicyInput()
@@ -187,11 +187,13 @@ class PolicySoak:
 
     def _drawn(self) -> _Segment:
         random = self._random
-        stream = str(random.choice(self._streams))
+        if not self._round:
+            self._round = [str(stream) for stream in random.permutation(self._streams)]
+        stream = self._round.pop()
         space = tuple(ActionSpace)[int(random.integers(len(ActionSpace)))]
         every = 1 if random.random() < 0.5 else int(random.integers(2, 100))
         ticks = (
-            int(random.integers(100, 1000)) if stream != "stall" else round((SILENT + _LONGEST + _STOPS) / self._period)
+            int(random.integers(100, 800)) if stream != "stall" else round((SILENT + _LONGEST + _STOPS) / self._period)
         )
         self._counts["segments"] += 1
         step = 10.0 ** random.uniform(-3.0, -1.2)

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_no_hostile_action_breaks_a_promise_and_the_arms_rest_after_each_stall() -> None:
-    report = PolicySoak(cell(), seed=1).run(8000)
+    report = PolicySoak(cell(), seed=1).run(7500)
     assert report.broken == []
     assert report.passed
     assert min(report.counts[name] for name in ("chunks", "policy_ticks", "begins", "stops", "stalls")) > 0
@@ -20,7 +20,7 @@ def test_no_hostile_action_breaks_a_promise_and_the_arms_rest_after_each_stall()
 
 def test_a_policy_whose_last_action_is_repeated_for_ever_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("q2r2_control.teleop.policy_motion.SILENT", 10.0)
-    report = PolicySoak(cell(), seed=0, streams=("walk", "stall")).run(8000)
+    report = PolicySoak(cell(), seed=0, streams=("walk", "stall")).run(5500)
     assert [found.promise for found in report.broken] == ["speed after a stall of the policy"]
     assert not report.passed
 
