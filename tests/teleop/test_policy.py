@@ -87,6 +87,13 @@ def test_a_newer_chunk_counts_from_its_first_time_on_and_the_difference_fades_wi
     assert np.abs(np.diff(ways)).max() <= 0.6 * TICK + 1e-9
 
 
+def test_a_newer_chunk_replaces_those_too_whose_time_has_not_come() -> None:
+    run = Run()
+    later = chunk(run.now + 0.3 + PERIOD * np.arange(10), np.full(10, 0.03))
+    newer = chunk(run.now + PERIOD * np.arange(20), np.zeros(20))
+    assert np.abs(run.ways(0.6, later, newer)).max() < 1e-12
+
+
 def test_a_late_chunk_is_followed_from_where_it_still_counts_and_one_of_the_past_is_left_out() -> None:
     run = Run()
     past = chunk(run.now - 2.0 + PERIOD * np.arange(10), np.full(10, 0.05))
