@@ -60,6 +60,7 @@ class ReasonKind(StrEnum):
     NOT_HOMING = "not_homing", "not homing: {cause}"
     NOT_CARRIED = "not_carried", "not carried: {cause}"
     NOT_CHANGED = "not_changed", "not changed: {cause}"
+    POLICY_REFUSED = "policy_refused", "the policy does not act: {cause}"
     NO_RECORDING = "no_recording", "not recorded: this run has no recording"
     RECORDING_ENDED = "recording_ended", "not recorded any more: {text}"
     NO_EPISODE = "no_episode", "not discarded: no episode has begun"
@@ -76,6 +77,15 @@ class ReasonKind(StrEnum):
     HAND_ROTATION_JUMPED = "hand_rotation_jumped", "the hand's rotation jumped {angle:.2f} rad"
     HAND_TOO_FAST = "hand_too_fast", "the hand moved at {speed:.1f} m/s"
     HAND_TURNS_TOO_FAST = "hand_turns_too_fast", "the hand turned at {speed:.0f} rad/s"
+    # A policy and its actions.
+    POLICY_ACTS = "policy_acts", "the policy acts"
+    POLICY_SILENT = "policy_silent", "no action of the policy that counts for {timeout:g} s"
+    POLICY_UNUSABLE = "policy_unusable", "actions of the policy that cannot be used: {text}"
+    POLICY_JUMPED = (
+        "policy_jumped",
+        "an action of the policy is {distance:.3f} m and {angle:.2f} rad from {what}; "
+        "allowed: {allowed:g} m and {allowed_angle:g} rad",
+    )
     CONNECTION_LOST = "connection_lost", "connection lost"
     LOOP_STALLED = "loop_stalled", "the control loop stood still for {duration:.3f} s"
     NODE_STALLED = "node_stalled", "this node stood still for {duration:.2f} s"
@@ -215,7 +225,7 @@ class ReasonKind(StrEnum):
 
 
 _K = ReasonKind
-_NOT_DONE = {_K.NOT_ENGAGED, _K.NOT_HOMING, _K.NOT_CARRIED, _K.NOT_CHANGED}
+_NOT_DONE = {_K.NOT_ENGAGED, _K.NOT_HOMING, _K.NOT_CARRIED, _K.NOT_CHANGED, _K.POLICY_REFUSED}
 REFUSALS = frozenset({*_NOT_DONE, _K.NO_RECORDING, _K.RECORDING_ENDED, _K.NO_EPISODE})
 _WAY_HOME = {_K.HOMING, _K.HOMING_ARRIVED, _K.HOMING_HELD_UP, _K.HOMING_NO_WAY, _K.HOMING_INTERRUPTED, _K.HOMING_ENDED}
 HOLD_REQUESTS = frozenset({_K.PAUSE_SERVICE, _K.RESET_SERVICE, *_WAY_HOME})  # and how a way home ended

@@ -7,15 +7,19 @@ clock that is passed in. An arm or hand is named ``"left"`` or ``"right"``.
 from __future__ import annotations
 
 import math
+from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
+from q2r2_control.events import Reason
+
+POSE_FIELDS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 Array = npt.NDArray[np.float64]
 
 SIDES = ("left", "right")
@@ -140,6 +144,61 @@ class Command:
     deceleration: Array | None = None  # (nv,) of the certified stop from q and v [rad/s^2]; None: none is known
 
 
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """The view that a policy has of one tick: the state before its command, on the loop's clock."""
+
+    time: float  # [s]
+    state: RobotState
+    openings: Mapping[str, float]  # measured, of the arms whose plant tells: 0 closed .. 1 fully open
+    tools: Mapping[str, pin.SE3]  # measured tool poses, world frame
+
+
+@dataclass(frozen=True, slots=True)
+class ActionChunk:
+    """Actions of a policy at n times, checked and told as tool poses; or the fault that makes all of them unusable."""
+
+    times: Array  # (n,) [s] on the loop's clock, ascending
+    period: float  # from one action to the next, also where there is one only [s]
+    tools: Mapping[str, Array] = field(default_factory=dict)  # arm -> (n, 7) x y z qx qy qz qw, world frame
+    motions: Mapping[str, Array] = field(default_factory=dict)  # arm -> (n, 6) to the next target, in its frame
+    grippers: Mapping[str, Array] = field(default_factory=dict)  # arm -> (n,) openings
+    postures: Array | None = None  # (n, nv) of all joints, for what the tools leave free [rad]
+    fault: Reason | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Data for ``json.dumps``, of which :meth:`from_json` makes the same chunk to the bit; made within a tick."""
+        named = {"tools": self.tools, "motions": self.motions, "grippers": self.grippers}
+        data: dict[str, Any] = {
+            name: {arm: _packed(values) for arm, values in arms.items()} for name, arms in named.items()
+        }
+        data |= {"times": _packed(self.times), "period": self.period}
+        data["postures"] = None if self.postures is None else _packed(self.postures)
+        return data | {"fault": None if self.fault is None else self.fault.as_json()}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> ActionChunk:
+        """Raises ValueError, KeyError or TypeError for other data."""
+        times = _unpacked(data["times"])
+        shapes = {"tools": (len(times), 7), "motions": (len(times), 6), "grippers": (len(times),)}
+        named = {
+            name: {arm: _unpacked(values).reshape(shape) for arm, values in data[name].items()}
+            for name, shape in shapes.items()
+        }
+        postures = None if data["postures"] is None else _unpacked(data["postures"]).reshape(len(times), -1)
+        fault = None if data["fault"] is None else Reason.from_json(data["fault"])
+        return cls(times, float(data["period"]), **named, postures=postures, fault=fault)
+
+
+def _packed(values: Array) -> str:
+    """The float64 of an array as base64; decimals of a long chunk would take a millisecond."""
+    return b64encode(values.tobytes()).decode("ascii")
+
+
+def _unpacked(text: str) -> Array:
+    return np.frombuffer(b64decode(text), dtype=np.float64)
+
+
 class StepStatus(StrEnum):
     """The outcome of one control tick."""
 
@@ -208,6 +267,7 @@ class ArmTarget:
     slip_angle: float = 0.0  # the same of the rotation [rad]
     offset: Array | None = None  # (3,) of the tool, from its command [m]; None: none
     filtered_hand: Pose | None = None  # the pose of its hand, filtered, that the target is made of
+    posture: Array | None = None  # (nv,) that a policy wants this arm's joints to have where the tool leaves them free
 
     @property
     def hand(self) -> pin.SE3 | None:

@@ -17,6 +17,8 @@ from q2r2_control.cli.output import DEMO_CONFIG, Json, notice_of_compiling, prin
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.verification.fault_injection import FINGERS, with_contact
+from q2r2_control.verification.policy_soak import COUNTED as POLICY_COUNTED
+from q2r2_control.verification.policy_soak import PolicySoak
 from q2r2_control.verification.soak import COUNTED, MEMORY_ALLOWED, SoakReport, run_soak
 from q2r2_control.viewer.tables import Cell, figure_table
 
@@ -97,6 +99,9 @@ def _cells(row: BenchRow, figures: MotionFigures) -> tuple[Cell, ...]:
 def soak(
     ticks: Annotated[int, Option(min=100, help="How many.")] = 1_000_000,
     contact: Annotated[bool, Option("--contact", help="Fingers may touch table and fingers.")] = False,
+    policy: Annotated[
+        bool, Option("--policy", help="Hostile actions of a policy, through the whole pipeline.")
+    ] = False,
     seed: Annotated[int, Option(min=0, help="Of all that is drawn at random.")] = 0,
     json: Json = False,
 ) -> None:
@@ -105,13 +110,17 @@ def soak(
     Prints the worst margin of each promise. Exit 1 if one was broken.
     """
     config = load_config(DEMO_CONFIG)
+    config = with_contact(config, FINGERS) if contact else config
     with notice_of_compiling():
-        report = run_soak(with_contact(config, FINGERS) if contact else config, ticks, seed, print_progress)
+        if policy:
+            report = PolicySoak(config, seed).run(ticks, print_progress)
+        else:
+            report = run_soak(config, ticks, seed, print_progress)
     table = figure_table(
         f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, seed {report.seed}",
         ("promise", "worst", "allowed", "checked", "broken"),
         _soak_rows(report),
-        list(_soak_notes(report, "--contact " if contact else "")),
+        list(_soak_notes(report, f"{'--policy ' * policy}{'--contact ' * contact}")),
     )
     print_report(report.as_json(), (table,), json)
     raise Exit(0 if report.passed else 1)
@@ -130,7 +139,8 @@ def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
 
 def _soak_notes(report: SoakReport, options: str) -> Iterator[str]:
     """Counts, the first time of each broken promise, and the command with ``options`` that shows it again."""
-    yield ", ".join(f"{report.counts[name]} {what}" for name, what in COUNTED.items())
+    counted = COUNTED if "resets" in report.counts else POLICY_COUNTED
+    yield ", ".join(f"{report.counts[name]} {what}" for name, what in counted.items())
     for found in report.broken:
         error = f": {found.error}" if found.error else ""
         where = f"tick {found.since_segment} of: {found.segment}; dt {found.dt}"

@@ -114,6 +114,9 @@ def _rows(summary: RunSummary) -> Iterator[tuple[str, str]]:
                 f"{name} arm at the end",
                 f"[red]{arm.end_error_mm:.0f} mm from its reference[/]: the tool did not follow",
             )
+        if arm.policy_s > 0.0 or arm.interventions:
+            taken_over = f"{arm.interventions} interventions, {arm.intervention_s:.2f} s"
+            yield f"{name} arm by the policy", f"{arm.policy_s:.2f} s; {taken_over}"
         if arm.gripper_held_by is not None:
             yield f"{name} gripper held for", f"{arm.gripper_held_s:.2f} s, by {' | '.join(arm.gripper_held_by)}"
         if arm.object_held_s is not None:

@@ -70,6 +70,8 @@ def run(
     trajectory: Annotated[str | None, Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
     human: Human = False,
     seed: Seed = 0,
+    policy: Annotated[str | None, Option(metavar="MODULE:NAME", help="With --input policy: what drives.")] = None,
+    takeover: Annotated[str | None, Option(metavar="NAME", help="The same: an input whose hands take over.")] = None,
     host: Host = None,
     port: Port = None,
     viewer: Viewer = False,
@@ -94,6 +96,7 @@ def run(
         raise ConfigError(f"{config}: {why}; q2r2 commission {config} commissions it; --i-know runs it all the same")
     source = input or cell.input
     asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
+    asked |= {"policy": policy, "takeover": takeover}
     asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}
     given = {option: value for option, value in asked.items() if value is not None}
     if unfit := [option for option in given if option not in options_of(source)]:

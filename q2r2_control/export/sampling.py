@@ -20,10 +20,11 @@ from PIL import Image, UnidentifiedImageError
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import RecordingError
+from q2r2_control.inputs.policy import ActionSpace, action_names
 from q2r2_control.recording.messages import NANOSECONDS
 from q2r2_control.recording.reader import WHOLE, EpisodeSpan, Picture, Recording
 from q2r2_control.recording.recorded_ticks import check_tools, tool_poses
-from q2r2_control.recording.tick_rows import NOT_MEASURED, POSE_FIELDS, targets_or_tools
+from q2r2_control.recording.tick_rows import NOT_MEASURED, targets_or_tools
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -33,8 +34,7 @@ Names = dict[str, tuple[str, ...]]
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b
 
 OBSERVED = ("position", "velocity", "effort", "opening")
-COMMANDED = ("reference", "gripper", "target", "reference_tool")
-MOTION = ("x", "y", "z", "rx", "ry", "rz")
+COMMANDED = ("reference", "gripper", "target", "reference_tool", "intervention")
 _MOVING = 0.01  # fastest joint of a reference that moves [rad/s]
 _OLDEST = 2  # periods of the camera: one picture may be lost
 
@@ -44,9 +44,10 @@ def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan
 
     Measured are ``position``, ``velocity``, ``effort`` (n, joints) [rad, rad/s, Nm] and ``opening`` (n, arms), 0 closed
     .. 1 open, -inf: not measured. Commanded are ``reference`` (n, joints) and ``gripper`` (n, arms). ``reference_tool``
-    and the operator's ``target``, or else that tool, are poses x y z qx qy qz qw in the world (n, arms, 7). ``time``
-    (n,) [s] is since t_0, ``stamp`` (n,) the time of day [ns]. ``trim``: from the first to the last tick at which an
-    arm is engaged or the reference moves. Raises :class:`RecordingError` for a damaged file, one without a tick to
+    and the operator's ``target``, or else that tool, are poses x y z qx qy qz qw in the world (n, arms, 7).
+    ``intervention`` (n, arms) is 1 where a hand moves the arm in the place of a policy. ``time`` (n,) [s] is since t_0,
+    ``stamp`` (n,) the time of day [ns]. ``trim``: from the first to the last tick at which an arm is engaged or the
+    reference moves. Raises :class:`RecordingError` for a damaged file, one without a tick to
     take, and one in which ticks were lost for longer than a frame.
     """
     picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("stamp", *OBSERVED, *COMMANDED)}
@@ -117,6 +118,7 @@ def _ticks(recording: Recording, fps: int) -> Iterator[Columns]:
             "gripper": arms["commanded"],
             "target": targets_or_tools(rows),
             "reference_tool": arms["tool"],
+            "intervention": arms["intervention"],
         }
 
 
@@ -132,7 +134,7 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
     commanded = _known(frames, "gripper", arms)
     tools = _continuous(tool_poses(frames["position"], robot))
     targets = _continuous(frames["target"], tools[0])
-    poses = tuple(f"{arm}_{number}" for arm in arms for number in POSE_FIELDS)
+    poses = action_names(robot, ActionSpace.TOOL)
     count = len(tools)
     made: dict[str, tuple[Array, tuple[str, ...]]] = {
         "observation.state": (
@@ -142,22 +144,23 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
         "observation.velocity": (frames["velocity"], joints),
         "observation.effort": (frames["effort"], joints),
         "observation.tool": (tools.reshape(count, -1), poses),
-        "action": (
+        ActionSpace.JOINTS: (
             np.hstack((frames["reference"], frames["gripper"][:, commanded])),
             (*joints, *(f"{arms[index]}_gripper" for index in commanded)),
         ),
-        "action.tool": (targets.reshape(count, -1), poses),
-        "action.tool_delta": (
+        ActionSpace.TOOL: (targets.reshape(count, -1), poses),
+        ActionSpace.TOOL_DELTA: (
             _to_next(targets).reshape(count, -1),
-            tuple(f"{arm}_{number}" for arm in arms for number in MOTION),
+            action_names(robot, ActionSpace.TOOL_DELTA),
         ),
+        "intervention": (frames["intervention"], arms),
     }
     for name, (values, labels) in made.items():
         if not (finite := np.isfinite(values)).all():
             frame, column = np.argwhere(~finite)[0]
             raise RecordingError(f"{name}[{labels[column]}] is no finite number at frame {frame}")
-    return {name: values.astype(np.float32) for name, (values, _) in made.items()}, {
-        name: labels for name, (_, labels) in made.items()
+    return {str(name): values.astype(np.float32) for name, (values, _) in made.items()}, {
+        str(name): labels for name, (_, labels) in made.items()
     }
 
 

@@ -7,7 +7,8 @@ from typing import Protocol, runtime_checkable
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import check_kind
 from q2r2_control.plugins import INPUTS, load_class
-from q2r2_control.types import DeviceControls, HandSample, HapticFeedback
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import ActionChunk, DeviceControls, HandSample, HapticFeedback, Observation
 
 
 @runtime_checkable
@@ -41,6 +42,20 @@ class Input(Protocol):
 
     def close(self) -> None:
         """Release every resource; may be called twice."""
+
+
+@runtime_checkable
+class PolicySource(Input, Protocol):
+    """An input that brings actions of a policy too. In each run, ``prepare`` comes before ``start``."""
+
+    def prepare(self, robot: Robot, realtime: bool) -> None:
+        """A run of ``robot`` begins; in simulated time, the policy has to be waited for."""
+
+    def chunks(self) -> list[ActionChunk]:
+        """Chunks that came in since the last call, oldest first. Never waits and never raises."""
+
+    def observe(self, observation: Observation) -> None:
+        """The state of a tick, for the policy; its numbers stay as they are. In real time this never waits."""
 
 
 def options_of(source: str) -> tuple[str, ...]:

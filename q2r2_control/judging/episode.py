@@ -38,6 +38,7 @@ class Ticks:
     distance: Array  # (n,) of the nearest pair [m]
     margin: Array  # (n,) of the tightest pair, less the distance that it keeps [m]
     engaged: Flags  # (n, arms)
+    by_policy: Flags  # (n, arms) engaged, and a policy moves the arm
     rejected: Flags  # (n, arms) the target was not usable
     slip: Array  # (n, arms) how far the leash has dragged the target since engaging [m]
     slip_angle: Array  # (n, arms) [rad]
@@ -169,6 +170,7 @@ class _Read:
             distance=rows["closest_distance"],
             margin=rows["margin"],
             engaged=arms["engaged"] > 0.5,
+            by_policy=arms["policy"] > 0.5,
             rejected=arms["rejected"] > 0.5,
             slip=arms["slip"],
             slip_angle=arms["slip_angle"],

@@ -19,7 +19,7 @@ _SHORTEST = 1e-3  # of a time in which an arm counts as engaged [s]
 
 @dataclass(frozen=True, slots=True)
 class HandFigures:
-    """One hand, over the time for which the arm that it leads is engaged; None: that never is."""
+    """One hand, over the time for which it leads its engaged arm; None: that never is."""
 
     arm: str
     pose_rate_hz: float | None  # poses received, by the time
@@ -34,10 +34,10 @@ class HandFigures:
 def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
     """Figures of a hand's samples; ``dropout`` [s] is the longest time between poses that is none.
 
-    A time between poses, or from the last one to the end, counts as far as its arm is engaged and no tick was lost.
+    A time between poses, or from the last one to the end, counts as far as it leads its arm and no tick was lost.
     """
     ticks, samples = episode.ticks, episode.hands[hand]
-    engaged = ticks.engaged[:, episode.arms.index(samples.arm)] & ticks.following
+    engaged = (ticks.engaged & ~ticks.by_policy)[:, episode.arms.index(samples.arm)] & ticks.following
     steps = np.where(engaged, ticks.dt, 0.0)
     passed = np.cumsum(steps)  # while engaged [s]
     total = float(passed[-1]) if len(passed) else 0.0

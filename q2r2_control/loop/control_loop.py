@@ -119,12 +119,14 @@ class ControlLoop:
         grippers: Mapping[str, float],
         openings: Mapping[str, float],
         braked: float = 0.0,
+        posture: Array | None = None,
     ) -> LoopStep:
         """Move on by ``dt`` [s], after ``braked`` [s] of the certified stop, which the plant has begun by itself.
 
         ``state`` is the newest measured one, which was observed; ``targets`` are tool poses in the world frame, None:
         the arm holds. An arm whose targets come as messages is not among them. ``grippers`` are wanted openings,
-        ``openings`` the measured ones, 0 closed .. 1 fully open.
+        ``openings`` the measured ones, 0 closed .. 1 fully open. ``posture`` (nv,) [rad]: where
+        joints go that the targets leave free; None: home.
         """
         supervisor, refusals = self.supervisor, {}
         for arm, pose in targets.items():
@@ -136,7 +138,7 @@ class ControlLoop:
         if braked > 0.0:
             self.controller.brake(braked)
         was_inactive = supervisor.phase is Phase.INACTIVE
-        reference = supervisor.tick(now, dt)
+        reference = supervisor.tick(now, dt, posture)
         if was_inactive and supervisor.phase is Phase.ACTIVE and state is not None:
             self._begin(state, openings, now)
         if reference is None and self._owns_plant:

@@ -14,7 +14,7 @@ import pinocchio as pin
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.base import Input, PolicySource
 from q2r2_control.loop.control_loop import ArmConditions
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.gripper_limiter import Grip
@@ -22,7 +22,7 @@ from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import ArmTarget, HandSample
+from q2r2_control.types import ActionChunk, ArmTarget, HandSample, Observation
 from q2r2_control.wording import event_line, sentence
 
 _PERIOD = 0.02  # of looking at more of an arm than its events [s]
@@ -92,7 +92,7 @@ def _merged(old: Mapping[str, Any], changed: Mapping[str, Any]) -> dict[str, Any
 
 
 class OperatorSide:
-    """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and :meth:`vibrate`."""
+    """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and :meth:`feed_back`."""
 
     def __init__(
         self,
@@ -103,6 +103,8 @@ class OperatorSide:
         requests: PendingRequests,
     ) -> None:
         self._teleop, self._input, self._supervisor = teleop, source, supervisor
+        self._policy = source if isinstance(source, PolicySource) else None
+        self.chunks: list[ActionChunk] = []  # of a policy, since the last poll
         self._controller, self._requests = controller, requests
         self._homing = False  # supervision is on the way home
         self.connected = False
@@ -116,6 +118,7 @@ class OperatorSide:
     def poll(self, now: float) -> list[HandSample]:
         """Samples of the hands; a connection that is lost stops the arms that hands drive."""
         samples = self._input.poll(now)
+        self.chunks = [] if self._policy is None else self._policy.chunks()
         was_connected, self.connected = self.connected, self._input.connected
         if was_connected and not self.connected:
             self._teleop.connection_lost(now)
@@ -128,7 +131,8 @@ class OperatorSide:
         commanded = {arm: self._controller.tool_pose(arm) for arm in tools}
         # Arms whose plant ended its session wait for the next one, and a press is refused meanwhile.
         waits = self._supervisor.phase is not Phase.ACTIVE and self._supervisor.fault
-        targets = self._teleop.update(samples, tools, now, commanded, dict.fromkeys(tools, waits) if waits else None)
+        obstacles = dict.fromkeys(tools, waits) if waits else None
+        targets = self._teleop.update(samples, tools, now, commanded, obstacles, chunks=self.chunks)
         self._go_home(now)
         return targets
 
@@ -142,9 +146,11 @@ class OperatorSide:
                 _logger.debug("%s arm: %s -> %s", event.arm, event.source, event_line(event))
         return events
 
-    def vibrate(self, tick: Tick) -> None:
-        """Send the vibrations of one tick to the hands."""
+    def feed_back(self, tick: Tick) -> None:
+        """Send the vibrations of one tick to the hands, and what a policy may see of it."""
         now = tick.now
+        if self._policy is not None:
+            self._policy.observe(Observation(now, tick.state, tick.openings, tick.tools))
         for event in tick.events:
             self._pulses[event.arm].start_pulse(event)
         self._conditions.note(tick.reference.report, now)

@@ -17,7 +17,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive, permitted
 from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.inputs.base import Input, make_input
+from q2r2_control.inputs.base import Input, PolicySource, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
 from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock
 from q2r2_control.pipeline.operator_side import OperatorSide, PendingRequests
@@ -32,7 +32,7 @@ from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import LONGEST_DT, ArmTarget, CommandMode, RobotState
+from q2r2_control.types import LONGEST_DT, ArmTarget, Array, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
 STOPPING = "stopping"  # state of every arm while the run ends
@@ -133,6 +133,8 @@ class Pipeline:
             raise ConfigError("simulated time: allowed with a plant that is simulated only")
         self._prepare(realtime)
         try:
+            if isinstance(self.input, PolicySource):
+                self.input.prepare(self.robot, realtime)
             self.input.start()
             with stop_on_signals(self.stop), few_garbage_collections():
                 self._begin(realtime)
@@ -257,7 +259,9 @@ class Pipeline:
             connected=self._operator.connected,
             samples=samples,
             targets=self._targets,
+            chunks=self._operator.chunks if self._following else [],
             engaged=self.teleop.engaged if self._following else dict.fromkeys(self._targets, False),
+            interventions=self.teleop.interventions if self._following else dict.fromkeys(self._targets, False),
             states={arm: str(value) if self._following else STOPPING for arm, value in self.teleop.states.items()},
             reference=step.reference,
             state=state,
@@ -275,7 +279,7 @@ class Pipeline:
             sessions={} if self._sessions is None else self._sessions.sessions(),
         )
         if self._following:
-            self._operator.vibrate(tick)
+            self._operator.feed_back(tick)
         self._recorder.add(tick)
         return tick
 
@@ -284,13 +288,23 @@ class Pipeline:
         pin.forwardKinematics(model, data, state.q)
         return {name: pin.updateFramePlacement(model, data, arm.frame_id).copy() for name, arm in arms.items()}
 
+    def _posture(self) -> Array | None:
+        """The joint positions that a policy asks for, arm by arm; None: it asks for none."""
+        asked = {arm: posture for arm, target in self._targets.items() if (posture := target.posture) is not None}
+        if not asked:
+            return None
+        q = self.robot.home.copy()
+        for arm, posture in asked.items():
+            q[self.robot.arms[arm].joints] = posture[self.robot.arms[arm].joints]
+        return q
+
     def _control(
         self, state: RobotState, openings: Mapping[str, float], now: float, dt: float, braked: float
     ) -> LoopStep:
         """From measurements and targets to a command. While a run ends, the operator asks for nothing."""
         poses = {arm: target.command for arm, target in self._targets.items()} if self._following else {}
         grippers = {arm: target.gripper for arm, target in self._targets.items()}
-        step = self.loop.step(state, poses, now, dt, grippers, openings, braked)
+        step = self.loop.step(state, poses, now, dt, grippers, openings, braked, self._posture())
         self._grippers = step.grippers
         for refusal in step.refusals.values():
             self.teleop.pause(now, refusal)  # or the operator would think that the arm follows

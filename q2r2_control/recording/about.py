@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # the writer's process does without them
     from q2r2_control.pipeline.pipeline import Pipeline
     from q2r2_control.robot.robot import Robot
 
-FORMAT = "3"  # of topics and fields; another one cannot be replayed
+FORMAT = "4"  # of topics and fields; another one cannot be replayed
 LOOP, ROS = "loop", "ros"  # sources: one loop's ticks, or what nodes published
 ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # metadata records
 CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"

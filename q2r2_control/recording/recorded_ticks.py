@@ -17,7 +17,7 @@ from q2r2_control.recording.tick_rows import HAND_FAULTS, NOT_MEASURED, SAMPLE_F
 from q2r2_control.recording.writer import RecordedRobot
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import RunStart
-from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, HandInputs, HandSample, RobotState
+from q2r2_control.types import QUEST_CONTROLS, SIDES, ActionChunk, Array, HandInputs, HandSample, RobotState
 
 _SAME_POSE = 1e-6  # [m], and of a quaternion
 
@@ -30,6 +30,7 @@ class RecordedTick:
     following: bool
     connected: bool
     samples: list[HandSample]
+    chunks: list[ActionChunk]
     state: RobotState
     openings: dict[str, float]
     unsolved: int
@@ -84,7 +85,8 @@ class RecordedTicks:
                 at_start = RobotState(**numbers, tau_external=felt, stamp=start["stamp"])
                 self._starts.append(RunStart(start["now"], at_start))
             samples, openings = chunk.samples[first:end], row["arms"]["opening"].tolist()
-            more = (json.loads(state) if state else {}).get("more_inputs", [{}] * len(samples))
+            text = json.loads(state) if state else {}
+            more = text.get("more_inputs", [{}] * len(samples))
             external = row["tau_external"].copy() if row["external"] else None
             yield RecordedTick(
                 number=number,
@@ -93,6 +95,7 @@ class RecordedTicks:
                 following=bool(row["following"]),
                 connected=bool(row["connected"]),
                 samples=list(map(_sample, samples, more)),
+                chunks=[ActionChunk.from_json(data) for data in text.get("chunks", [])],
                 state=RobotState(
                     row["q"].copy(), row["v"].copy(), row["tau"].copy(), external, float(row["state_stamp"])
                 ),

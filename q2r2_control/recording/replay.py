@@ -26,7 +26,17 @@ from q2r2_control.recording.tick_rows import NOT_REPLAYED, TickPacker, tick_labe
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import QUEST_CONTROLS, Array, Command, CommandMode, HandSample, HapticFeedback, RobotState
+from q2r2_control.types import (
+    QUEST_CONTROLS,
+    ActionChunk,
+    Array,
+    Command,
+    CommandMode,
+    HandSample,
+    HapticFeedback,
+    Observation,
+    RobotState,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +154,7 @@ class _Clock(LoopClock):
 
 
 class _Recorded:
-    """Samples and measured states of the recorded tick; commands move nothing. Implements Input and Plant."""
+    """Samples and measured states of the recorded tick; commands move nothing. Implements PolicySource and Plant."""
 
     controls = QUEST_CONTROLS
 
@@ -162,12 +172,17 @@ class _Recorded:
         self._on_tick(self._ticks.current)
         return self._ticks.current.samples
 
+    def chunks(self) -> list[ActionChunk]:
+        return [] if self._ticks.current is None else self._ticks.current.chunks
+
     def state(self) -> RobotState:
         return self._ticks.start.state if self._ticks.current is None else self._ticks.current.state
 
     def gripper_openings(self) -> dict[str, float]:
         return {} if self._ticks.current is None else self._ticks.current.openings
 
+    def prepare(self, robot: Robot, realtime: bool) -> None: ...
+    def observe(self, observation: Observation) -> None: ...
     def start(self) -> None: ...
     def send_haptic(self, feedback: HapticFeedback) -> None: ...
     def reset(self, q: Array | None = None) -> None: ...

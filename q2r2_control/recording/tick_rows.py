@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
-from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, CommandMode, HandFault, HandSample, StepStatus
+from q2r2_control.types import POSE_FIELDS, QUEST_CONTROLS, SIDES, Array, CommandMode, HandFault, HandSample, StepStatus
 
 if TYPE_CHECKING:  # the writer's process does without the loop's modules
     from q2r2_control.summary.tick import Tick
@@ -29,9 +29,9 @@ SAMPLE_FIELDS = (
     *QUEST_CONTROLS.names,
     "fault",
 )
-POSE_FIELDS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 ARM_FIELDS = (
     *("opening", "engaged", "slip", "slip_angle", "wanted", "commanded", "rejected", "gripper_held", "holding"),
+    *("intervention", "policy"),
 )
 ARM_POSES = ("filtered_hand", "target", "tool")  # zeros: none; the tool is at the reference
 NOT_REPLAYED = ("compute_time", "solve_time", "tool")  # the writer adds the tool, which follows from the reference
@@ -50,7 +50,7 @@ class PackedTick(NamedTuple):
 
     row: bytes  # of tick_type
     samples: bytes  # float64 of SAMPLE_FIELDS, one after the other
-    state: str  # JSON where it changed or samples have controls of their device's own, else empty
+    state: str  # JSON where it changed, a chunk came or samples have controls of their device's own
 
     @property
     def size(self) -> int:
@@ -130,6 +130,7 @@ class TickPacker:
         return (
             *(opening, tick.engaged[arm], target.slip, target.slip_angle, target.gripper, commanded),
             *(arm in tick.reference.report.rejected, arm in tick.held_grippers, tick.holding.get(arm, False)),
+            *(tick.interventions.get(arm, False), tick.by_policy(arm)),
             *position,
             *rotation,
             *(_NO_POSE if target.command is None else pin.SE3ToXYZQUATtuple(target.command)),
@@ -149,9 +150,11 @@ class TickPacker:
             "holding": tick.holding,
         }
         more = [sample.inputs.more for sample in samples]
-        if state == self._state and not tick.events and not any(more):
+        if state == self._state and not tick.events and not tick.chunks and not any(more):
             return ""
         before, self._state = self._state, dict(state)
+        if tick.chunks:
+            state["chunks"] = [chunk.as_json() for chunk in tick.chunks]
         if tick.events:
             state["events"] = [event.as_json() for event in tick.events]
         if any(more):

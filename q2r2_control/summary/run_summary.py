@@ -107,6 +107,9 @@ class ArmSummary:
     slip_deg_max: float = 0.0
     yielded_mm_max: float = 0.0  # largest displacement of the target by the admittance, in position mode
     yielded_deg_max: float = 0.0
+    policy_s: float = 0.0  # moved by a policy
+    interventions: int = 0  # times that a hand took over from a policy
+    intervention_s: float = 0.0
     end_error_mm: float | None = None  # of the measured tool from the reference's at the end; None: not measured
 
     @property
@@ -152,12 +155,18 @@ class _ArmStatistics:
         self._name = name
         self.summary = ArmSummary()
         self._gripper: float | None = None
+        self._intervenes = False
         self._squares, self._ticks = np.zeros(2), 0  # of the errors [m^2], [rad^2]
 
     def add(self, tick: Tick) -> None:
         name, summary = self._name, self.summary
         if (target := tick.targets.get(name)) is not None:
             self._add_target(target, tick)
+        intervenes = tick.interventions.get(name, False)
+        summary.interventions += intervenes and not self._intervenes
+        summary.intervention_s += tick.dt if intervenes else 0.0
+        summary.policy_s += tick.dt if tick.by_policy(name) else 0.0
+        self._intervenes = intervenes
         if (pair := tick.held_grippers.get(name)) is not None:
             summary.gripper_held_s += tick.dt
             summary.gripper_held_by = pair

@@ -11,7 +11,8 @@ from q2r2_control.compliance.admittance import AdmittanceReport
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.events import Event
-from q2r2_control.types import ArmTarget, Command, HandSample, Reference, RobotState
+from q2r2_control.teleop.arm_states import ArmState
+from q2r2_control.types import ActionChunk, ArmTarget, Command, HandSample, Reference, RobotState
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,13 @@ class Tick:
     admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
     held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)  # see :attr:`ControlLoop.held_grippers`
     holding: dict[str, bool] = field(default_factory=dict)  # arm whose gripper has an object -> whether it holds it
+    chunks: list[ActionChunk] = field(default_factory=list)  # of a policy, as they came
+    interventions: dict[str, bool] = field(default_factory=dict)  # arm -> whether a hand moves it instead of a policy
     sessions: dict[str, str] = field(default_factory=dict)  # of arms that follow during sessions only, in words
+
+    def by_policy(self, arm: str) -> bool:
+        """Whether a policy moves the arm."""
+        return self.states[arm] == ArmState.POLICY
 
     def tracking_error(self, arm: str) -> tuple[float, float]:
         """Distance [m] and angle [rad] of an arm's tool from its target; NaN where it has none."""

@@ -129,8 +129,11 @@ class Supervisor:
             return Reason(ReasonKind.CONTROLLER_PAUSED)
         return Reason(ReasonKind.ARMS_HOMING) if self.homing.active else None
 
-    def tick(self, now: float, dt: float) -> Reference | None:
-        """Move on by ``dt`` [s]; the reference to be commanded, or None."""
+    def tick(self, now: float, dt: float, posture: Array | None = None) -> Reference | None:
+        """Move on by ``dt`` [s]; the reference to be commanded, or None.
+
+        ``posture`` (nv,) [rad]: where joints go that the targets leave free; None: home.
+        """
         if self.phase is Phase.INACTIVE:
             if self._watch.settled(now):
                 self._activate()
@@ -143,7 +146,7 @@ class Supervisor:
             self._brake(Reason(ReasonKind.JOINT_STATES, cause=fault))
         self.events += self.targets.expire(now)
         targets = self.homing.targets(self._last, dt) if self.homing.active else self.targets.at(now)
-        self._last = reference = self._step(targets, dt)
+        self._last = reference = self._step(targets, dt, posture)
         if self.phase is Phase.ACTIVE:
             self._compare(reference, now)
             if outcome := self.homing.check(reference):
@@ -152,14 +155,14 @@ class Supervisor:
             self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
         return reference
 
-    def _step(self, targets: dict[str, pin.SE3 | None], dt: float) -> Reference:
+    def _step(self, targets: dict[str, pin.SE3 | None], dt: float, posture: Array | None) -> Reference:
         state = self._watch.state
         if state is None or self.phase is not Phase.ACTIVE:
             return self._controller.step(targets, dt)
         if self._displace is not None:
             targets = self._displace(targets, state, dt)
         if self._external is None:
-            return self._controller.step(targets, dt)
+            return self._controller.step(targets, dt, posture)
         return self._controller.step(self._external.targets(targets, self._last), dt, state.q)
 
     def _compare(self, reference: Reference, now: float) -> None:

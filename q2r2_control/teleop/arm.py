@@ -80,6 +80,7 @@ class ArmTeleop:
         self._gate = PoseGate(settings.gate)
         self._use_controls(settings)
         self._inputs_stamp = -math.inf  # of the newest reading of the controls [s]
+        self.heard_of = False  # whether its hand has ever told its controls
         self._presses: list[Press] = []
         self.gripped: bool | None = None  # the dead man was just held, or let go
         self._aligned_at = 0.0
@@ -108,7 +109,7 @@ class ArmTeleop:
         """Process one sample of this arm's hand; returns the fault that forbids to follow it any longer, or None."""
         stamp = min(sample.inputs_stamp, now)
         if -math.inf < stamp and self._inputs_stamp <= stamp:  # an older reading was overtaken, and says nothing
-            self._inputs_stamp = stamp
+            self._inputs_stamp, self.heard_of = stamp, True
             self._presses += self._gestures.receive(sample.inputs, stamp)
             before = self._held.actions
             self._held.receive(sample.inputs)
@@ -136,7 +137,7 @@ class ArmTeleop:
         self._gestures.cancel()
         self._presses.clear()
         self.gripped = None
-        self._go(cause, now, reason)
+        self.go(cause, now, reason)
         if self.state is ArmState.STOPPED:
             self._analog.forget()
 
@@ -165,12 +166,12 @@ class ArmTeleop:
     def act(self, presses: Iterable[Press], around: ArmMeasurements, now: float, chord: bool) -> None:
         """Change the state by this hand's gestures, and by chords; ``chord``: whether a hand holds one."""
         if self.gripped is False:
-            self._go(Cause.LET_GO, now, Reason(ReasonKind.DEAD_MAN_RELEASED))
+            self.go(Cause.LET_GO, now, Reason(ReasonKind.DEAD_MAN_RELEASED))
         if chord:
             self._aligned_at = now
             # The other hand's chord does not say what this one's press is.
             if self.state is not ArmState.PAUSING or self.chord:
-                self._go(Cause.CHORD, now, Reason(ReasonKind.ALIGNMENT_CHORD))
+                self.go(Cause.CHORD, now, Reason(ReasonKind.ALIGNMENT_CHORD))
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
             self._engage(Cause.ALIGNED, around, now, Reason(ReasonKind.ALIGNED))
         elif self.gripped:
@@ -192,9 +193,9 @@ class ArmTeleop:
         reason = pressed(control)
         if gesture is Gesture.DOWN:
             if pauses:
-                self._go(Cause.PAUSE_BEGINS, now, reason)
+                self.go(Cause.PAUSE_BEGINS, now, reason)
         elif pauses and self.state is ArmState.PAUSING:
-            self._go(Cause.PAUSE, now, reason)
+            self.go(Cause.PAUSE, now, reason)
         elif action is Action.GRIPPER_TOGGLE:
             self.gripper = CLOSED if self.gripper == OPEN else OPEN
         elif action is Action.PAUSE_TOGGLE:
@@ -203,7 +204,8 @@ class ArmTeleop:
     def _engage(self, cause: Cause, around: ArmMeasurements, now: float, reason: Reason) -> None:
         if next_state(self.state, cause) is self.state:
             return
-        obstacle, anchor = around.obstacles.get(self.arm) or self.watchdog(now), around.anchor(self.arm)
+        obstacle = around.obstacles.get(self.arm) or self.watchdog(now)
+        anchor = around.last_target(self.arm) if self.state is ArmState.POLICY else around.anchor(self.arm)
         if self._gate.pose is None:
             obstacle = obstacle or self._gate.problem
         elif anchor is None or not np.isfinite(anchor.tool.homogeneous).all():
@@ -213,9 +215,9 @@ class ArmTeleop:
             self.motion.anchor(self._gate.pose, floats_of(anchor.tool), self._shares(), now)
         refusal = Reason(ReasonKind.NOT_ENGAGED, cause=obstacle)
         if obstacle is None:
-            self._go(cause, now, reason)
+            self.go(cause, now, reason)
         elif self.state is ArmState.ALIGNING:
-            self._go(Cause.NOT_ALIGNED, now, refusal)
+            self.go(Cause.NOT_ALIGNED, now, refusal)
         else:
             self.record_event(now, refusal)
 
@@ -224,7 +226,8 @@ class ArmTeleop:
         share = self._settings.precision_scale if Action.PRECISION in held else 1.0
         return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
 
-    def _go(self, cause: Cause, now: float, reason: Reason) -> None:
+    def go(self, cause: Cause, now: float, reason: Reason) -> None:
+        """Follow a cause; presses that began before go on."""
         state = next_state(self.state, cause)
         if state is not self.state:
             self.events.append(Event(now, self.arm, self.state, state, reason))

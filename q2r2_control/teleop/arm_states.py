@@ -9,7 +9,7 @@ from q2r2_control.events import REFUSALS, Event
 
 
 class ArmState(StrEnum):
-    """In every state but ENGAGED, CARRIED and HOMING an arm holds."""
+    """In every state but ENGAGED, CARRIED, POLICY and HOMING an arm holds."""
 
     IDLE = "idle"  # was never engaged
     ENGAGED = "engaged"
@@ -17,6 +17,7 @@ class ArmState(StrEnum):
     PAUSED = "paused"
     ALIGNING = "aligning"  # stopped by the alignment chord; anchored when the buttons are released
     CARRIED = "carried"  # goes with the other arm, which is engaged: one hand moves both
+    POLICY = "policy"  # follows the actions of a policy
     HOMING = "homing"
     LOST = "lost"  # stopped by what its operator did not press
     STOPPED = "stopped"  # by its operator, until that is taken back
@@ -34,6 +35,7 @@ class Cause(StrEnum):
     NOT_ALIGNED = "the same, with something in the way"
     CARRY = "the control that carries, by the hand of the other arm, which is engaged"
     CARRY_ENDS = "that control, one that pauses or an alignment, by either hand"
+    POLICY_ACTS = "an action of a policy counts, with nothing in the way"
     HOME = "the control that brings the arms home, with nothing in the way"
     HOMED = "home, or held up on the way"
     PRESS = "any press"
@@ -62,9 +64,9 @@ class Transition(NamedTuple):
 _S = ArmState
 AT_REST = frozenset({_S.IDLE, _S.PAUSED, _S.LOST})  # may be engaged
 HOLDING = AT_REST | {_S.STOPPED}
-FOLLOWING = frozenset({_S.ENGAGED, _S.PAUSING, _S.ALIGNING, _S.CARRIED})
+FOLLOWING = frozenset({_S.ENGAGED, _S.PAUSING, _S.ALIGNING, _S.CARRIED, _S.POLICY})
 TRANSITIONS = (
-    Transition(AT_REST, Cause.ENGAGE, _S.ENGAGED),
+    Transition(AT_REST | {_S.POLICY}, Cause.ENGAGE, _S.ENGAGED),
     Transition(frozenset({_S.ENGAGED}), Cause.PAUSE_BEGINS, _S.PAUSING),
     Transition(frozenset({_S.PAUSING}), Cause.PAUSE, _S.PAUSED),
     Transition(frozenset({_S.ENGAGED, _S.ALIGNING}), Cause.LET_GO, _S.PAUSED),
@@ -73,8 +75,9 @@ TRANSITIONS = (
     Transition(frozenset({_S.ALIGNING}), Cause.NOT_ALIGNED, _S.LOST),
     Transition(AT_REST | {_S.ENGAGED}, Cause.CARRY, _S.CARRIED),
     Transition(frozenset({_S.ENGAGED, _S.CARRIED}), Cause.CARRY_ENDS, _S.PAUSED, Who.BOTH),
+    Transition(AT_REST, Cause.POLICY_ACTS, _S.POLICY),
     Transition(FOLLOWING, Cause.FAULT, _S.LOST, Who.LINKED),
-    Transition(AT_REST | {_S.ENGAGED, _S.PAUSING}, Cause.HOME, _S.HOMING, Who.BOTH),
+    Transition(AT_REST | {_S.ENGAGED, _S.PAUSING, _S.POLICY}, Cause.HOME, _S.HOMING, Who.BOTH),
     Transition(frozenset({_S.HOMING}), Cause.HOMED, _S.PAUSED, Who.BOTH),
     Transition(frozenset({_S.HOMING}), Cause.PRESS, _S.PAUSED, Who.BOTH),
     Transition(frozenset({_S.HOMING}), Cause.FAULT, _S.LOST, Who.BOTH),

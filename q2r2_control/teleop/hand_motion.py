@@ -144,6 +144,10 @@ class ArmMeasurements:
         offset = None if commanded is None else measured.translation - commanded.translation
         return Anchor(tool, offset if offset is not None and math.hypot(*offset) <= MAX_OFFSET[0] else None)
 
+    def last_target(self, arm: str) -> Anchor | None:
+        """Where a policy left the target; None: there is none."""
+        return Anchor(self.targets[arm]) if arm in self.targets else None
+
     def expected(self, arm: str, offset: Array | None) -> Pose | None:
         """Where a tool with this offset is to be measured, by what is commanded. None: not known."""
         if self.commanded is None or (commanded := self.commanded.get(arm)) is None:

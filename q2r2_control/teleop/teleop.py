@@ -14,10 +14,11 @@ from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import AT_REST, FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import BothArms
 from q2r2_control.teleop.hand_motion import ArmMeasurements
-from q2r2_control.types import ArmTarget, HandSample
+from q2r2_control.teleop.policy_side import PolicySide
+from q2r2_control.types import ActionChunk, ArmTarget, HandSample
 
 _BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
-_LED = FOLLOWING - {ArmState.CARRIED}  # by their own hand, which does not move an arm that is carried
+_LED = FOLLOWING - {ArmState.CARRIED, ArmState.POLICY}  # by their own hand, which moves no other arm
 
 
 class Teleop:
@@ -38,6 +39,7 @@ class Teleop:
     def __init__(self, settings: TeleopSettings, arms: Sequence[str]) -> None:
         self._pair = BothArms(settings, arms)
         self._arms = self._pair.arms
+        self._policy = PolicySide(self._arms, settings)
         self.marks = self._pair.marks  # the operator's, of the recording
         self._commanded: dict[str, pin.SE3] = {}
         self._now: float | None = None
@@ -60,6 +62,7 @@ class Teleop:
             return Reason(ReasonKind.ARMS_MUST_HOLD)
         self._use(settings)
         self._pair.use(settings)
+        self._policy.configure(settings)
         for name, arm in self._arms.items():
             arm.configure(settings, self._commanded.get(name), now)
             if turned:
@@ -74,8 +77,13 @@ class Teleop:
 
     @property
     def engaged(self) -> dict[str, bool]:
-        """Whether each arm follows a hand now."""
-        return {name: arm.state in _BY_HANDS for name, arm in self._arms.items()}
+        """Whether each arm follows a hand or a policy now."""
+        return {name: arm.state in (*_BY_HANDS, ArmState.POLICY) for name, arm in self._arms.items()}
+
+    @property
+    def interventions(self) -> dict[str, bool]:
+        """Whether a hand moves each arm in the place of a policy, which has sent actions before."""
+        return {name: self._policy.seen and arm.state in _BY_HANDS for name, arm in self._arms.items()}
 
     @property
     def aligning(self) -> bool:
@@ -106,8 +114,9 @@ class Teleop:
         commanded: Mapping[str, pin.SE3] | None = None,
         obstacles: Mapping[str, Reason] | None = None,
         in_step: bool = True,
+        chunks: Sequence[ActionChunk] = (),
     ) -> dict[str, ArmTarget]:
-        """One tick: process the samples and compute every arm's target.
+        """One tick: process the samples, and a policy's ``chunks``, and compute every arm's target.
 
         ``tools``: measured tool poses in the world frame. ``commanded``: those of the controller's reference, which the
         leash is tied to; without it there is no leash. ``obstacles``: reasons outside of this layer against engaging an
@@ -130,6 +139,7 @@ class Teleop:
         chord = self.aligning
         for name, arm in self._arms.items():
             arm.act(presses[name], around, now, chord)
+        self._policy.update(chunks, around, now, clock_fault)
         return self._targets(now, around)
 
     def _targets(self, now: float, around: ArmMeasurements) -> dict[str, ArmTarget]:
@@ -143,15 +153,18 @@ class Teleop:
             self._commanded |= (carried := carry.targets(now, expected, expected if around.in_step else {}))
         targets = {}
         for name, arm in self._arms.items():
-            pose = hand = None
+            pose = hand = posture = None
             if carry is not None:
                 pose = carried[name]
             elif arm.state is ArmState.ENGAGED:
                 self._commanded[name] = pose = se3_of(arm.target(now, around.expected(name, arm.offset)))
+            elif arm.state is ArmState.POLICY:
+                self._commanded[name] = pose = self._policy.target(name, around, now)
+                posture = self._policy.posture(name, now)
             if arm.state is ArmState.ENGAGED:
                 hand = arm.motion.filtered
             slip, slip_angle = (arm if carry is None else carry.leader).motion.slip
-            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.offset, hand)
+            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.offset, hand, posture)
         return targets
 
     def home(self, now: float) -> None:

@@ -27,6 +27,7 @@ _REFRESH_RATE = 6.0  # [Hz]
 # The loop gets the interpreter back within this time from drawing, which takes milliseconds of Python at a time [s].
 _SWITCH_INTERVAL = 2e-5
 _LIMITS_SHOWN = 4
+_FOLLOWS_WHAT = {str(ArmState.CARRIED): "goes with the other arm", str(ArmState.POLICY): "follows the policy"}
 _NEAR = 0.01  # a pair with less to spare is coloured [m]
 
 
@@ -45,7 +46,7 @@ def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[Activ
         return sentence(last.reason) if last.kind in REFUSALS else f"{tick.states[arm]}: {sentence(last.reason)}"
     distance, angle = tick.tracking_error(arm)
     if not (distance > _FOLLOWS or angle > _TURNED):
-        return "goes with the other arm" if tick.states[arm] == ArmState.CARRIED else "follows the hand"
+        return _FOLLOWS_WHAT.get(tick.states[arm], "follows the hand")
     return _held_by(tick, arm, joints, binding) or ("catches up" if np.isfinite(distance) else "holds")
 
 

@@ -66,3 +66,28 @@ def test_a_plant_without_pictures_is_named_and_recorded_without(tmp_path: Path) 
     assert result.exit_code == 0
     assert "no pictures are recorded: the kinematic plant has none; allowed: --plant mujoco\n" in result.stderr
     assert Recording(Path(one_object(result.stdout)["recording"]["file"])).about.cameras == ()
+
+
+POLICY = """
+class Still:
+    rate = 20.0
+
+    def __call__(self, observation):
+        return observation.state.q
+"""
+
+
+def test_a_policy_of_this_folder_runs_and_is_refused_with_another_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "still_policy.py").write_text(POLICY)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    policy = ("--policy", "still_policy:Still")
+    options = ("run", FAST[1], "--plant", "kinematic", "--fast", "--headless", "--duration", "0.3")
+    result = q2r2(*options, "--input", "policy", *policy, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert one_object(result.stdout)["arms"]["left"]["policy_s"] == pytest.approx(0.3, abs=0.01)
+    assert "0 interventions" in q2r2(*options, "--input", "policy", *policy).stdout
+    assert "--policy cannot be used with --input scripted" in q2r2(*options, "--input", "scripted", *policy).stderr
+    assert "--policy MODULE:NAME is missing" in q2r2(*options, "--input", "policy").stderr

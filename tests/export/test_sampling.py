@@ -16,7 +16,8 @@ import pytest
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import RecordingError
-from q2r2_control.export.sampling import MOTION, CameraFrames, features, sample
+from q2r2_control.export.sampling import CameraFrames, features, sample
+from q2r2_control.inputs.policy import MOTION_FIELDS
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.tick_rows import NOT_MEASURED, POSE_FIELDS
 from q2r2_control.robot.robot import Robot
@@ -137,6 +138,7 @@ def frames(seed: int = 0) -> dict[str, Array]:
         "gripper": random.uniform(size=(COUNT, 2)),
         "target": np.array([poses(q) for q in motion()]),
         "reference_tool": np.array([poses(q) for q in reference]),
+        "intervention": random.integers(2, size=(COUNT, 2)).astype(np.float64),
     }
 
 
@@ -151,6 +153,7 @@ def test_every_number_has_the_name_of_its_joint_or_gripper() -> None:
         ("action", robot().joint_names, "reference"),
         ("observation.state", grippers, "opening"),
         ("action", grippers, "gripper"),
+        ("intervention", list(robot().arms), "intervention"),
     ):
         columns = [names[feature].index(label) for label in labels]
         np.testing.assert_array_equal(vectors[feature][:, columns], given[what].astype(np.float32))
@@ -170,7 +173,7 @@ def test_tool_deltas_lead_from_each_target_to_the_next_and_nowhere_from_the_last
     vectors, names = features(frames(), robot())
     for arm in robot().arms:
         targets = vectors["action.tool"][:, [names["action.tool"].index(f"{arm}_{number}") for number in POSE_FIELDS]]
-        at = [names["action.tool_delta"].index(f"{arm}_{number}") for number in MOTION]
+        at = [names["action.tool_delta"].index(f"{arm}_{number}") for number in MOTION_FIELDS]
         deltas = vectors["action.tool_delta"][:, at].astype(np.float64)
         places = [pin.XYZQUATToSE3(pose.astype(np.float64)) for pose in targets]
         for now, then, delta in zip(places, places[1:], deltas, strict=False):

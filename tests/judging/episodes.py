@@ -60,6 +60,7 @@ def episode(
         distance=np.full(count, 0.1),
         margin=np.full(count, 0.08),
         engaged=np.ones((count, 2), dtype=bool) if engaged is None else np.stack((engaged, engaged), axis=1),
+        by_policy=flags,
         rejected=flags,
         slip=np.zeros((count, 2)),
         slip_angle=np.zeros((count, 2)),

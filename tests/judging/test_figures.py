@@ -54,6 +54,12 @@ class TestHands:
         found = hand(received=())
         assert (found.pose_rate_hz, found.dropouts, found.sample_age_ms_p99) == (0.0, 1, None)
 
+    def test_a_hand_is_not_missed_while_a_policy_moves_its_arm(self) -> None:
+        by_policy = np.zeros((2000, 2), dtype=bool)
+        assert hand(received=(), by_policy=~by_policy).longest_gap_s is None
+        by_policy[500:1500] = True
+        assert hand(received=without(1.1, 2.9), by_policy=by_policy).dropouts == 0
+
     def test_of_a_gap_only_the_time_counts_in_which_the_arm_is_engaged(self) -> None:
         found = hand(engaged=engaged_until(500, 1500), received=without(1.1, 2.9))
         assert (found.dropouts, found.dropout_share) == (0, 0.0)

@@ -74,7 +74,7 @@ def test_an_input_a_plant_and_a_task_written_as_the_page_says_run_in_one_pipelin
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"input": "joystick"}, "input 'joystick': allowed are broken, headset, scripted, swing"),
+        ({"input": "joystick"}, "input 'joystick': allowed are broken, headset, policy, scripted, swing"),
         ({"input": "broken"}, "broken = my_package:Nothing"),
         ({"plant": "gazebo"}, "plant 'gazebo': allowed are fri, kinematic, lagging, mujoco"),
         (

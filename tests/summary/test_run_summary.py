@@ -30,7 +30,8 @@ KEYS = (
 )
 ARM_KEYS = (
     "engaged_s position_error_mm_rms rotation_error_deg_rms gripper_changes gripper_held_s gripper_held_by "
-    "object_held_s slip_mm_max slip_deg_max yielded_mm_max yielded_deg_max end_error_mm"
+    "object_held_s slip_mm_max slip_deg_max yielded_mm_max yielded_deg_max "
+    "policy_s interventions intervention_s end_error_mm"
 )
 REPORT = StepReport(StepStatus.OK, (), (), ("left_a", "right_b"), 0.2, True, False, 0.0, 1e-5)
 

@@ -9,7 +9,7 @@ import pytest
 from q2r2_control.teleop.arm_states import TRANSITIONS, ArmState, Cause, Transition, Who, next_state
 from tests.support.docs import table_rows
 
-RESTS = set(ArmState) - {ArmState.ENGAGED, ArmState.CARRIED, ArmState.HOMING}
+RESTS = set(ArmState) - {ArmState.ENGAGED, ArmState.CARRIED, ArmState.POLICY, ArmState.HOMING}
 
 
 def documented(sources: str, cause: str, destination: str, who: str) -> Transition:
@@ -31,9 +31,9 @@ def test_no_state_has_two_ways_for_one_cause() -> None:
     assert {line.destination for line in TRANSITIONS} | {ArmState.IDLE} == set(ArmState)
 
 
-def test_an_arm_is_set_in_motion_by_its_operator_alone() -> None:
+def test_an_arm_is_set_in_motion_by_its_operator_or_a_policy_alone() -> None:
     begins = {line.cause for line in TRANSITIONS if line.destination not in RESTS and line.sources & RESTS}
-    assert begins == {Cause.ENGAGE, Cause.ALIGNED, Cause.CARRY, Cause.HOME}
+    assert begins == {Cause.ENGAGE, Cause.ALIGNED, Cause.CARRY, Cause.POLICY_ACTS, Cause.HOME}
 
 
 @pytest.mark.parametrize("state", ArmState)

@@ -1,0 +1,33 @@
+"""A policy drives the arms, within every promise. A trained one computes its actions from the observation."""
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control import Pipeline, load_config
+from q2r2_control.inputs.policy import PolicyInput
+from q2r2_control.types import Array, Observation
+
+
+class Circles:
+    """Both tools go round circles. The numbers are those of a dataset's action.tool: x y z qx qy qz qw of each arm."""
+
+    space = "action.tool"
+    rate = 30.0  # actions a second
+
+    def __init__(self) -> None:
+        self.start: Observation | None = None
+
+    def __call__(self, observation: Observation) -> Array:
+        """The actions of the next half second, the first of them for the observation's time."""
+        self.start = self.start or observation
+        t = observation.time - self.start.time + np.arange(15) / self.rate
+        poses = np.array([[pin.SE3ToXYZQUAT(tool) for tool in self.start.tools.values()]] * len(t))
+        poses[:, :, 1] += 0.05 * np.sin(2.0 * t)[:, None]
+        poses[:, :, 2] += 0.05 * (1.0 - np.cos(2.0 * t))[:, None]
+        return poses.reshape(len(t), -1)
+
+
+config = load_config("config/dual_iiwa7.yaml")
+summary = Pipeline.from_config(config, input=PolicyInput(Circles()), plant="mujoco").run(4.0, realtime=False)
+for name, arm in summary.arms.items():
+    print(f"{name} arm: {arm.policy_s:.1f} s by the policy, tracking error {arm.position_error_mm_rms:.1f} mm RMS")

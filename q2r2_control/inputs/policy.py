@@ -1,0 +1,292 @@
+"""Actions of a policy as an input: those that a dataset has move the arms again.
+
+The numbers of an action are those of the features of datasets, in their order: :class:`ActionSpace`. They are checked
+where they come in, on the policy's own thread, and become tool poses there. Teleop follows these as it follows a hand.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+
+from q2r2_control.config.cell import Config
+from q2r2_control.errors import ConfigError, shown
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.inputs.base import Input, make_input
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import POSE_FIELDS, QUEST_CONTROLS, ActionChunk, Array, HandSample, HapticFeedback, Observation
+
+MOTION_FIELDS = ("x", "y", "z", "rx", "ry", "rz")
+_GAPS = 0.002, 0.5  # from one action to the next [s]
+_LARGEST = 1e3  # of any number, in metres or radians
+_MOST = 1000  # actions in a chunk
+_KEPT = 20  # chunks between two ticks: of more, the newest
+_JOINED = 1.0  # how long a policy that computes may take to end with the run [s]
+
+
+class ActionSpace(StrEnum):
+    """Whose numbers an action has: the name of the feature of a dataset. Openings of all grippers may follow."""
+
+    JOINTS = "action"  # joint positions of all arms [rad]
+    TOOL = "action.tool"  # tool poses x y z [m] qx qy qz qw in the world
+    TOOL_DELTA = "action.tool_delta"  # motion to the next target, in the target's own frame [m], rotation vector [rad]
+
+
+def action_names(robot: Robot, space: ActionSpace) -> tuple[str, ...]:
+    """The names of an action's numbers, without those of grippers."""
+    if space is ActionSpace.JOINTS:
+        return tuple(robot.joint_names)
+    fields = POSE_FIELDS if space is ActionSpace.TOOL else MOTION_FIELDS
+    return tuple(f"{arm}_{number}" for arm in robot.arms for number in fields)
+
+
+Policy = Callable[[Observation], npt.ArrayLike]
+
+
+class PolicyInput:
+    """Moves the arms by actions that :meth:`send` brings, and lets a hand take over. Implements :class:`PolicySource`.
+
+    ``policy`` is a function of an :class:`Observation` that returns the next actions, (n, size) or (size,), the first
+    of them for the observation's time. It runs on a thread of its own, and is asked again when half of its actions are
+    over. In simulated time the loop waits for it. Without one, a program calls :meth:`send` by itself, from any thread.
+
+    ``space`` and ``rate`` [Hz] are those of its actions; None: its attributes of these names, or joints at 30 Hz.
+    ``operator`` is an input whose hands take over: a press engages an arm, and the next one gives it back. Raises
+    :class:`ConfigError` for a space or a rate that is not allowed.
+    """
+
+    options = ("policy", "takeover", "fast", "say")
+
+    def __init__(
+        self,
+        policy: Policy | None = None,
+        *,
+        space: ActionSpace | str | None = None,
+        rate: float | None = None,
+        operator: Input | None = None,
+    ) -> None:
+        space = getattr(policy, "space", ActionSpace.JOINTS) if space is None else space
+        rate = getattr(policy, "rate", 30.0) if rate is None else rate
+        if space not in list(ActionSpace):
+            raise ConfigError(f"space = {shown(space)}: allowed: {', '.join(ActionSpace)}")
+        if not (isinstance(rate, float | int) and _GAPS[0] <= 1.0 / max(rate, 1e-9) <= _GAPS[1]):
+            raise ConfigError(f"rate = {shown(rate)}: allowed: {1.0 / _GAPS[1]:g} to {1.0 / _GAPS[0]:g} Hz")
+        self.space, self.period, self._policy, self._operator = ActionSpace(space), 1.0 / float(rate), policy, operator
+        self.controls = QUEST_CONTROLS if operator is None else operator.controls
+        self.observation: Observation | None = None  # the newest one
+        self._chunks: deque[ActionChunk] = deque(maxlen=_KEPT)
+        self._wake, self._ends = threading.Event(), threading.Event()
+        self._thread: threading.Thread | None = None
+        self._robot: Robot | None = None
+        self._realtime, self._started = True, False
+        self._due = -np.inf  # when the policy is asked again [s]
+
+    @classmethod
+    def from_config(
+        cls, config: Config, policy: str | None = None, takeover: str | None = None, **options: object
+    ) -> PolicyInput:
+        """``policy`` is "module:name" of a policy, or a class of policies; ``takeover`` the name of an input."""
+        if policy is None:
+            raise ConfigError("input policy: --policy MODULE:NAME is missing, which names the policy")
+        operator = None if takeover is None else make_input(takeover, config, **options)
+        return cls(_loaded(policy), operator=operator)
+
+    @property
+    def connected(self) -> bool:
+        return self._started if self._operator is None else self._operator.connected
+
+    def prepare(self, robot: Robot, realtime: bool) -> None:
+        """See :class:`PolicySource`."""
+        self._robot, self._realtime = robot, realtime
+        self._due, self.observation = -np.inf, None
+        self._chunks.clear()
+
+    def start(self) -> None:
+        if self._operator is not None:
+            self._operator.start()
+        self._started = True
+        self._ends.clear()
+        if self._policy is not None and self._realtime:
+            self._thread = threading.Thread(target=self._run, name="policy", daemon=True)
+            self._thread.start()
+
+    def poll(self, now: float) -> list[HandSample]:
+        return [] if self._operator is None else self._operator.poll(now)
+
+    def chunks(self) -> list[ActionChunk]:
+        """See :class:`PolicySource`."""
+        return [self._chunks.popleft() for _ in range(len(self._chunks))]
+
+    def observe(self, observation: Observation) -> None:
+        """See :class:`PolicySource`."""
+        self.observation = observation
+        if not self._realtime:
+            self._ask()
+        elif observation.time >= self._due:
+            self._wake.set()
+
+    def send_haptic(self, feedback: HapticFeedback) -> None:
+        if self._operator is not None:
+            self._operator.send_haptic(feedback)
+
+    def close(self) -> None:
+        self._started = False
+        self._ends.set()
+        self._wake.set()
+        if self._thread is not None:
+            self._thread.join(_JOINED)
+            self._thread = None
+        if self._operator is not None:
+            self._operator.close()
+
+    def send(self, actions: npt.ArrayLike, times: npt.ArrayLike | None = None, names: Sequence[str] = ()) -> None:
+        """Actions (n, size) or one (size,), to be followed at ``times`` (n,) [s] on the loop's clock.
+
+        They replace what was sent before from their first time on. Without ``times`` the first is for the newest
+        observation, and the others follow at the rate. ``names`` of the numbers, where given, are checked. Never
+        raises: actions that cannot be used stop the arms, with a line that says why.
+        """
+        try:
+            chunk = self._checked(actions, times, names)
+        except _UnusableError as error:
+            chunk = self._fault(str(error))
+        self._chunks.append(chunk)
+
+    def _run(self) -> None:
+        while not self._ends.is_set():
+            self._wake.wait()
+            self._wake.clear()
+            if not self._ends.is_set():
+                self._ask()
+
+    def _ask(self) -> None:
+        observation = self.observation
+        if self._policy is None or observation is None or observation.time < self._due:
+            return
+        count = 1
+        try:
+            actions = np.atleast_2d(np.asarray(self._policy(observation), dtype=np.float64))
+            count = len(actions)
+            self.send(actions, observation.time + self.period * np.arange(count))
+        except Exception as error:  # whatever a policy does, the loop goes on
+            self._chunks.append(self._fault(f"{type(error).__name__}: {error}"))
+        self._due = observation.time + max(count // 2, 1) * self.period - 1e-9
+
+    def _fault(self, text: str) -> ActionChunk:
+        reason = Reason.of(ReasonKind.POLICY_UNUSABLE, text=" ".join(text.split())[:200])
+        return ActionChunk(np.zeros(0), self.period, fault=reason)
+
+    def _checked(self, actions: npt.ArrayLike, times: npt.ArrayLike | None, names: Sequence[str]) -> ActionChunk:
+        robot = self._robot
+        if robot is None:
+            raise _UnusableError("sent before the run began")
+        values = np.atleast_2d(_numbers("actions", actions))
+        expected = action_names(robot, self.space)
+        grippers = tuple(f"{arm}_gripper" for arm in robot.arms)
+        allowed = tuple(names) if names else (*expected, *grippers)[: values.shape[-1]]
+        _check_names(allowed, expected, grippers)
+        size = len(allowed)
+        if values.ndim != 2 or values.shape[1] != size or not 0 < len(values) <= _MOST:
+            sizes = f"{len(expected)} or {len(expected) + len(grippers)}"
+            raise _UnusableError(f"actions have the shape {values.shape}; allowed: (n, {size if names else sizes})")
+        _check_finite(values, allowed)
+        stamps = self._stamps(times, len(values))
+        period = (stamps[-1] - stamps[0]) / (len(stamps) - 1) if len(stamps) > 1 else self.period
+        openings = {
+            arm: np.clip(values[:, allowed.index(name)], 0.0, 1.0)
+            for arm, name in zip(robot.arms, grippers, strict=True)
+            if name in allowed
+        }
+        moved = values[:, : len(expected)]
+        if self.space is ActionSpace.JOINTS:
+            return ActionChunk(stamps, period, tools=self._tools(moved), grippers=openings, postures=moved)
+        parts = dict(zip(robot.arms, np.split(moved, len(robot.arms), axis=1), strict=True))
+        if self.space is ActionSpace.TOOL_DELTA:
+            return ActionChunk(stamps, period, motions=parts, grippers=openings)
+        for arm, poses in parts.items():
+            lengths = np.linalg.norm(poses[:, 3:], axis=1)
+            if (wrong := np.flatnonzero((lengths < 0.5) | (lengths > 2.0))).size:
+                where = f"action {wrong[0]}: the quaternion of {arm}"
+                raise _UnusableError(f"{where} has the length {lengths[wrong[0]]:.3g}; allowed: 1, or nearly so")
+        return ActionChunk(stamps, period, tools=parts, grippers=openings)
+
+    def _stamps(self, times: npt.ArrayLike | None, count: int) -> Array:
+        if times is None:
+            if self.observation is None:
+                raise _UnusableError("times are missing, and nothing was observed yet")
+            return np.asarray(self.observation.time + self.period * np.arange(count))
+        stamps = np.atleast_1d(_numbers("times", times))
+        if stamps.shape != (count,) or not np.isfinite(stamps).all():
+            raise _UnusableError(f"times = {shown(times)}; allowed: a finite number for each of {count} actions")
+        gaps = np.diff(stamps)
+        if ((gaps < _GAPS[0]) | (gaps > _GAPS[1])).any():
+            raise _UnusableError(f"times = {shown(times)}; allowed: ascending, {_GAPS[0]:g} to {_GAPS[1]:g} s apart")
+        return stamps
+
+    def _tools(self, postures: Array) -> dict[str, Array]:
+        """Tool poses (n, 7) of each arm at joint positions (n, nv)."""
+        robot = self._robot
+        assert robot is not None
+        data = robot.model.createData()  # of this call: any thread may send
+        tools = {arm: np.empty((len(postures), 7)) for arm in robot.arms}
+        for index, q in enumerate(postures):
+            pin.forwardKinematics(robot.model, data, q)
+            for name, arm in robot.arms.items():
+                pose = pin.updateFramePlacement(robot.model, data, arm.frame_id)
+                tools[name][index] = pin.SE3ToXYZQUATtuple(pose)
+        return tools
+
+
+class _UnusableError(Exception):
+    """Why actions cannot be used."""
+
+
+def _numbers(what: str, values: Any) -> Array:
+    try:
+        return np.array(values, dtype=np.float64)  # a copy: its sender may use the array again
+    except (TypeError, ValueError, OverflowError) as error:
+        raise _UnusableError(f"{what} = {shown(values)}; allowed: an array of numbers") from error
+
+
+def _check_finite(values: Array, names: Sequence[str]) -> None:
+    if not (usable := np.abs(values) <= _LARGEST).all():  # nor is NaN
+        action, column = np.argwhere(~usable)[0]
+        allowed = f"allowed: finite numbers, {_LARGEST:g} at most"
+        raise _UnusableError(f"action {action}: {names[column]} = {values[action, column]}; {allowed}")
+
+
+def _check_names(names: Sequence[str], expected: Sequence[str], grippers: Sequence[str]) -> None:
+    """Raises :class:`_UnusableError` for other names than the joints' or arms', and grippers' behind, in this order."""
+    for place, name in enumerate(expected):
+        if place >= len(names) or names[place] != name:
+            found = shown(names[place]) if place < len(names) else "missing"
+            raise _UnusableError(f"number {place} is {found}; allowed: {name}, in the order {', '.join(expected)}")
+    behind = list(names[len(expected) :])
+    if behind != [name for name in grippers if name in behind]:
+        raise _UnusableError(f"names end with {shown(behind)}; allowed: {', '.join(grippers)}, in this order")
+
+
+def _loaded(where: str) -> Policy:
+    """The policy at "module:name", of this folder or installed. Raises :class:`ConfigError` where there is none."""
+    module, _, name = where.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        found = getattr(importlib.import_module(module), name)
+        found = found() if isinstance(found, type) else found
+    except Exception as error:  # whatever its module does
+        raise ConfigError(f"--policy {where}: {type(error).__name__}: {error}"[:200]) from error
+    if not callable(found):
+        raise ConfigError(f"--policy {where}: allowed: MODULE:NAME of a function of an Observation, or a class of such")
+    loaded: Policy = found
+    return loaded

@@ -1,0 +1,259 @@
+"""From the chunks of a policy to the targets of one arm, on one time line.
+
+A chunk is followed from its first time on, or from now on if it is late, and replaces what older ones say from there
+on. Positions between two actions are cubic, rotations turn evenly. Where two chunks disagree at the moment of the
+change, the difference fades instead of a jump; of motions there is none, since they begin where the target is. The last
+action counts for :data:`SILENT`, and then the arm rests: an action that is repeated for ever is no policy.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.quaternions import Quaternion, Vector, normalized, product, rotation_of, turn_between, turned_by
+from q2r2_control.teleop.leash import Leash, Workspace
+from q2r2_control.types import ActionChunk, Array, Pose
+
+SILENT = 0.5  # without an action that counts, after which an arm rests [s]
+_FADING = 0.5, 2.0  # how fast the difference of two chunks fades, at most [m/s], [rad/s]
+_AHEAD = 10.0  # a chunk whose time is farther off is on another clock [s]
+_NONE: Vector = (0.0, 0.0, 0.0)
+
+
+class _Plan(NamedTuple):
+    """The part of a chunk that is one arm's."""
+
+    start: float  # followed from here on [s]
+    chunk: ActionChunk
+    times: list[float]  # of the poses [s]
+    poses: list[Pose]  # in the world, or of motions, from where the first of them begins
+    grippers: list[float]  # empty: not commanded
+
+    @property
+    def end(self) -> float:
+        return self.times[-1] + SILENT
+
+
+class PolicyMotion:
+    """The policy's motion of one arm. Times are those of the loop's clock [s]."""
+
+    def __init__(self, arm: str, settings: TeleopSettings) -> None:
+        self._arm = arm
+        self._plans: list[_Plan] = []  # those whose time comes, in their order
+        self._plan: _Plan | None = None  # the one that is followed
+        self.configure(settings)
+
+    def configure(self, settings: TeleopSettings) -> None:
+        self._settings = settings
+        self._leash = Leash(settings.leash)
+        self._workspace = Workspace(settings.workspace.get(self._arm))  # type: ignore[call-overload]
+
+    @property
+    def following(self) -> bool:
+        """Whether an arm has begun to follow, and the actions have not been forgotten since."""
+        return self._plan is not None
+
+    def forget(self) -> None:
+        """Nothing of the past counts any more."""
+        self._plans.clear()
+        self._plan = None
+
+    def receive(self, chunk: ActionChunk, now: float) -> Reason | None:
+        """A chunk that came at ``now``; returns why it cannot be used, or None. One that is too late is left out."""
+        if self._arm not in chunk.tools and self._arm not in chunk.motions:
+            return None
+        times = chunk.times.tolist()
+        if max(abs(times[0] - now), abs(times[-1] - now)) > _AHEAD:
+            text = f"times[0] is {times[0] - now:.3g} s from now; allowed: {_AHEAD:g} s at most, on the loop's clock"
+            return Reason.of(ReasonKind.POLICY_UNUSABLE, text=text)
+        if self._arm in chunk.tools:
+            poses = [_pose(numbers) for numbers in chunk.tools[self._arm].tolist()]
+        else:
+            poses = _added_up(chunk.motions[self._arm].tolist())
+            if len(times) == 1:  # the whole motion, as late as it comes: what is left out would be missing for good
+                times[0] = max(times[0], now)
+            times.append(times[-1] + chunk.period)
+        if jump := self._jump(times, poses):
+            return jump
+        grippers = chunk.grippers[self._arm].tolist() if self._arm in chunk.grippers else []
+        plan = _Plan(max(times[0], now), chunk, times, poses, grippers)
+        if plan.end > now:
+            plans = [other for other in self._plans if other.start < plan.start] + [plan]
+            due = sum(other.start <= now for other in plans)
+            self._plans = plans[max(due - 1, 0) :]
+        return None
+
+    def _jump(self, times: list[float], poses: list[Pose]) -> Reason | None:
+        """Two actions that are farther apart than the gate lets a hand go."""
+        gate = self._settings.gate
+        for (before, start), (after, end) in pairwise(zip(times, poses, strict=True)):
+            distance, angle = math.dist(start[0], end[0]), math.hypot(*turn_between(start[1], end[1]))
+            most = min(gate.max_jump, gate.max_speed * (after - before))
+            most_angle = min(gate.max_rotation_jump, gate.max_angular_speed * (after - before))
+            if distance > most or angle > most_angle:
+                return _jumped(distance, angle, "the one before", most, most_angle)
+        return None
+
+    def counts(self, now: float) -> bool:
+        """Whether there is an action that an arm may begin to follow."""
+        return any(plan.start <= now < plan.end for plan in self._plans)
+
+    def begin(self, tool: Pose, now: float) -> Reason | None:
+        """Follow the newest action that counts, from ``tool`` on, world frame; returns why not, or None."""
+        self._plan = None
+        self._workspace.reset()
+        return self.advance(tool, now)
+
+    def advance(self, tool: Pose | None, now: float) -> Reason | None:
+        """Go on to the chunk that is followed at ``now``; returns why none can be, or None. ``tool``: the reference's.
+
+        Arms that something holds up have their target on the leash: a chunk may begin there or where the last one led.
+        """
+        due = [plan for plan in self._plans if plan.start <= now]
+        self._plans = self._plans[len(due) :]
+        if due:
+            plan, places = due[-1], [tool] if tool is not None else []
+            if self._plan is not None:
+                places = [self.target(tool, now), self._at(now)]
+            if jump := self._change(plan, places, now):
+                return jump
+        if self._plan is None or now >= self._plan.end:
+            return Reason.of(ReasonKind.POLICY_SILENT, timeout=SILENT)
+        return None
+
+    def _change(self, plan: _Plan, places: list[Pose], now: float) -> Reason | None:
+        """Follow ``plan`` from the one of ``places`` on that it is nearest to."""
+        if self._arm in plan.chunk.motions:
+            plan = plan._replace(poses=_moved_to(places[0], _interpolated(plan, now), plan.poses))
+        planned, turned = _interpolated(plan, now)
+        position, rotation = min(places, key=lambda place: math.dist(place[0], planned))
+        (x, y, z), (at_x, at_y, at_z) = planned, position
+        self._way, self._turn = (at_x - x, at_y - y, at_z - z), turn_between(turned, rotation)
+        distance, angle = math.hypot(*self._way), math.hypot(*self._turn)
+        leash, gate = self._settings.leash, self._settings.gate
+        most, most_angle = leash.distance or gate.max_jump, leash.angle or gate.max_rotation_jump
+        if distance > most or angle > most_angle:
+            what = "the tool" if self._plan is None else "where the one before led"
+            return _jumped(distance, angle, what, most, most_angle)
+        self._plan, self._began = plan, now
+        self._fades = max(plan.chunk.period, distance / _FADING[0], angle / _FADING[1])
+        return None
+
+    def _at(self, now: float) -> Pose:
+        """Where the plan that is followed has the tool, with the difference to the one before that is left."""
+        assert self._plan is not None
+        (x, y, z), rotation = _interpolated(self._plan, now)
+        left = 1.0 - min((now - self._began) / self._fades, 1.0)
+        if left == 0.0:
+            return (x, y, z), rotation
+        (way_x, way_y, way_z), (a, b, c) = self._way, self._turn
+        return (x + left * way_x, y + left * way_y, z + left * way_z), turned_by(
+            rotation, (left * a, left * b, left * c)
+        )
+
+    def target(self, tool: Pose | None, now: float) -> Pose:
+        """Where the tool should be, world frame: in its workspace, and on the leash of ``tool``, the reference's."""
+        target = self._at(now)
+        if (held := self._workspace.hold(target)) is not None:
+            target = held, target[1]
+        return target if tool is None else self._leash.hold(target, tool)
+
+    def gripper(self, now: float) -> float | None:
+        """The opening of the newest action at or before ``now``; None: the policy says nothing of it."""
+        if self._plan is None or not self._plan.grippers:
+            return None
+        index = bisect_right(self._plan.times, now) - 1
+        return self._plan.grippers[min(max(index, 0), len(self._plan.grippers) - 1)]
+
+    def posture(self, now: float) -> Array | None:
+        """Joint positions of the whole robot that the actions have at ``now`` (nv,) [rad]; None: none are asked for."""
+        if self._plan is None or self._plan.chunk.postures is None:
+            return None
+        postures, (index, share) = self._plan.chunk.postures, _place(self._plan.times, now)
+        after = postures[min(index + 1, len(postures) - 1)]
+        return np.asarray(postures[index] + share * (after - postures[index]))
+
+
+def _jumped(distance: float, angle: float, what: str, allowed: float, allowed_angle: float) -> Reason:
+    detail = {"distance": distance, "angle": angle, "what": what, "allowed": allowed, "allowed_angle": allowed_angle}
+    return Reason(ReasonKind.POLICY_JUMPED, detail)
+
+
+def _pose(numbers: list[float]) -> Pose:
+    x, y, z, *rotation = numbers
+    a, b, c, w = rotation
+    return (x, y, z), normalized((a, b, c, w))
+
+
+def _added_up(motions: list[list[float]]) -> list[Pose]:
+    """Poses that motions lead to, one after the other, in the frame of where they begin."""
+    position, rotation = _NONE, (0.0, 0.0, 0.0, 1.0)
+    poses = [(position, rotation)]
+    for x, y, z, a, b, c in motions:
+        position = _added(position, _turned(rotation, (x, y, z)))
+        rotation = normalized(product(rotation, rotation_of((a, b, c))))
+        poses.append((position, rotation))
+    return poses
+
+
+def _moved_to(place: Pose, origin: Pose, poses: list[Pose]) -> list[Pose]:
+    """The same motion as that of ``poses``, with ``origin`` at ``place``."""
+    turn = product(place[1], _inverse(origin[1]))
+    x, y, z = _turned(turn, origin[0])
+    shift = place[0][0] - x, place[0][1] - y, place[0][2] - z
+    return [(_added(shift, _turned(turn, position)), product(turn, rotation)) for position, rotation in poses]
+
+
+def _inverse(rotation: Quaternion) -> Quaternion:
+    x, y, z, w = rotation
+    return -x, -y, -z, w
+
+
+def _turned(rotation: Quaternion, vector: Vector) -> Vector:
+    x, y, z, _ = product(product(rotation, (*vector, 0.0)), _inverse(rotation))
+    return x, y, z
+
+
+def _added(one: Vector, other: Vector) -> Vector:
+    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
+
+
+def _place(times: list[float], t: float) -> tuple[int, float]:
+    """The index of the action before ``t``, and the share of the way to the next one."""
+    index = min(max(bisect_right(times, t) - 1, 0), max(len(times) - 2, 0))
+    if len(times) == 1:
+        return 0, 0.0
+    return index, min(max((t - times[index]) / (times[index + 1] - times[index]), 0.0), 1.0)
+
+
+def _interpolated(plan: _Plan, t: float) -> Pose:
+    """Between two actions: a cubic that goes through all of them with their mean velocities, and an even turn."""
+    times, poses = plan.times, plan.poses
+    index, share = _place(times, t)
+    if len(times) == 1:
+        return poses[0]
+    (start, rotation), (end, turned) = poses[index], poses[index + 1]
+    h, rest = times[index + 1] - times[index], 1.0 - share
+    before, after = _velocity(times, poses, index), _velocity(times, poses, index + 1)
+    x, y, z = (
+        rest * rest * (1.0 + 2.0 * share) * p
+        + share * share * (3.0 - 2.0 * share) * q
+        + h * share * rest * (rest * u - share * v)
+        for p, q, u, v in zip(start, end, before, after, strict=True)
+    )
+    a, b, c = turn_between(rotation, turned)
+    return (x, y, z), turned_by(rotation, (share * a, share * b, share * c))
+
+
+def _velocity(times: list[float], poses: list[Pose], index: int) -> Vector:
+    """Of the position at an action, from those beside it [m/s]."""
+    first, last = max(index - 1, 0), min(index + 1, len(times) - 1)
+    h, start, end = times[last] - times[first], poses[first][0], poses[last][0]
+    return (end[0] - start[0]) / h, (end[1] - start[1]) / h, (end[2] - start[2]) / h

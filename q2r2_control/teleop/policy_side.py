@@ -1,0 +1,109 @@
+"""Which arms follow a policy: those that no operator drives, from their tools on, until its actions end or break."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import pinocchio as pin
+
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.quaternions import floats_of, se3_of
+from q2r2_control.teleop.arm import ArmTeleop
+from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
+from q2r2_control.teleop.hand_motion import ArmMeasurements
+from q2r2_control.teleop.policy_motion import PolicyMotion
+from q2r2_control.types import ActionChunk, Array
+
+
+class PolicySide:
+    """The policy of all arms.
+
+    An operator who has a device is asked first: after a fault, arms wait for a press. Without one, they go on with the
+    next chunk that begins at the tool.
+    """
+
+    def __init__(self, arms: Mapping[str, ArmTeleop], settings: TeleopSettings) -> None:
+        self._arms = arms
+        self._motions = {name: PolicyMotion(name, settings) for name in arms}
+        self._told: dict[str, ReasonKind] = {}  # arm -> what its last refused actions were refused for
+        self._linked = settings.linked
+        self.seen = False  # whether a policy has sent anything in this run
+
+    def configure(self, settings: TeleopSettings) -> None:
+        self._linked = settings.linked
+        for motion in self._motions.values():
+            motion.configure(settings)
+
+    def update(
+        self, chunks: Sequence[ActionChunk], around: ArmMeasurements, now: float, clock_fault: Reason | None
+    ) -> None:
+        """One tick: take the chunks, stop arms whose actions end or cannot be used, and begin with those that can."""
+        if chunks:
+            self.seen = True
+        elif not self.seen:
+            return
+        faults: dict[str, Reason] = {}
+        for name, motion in self._motions.items():
+            if motion.following and self._arms[name].state is not ArmState.POLICY:
+                motion.forget()  # stopped or taken over: the next chunk says where to go on
+        for chunk in chunks:
+            for name, motion in self._motions.items():
+                if fault := chunk.fault or motion.receive(chunk, now):
+                    faults[name] = fault
+        for name in self._in(ArmState.POLICY):
+            ended = self._motions[name].advance(around.expected(name, None), now)
+            if fault := clock_fault or faults.get(name) or ended:
+                faults[name] = fault
+        if faults:
+            self._refuse(faults, now)
+        for name in () if faults else self._arms:
+            if self._may_begin(name, around) and self._motions[name].counts(now):
+                self._begin(name, around, now)
+
+    def _in(self, *states: ArmState) -> list[str]:
+        return [name for name, arm in self._arms.items() if arm.state in states]
+
+    def _refuse(self, faults: Mapping[str, Reason], now: float) -> None:
+        """Arms that follow stop; of others it is told once, not for every chunk."""
+        following = self._in(ArmState.POLICY)
+        for name, fault in faults.items():
+            self._motions[name].forget()
+            if name in following:
+                self._arms[name].change(Cause.FAULT, now, fault)
+            elif self._told.get(name) is not fault.kind:
+                self._told[name] = fault.kind
+                self._arms[name].record_event(now, Reason(ReasonKind.POLICY_REFUSED, cause=fault))
+        first, fault = next(iter(faults.items()))
+        if self._linked and not faults.keys().isdisjoint(following):
+            for name in following:
+                if name not in faults:
+                    self._motions[name].forget()
+                    self._arms[name].change(Cause.FAULT, now, Reason.of(ReasonKind.LINKED, cause=fault, arm=first))
+
+    def _may_begin(self, name: str, around: ArmMeasurements) -> bool:
+        arm = self._arms[name]
+        if arm.state not in AT_REST or name in around.obstacles or around.anchor(name) is None:
+            return False
+        lost = self._in(ArmState.LOST) if self._linked else [name] if arm.state is ArmState.LOST else []
+        return not any(self._arms[other].heard_of for other in lost)
+
+    def _begin(self, name: str, around: ArmMeasurements, now: float) -> None:
+        tool = around.expected(name, None) or floats_of(around.tools[name])
+        if fault := self._motions[name].begin(tool, now):
+            self._refuse({name: fault}, now)
+            return
+        self._told.pop(name, None)
+        self._arms[name].offset = None  # actions are what the controller is asked for
+        self._arms[name].go(Cause.POLICY_ACTS, now, Reason(ReasonKind.POLICY_ACTS))
+
+    def target(self, name: str, around: ArmMeasurements, now: float) -> pin.SE3:
+        """The target of an arm that follows the policy, which also says how far its gripper is open."""
+        motion = self._motions[name]
+        if (opening := motion.gripper(now)) is not None:
+            self._arms[name].gripper = opening
+        return se3_of(motion.target(around.expected(name, None), now))
+
+    def posture(self, name: str, now: float) -> Array | None:
+        """See :meth:`PolicyMotion.posture`."""
+        return self._motions[name].posture(now)

@@ -1,0 +1,140 @@
+"""A policy in the loop: what it may not do, who takes over, and what is recorded of both."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.export.sampling import features, sample
+from q2r2_control.inputs.policy import ActionSpace, PolicyInput
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.replay import replay
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import SIDES, Array, HandInputs, HandSample, Observation
+from tests.recording.runs import file_of, pipeline, record
+from tests.support.hands_input import HandsInput
+from tests.support.processes import Watch
+
+pytestmark = pytest.mark.slow
+
+CYCLE, PRESS, GIVES_BACK = 0.6, 0.1, 0.3  # of an operator who takes over again and again [s]
+
+
+class Circle:
+    """Both tools go round circles of 60 mm, from where they are first seen."""
+
+    space, rate = ActionSpace.TOOL, 50.0
+
+    def __init__(self) -> None:
+        self.start: Observation | None = None
+
+    def __call__(self, observation: Observation) -> Array:
+        self.start = self.start or observation
+        phase = 2.0 * (observation.time - self.start.time + np.arange(10) / self.rate)
+        poses = np.array([[pin.SE3ToXYZQUAT(tool) for tool in self.start.tools.values()]] * len(phase))
+        poses[:, :, 1] += 0.03 * np.sin(phase)[:, None]
+        poses[:, :, 2] += 0.03 * (1.0 - np.cos(phase))[:, None]
+        return poses.reshape(len(phase), -1)
+
+
+class Operator(HandsInput):
+    """Presses the lower buttons to take over, and once more to give back; the hands move all the time."""
+
+    def poll(self, now: float) -> list[HandSample]:
+        hand = super().poll(now)
+        since = now % CYCLE
+        pressed = now > CYCLE and (since < PRESS or GIVES_BACK <= since < GIVES_BACK + PRESS)
+        inputs = HandInputs(button_lower=pressed)
+        place = np.array([0.02 * np.sin(5.0 * now), 0.0, 0.0])
+        return [HandSample(one.hand, place, one.quaternion, now, inputs, now) for one in hand]
+
+
+def with_operator() -> Pipeline:
+    return pipeline(source=PolicyInput(Circle(), operator=Operator()))
+
+
+def test_a_hundred_takeovers_make_no_target_jump_and_every_tick_says_who_acted() -> None:
+    loop, count = with_operator(), 100
+    watch = Watch(loop)
+    summary = loop.run((count + 1) * CYCLE, realtime=False)
+    for arm in SIDES:
+        states = [tick.states[arm] for tick in watch.ticks]
+        changes = [(k, *pair) for k, pair in enumerate(pairwise(states), 1) if len(set(pair)) > 1]
+        taken = [k for k, before, now in changes if (before, now) == ("policy", "engaged")]
+        given = [k for k, _, now in changes if now == "policy"]
+        assert (len(taken), len(given)) == (count, count + 1)
+        for k in taken:
+            before, after = (watch.ticks[i].targets[arm].command for i in (k - 1, k))
+            assert before is not None
+            assert after is not None
+            assert np.linalg.norm(after.translation - before.translation) <= 1e-6
+            assert np.linalg.norm(pin.log3(before.rotation.T @ after.rotation)) <= 1e-6
+        for k in given[1:]:
+            target, tool = (
+                watch.ticks[k].targets[arm].command,
+                loop.robot.tool_pose(watch.ticks[k - 1].reference.q, arm),
+            )
+            assert target is not None
+            assert np.linalg.norm(target.translation - tool.translation) <= 1e-6
+        engaged = [state == "engaged" for state in states]
+        assert [tick.interventions[arm] for tick in watch.ticks] == engaged
+        assert summary.arms[arm].interventions == count
+        assert summary.arms[arm].intervention_s == pytest.approx(sum(engaged) * 0.002)
+        assert summary.arms[arm].policy_s == pytest.approx(states.count("policy") * 0.002)
+
+
+def test_a_recording_says_at_every_frame_who_acted_and_is_replayed_to_the_bit(tmp_path: Path) -> None:
+    loop, tags = with_operator(), []
+    loop.listeners.append(lambda tick: tags.append([tick.interventions[arm] for arm in SIDES]))
+    file = file_of(record(tmp_path, loop, 3.0 * CYCLE))
+    vectors, names = features(sample(Recording(file), 500), loop.robot)
+    assert names["intervention"] == SIDES
+    assert 0.0 < vectors["intervention"].mean() < 1.0
+    np.testing.assert_array_equal(vectors["intervention"], tags)
+    again = replay(file)
+    assert (again.difference, again.ended_by) == (None, None)
+
+
+def colliding(loop: Pipeline) -> Array:
+    """Joint positions at which both arms, turned towards each other, are inside each other."""
+    q = loop.robot.home.copy()
+    while loop.robot.distance_values(q).min() > -0.03:
+        q[[0, 7]] += (-0.05, 0.05)
+    return q
+
+
+def touching(plant: MujocoPlant) -> set[str]:
+    """Bodies of the arms that touch anything now."""
+    bodies = {plant.model.geom_bodyid[geom] for pair in plant.data.contact.geom.tolist() for geom in pair}
+    return {name for body in bodies if (name := plant.model.body(body).name).startswith(SIDES)}
+
+
+def test_a_policy_that_would_let_the_arms_collide_makes_no_contact_and_the_summary_names_the_pair() -> None:
+    policy, touched = PolicyInput(), set[str]()
+    loop = pipeline(source=policy, plant="mujoco")
+    plant, home, goal = loop.plant, loop.robot.home, colliding(loop)
+    assert isinstance(plant, MujocoPlant)
+
+    def drive(tick: Tick) -> None:
+        if len(watch.ticks) % 50 == 0:
+            times = tick.now + np.arange(10) / 20.0
+            shares = np.minimum((times - tick.start.now) / 3.0, 1.0)[:, None]
+            policy.send(home + shares * (goal - home), times)
+        touched.update(touching(plant))
+
+    watch = Watch(loop)
+    loop.listeners.append(drive)
+    summary = loop.run(4.0, realtime=False)
+    assert touched == set()
+    assert {name.split("_")[0] for name in summary.closest_pair or ()} == set(SIDES)
+    assert summary.min_distance_mm == pytest.approx(20.0, abs=3.0)
+    assert summary.at_rest
+    assert max(np.linalg.norm(tick.reference.q - home) for tick in watch.ticks) > 0.2
+    plant.reset(goal)
+    assert touching(plant)

@@ -1,0 +1,72 @@
+"""A recorded motion runs again: by each kind of action that its dataset has, sent back at its time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.export.sampling import features, sample
+from q2r2_control.inputs.policy import ActionSpace, PolicyInput
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.recording.reader import Recording
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import Array
+from tests.recording.runs import file_of, pipeline, record
+
+pytestmark = pytest.mark.slow
+
+FPS = 30
+DURATION = 5.0  # [s]
+CHUNK = 16  # actions, of which half are replaced by the next chunk
+
+
+def tools_of(loop: Pipeline) -> list[dict[str, pin.SE3]]:
+    """The measured tools of a run that is to come, tick by tick."""
+    tools: list[dict[str, pin.SE3]] = []
+    loop.listeners.append(lambda tick: tools.append(tick.tools))
+    return tools
+
+
+class Playback:
+    """Sends the frames of a dataset at their times, some ahead, as a policy does that knows it by heart."""
+
+    def __init__(self, policy: PolicyInput, actions: Array) -> None:
+        self._policy, self._actions, self._next = policy, actions, 0
+
+    def __call__(self, tick: Tick) -> None:
+        begin, frame = tick.start.now + tick.dt, self._next  # the first frame is that of the first tick
+        if tick.now >= begin + frame / FPS - 1e-9 and frame < len(self._actions):
+            chunk = self._actions[frame : frame + CHUNK]
+            self._policy.send(chunk, begin + np.arange(frame, frame + len(chunk)) / FPS)
+            self._next += CHUNK // 2
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, pin.SE3]], dict[str, Array]]:
+    """Tools that come together and turn in MuJoCo, led by scripted hands, and the vectors of the run's dataset."""
+    loop = pipeline("meet", "mujoco")
+    tools = tools_of(loop)
+    file = file_of(record(tmp_path_factory.mktemp("recordings"), loop, DURATION))
+    vectors, _ = features(sample(Recording(file), FPS), loop.robot)
+    return tools, {name: values.astype(np.float64) for name, values in vectors.items()}
+
+
+@pytest.mark.parametrize("space", ActionSpace)
+def test_the_actions_of_a_dataset_sent_back_at_their_times_repeat_the_recorded_motion(
+    recorded: tuple[list[dict[str, pin.SE3]], dict[str, Array]], space: ActionSpace
+) -> None:
+    before, vectors = recorded
+    policy = PolicyInput(space=space)
+    loop = pipeline(source=policy, plant="mujoco")
+    tools = tools_of(loop)
+    loop.listeners.append(Playback(policy, vectors[space]))
+    summary = loop.run(DURATION, realtime=False)
+    for arm in loop.robot.arms:
+        ways = [there[arm].actInv(here[arm]) for there, here in zip(before, tools, strict=False)]
+        apart = np.array([(np.linalg.norm(way.translation), np.linalg.norm(pin.log3(way.rotation))) for way in ways])
+        distance, angle = np.sqrt(np.mean(apart**2, axis=0))
+        assert max(np.linalg.norm(here[arm].translation - before[0][arm].translation) for here in before) > 0.1
+        assert distance < 0.5e-3
+        assert np.degrees(angle) < 0.2
+        assert summary.arms[arm].policy_s > DURATION - 0.1

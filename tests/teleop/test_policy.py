@@ -1,0 +1,198 @@
+"""Actions of a policy become targets: interpolated, replaced without a jump, and over when they cease or break."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.quaternions import floats_of
+from q2r2_control.teleop.policy_motion import SILENT
+from q2r2_control.teleop.teleop import Teleop
+from q2r2_control.types import SIDES, ActionChunk, ArmTarget, Array, HandSample
+from tests.support.reasons import kinds
+from tests.teleop.hands import pose, sample
+
+TICK = 0.001
+TOOLS = {"left": pose(0.5, 0.4, 0.4), "right": pose(0.5, -0.4, 0.4, (0.0, 0.0, 0.3))}
+PERIOD = 0.05  # of actions [s]
+
+
+def chunk(times: npt.ArrayLike, ways: Array, arms: tuple[str, ...] = SIDES, **more: object) -> ActionChunk:
+    """Actions at ``times`` that put the tools ``ways`` (n,) [m] along x from :data:`TOOLS`."""
+    tools = {arm: np.array([floats_of_moved(TOOLS[arm], way) for way in ways]) for arm in arms}
+    return ActionChunk(np.array(times), PERIOD, tools=tools, **more)  # type: ignore[arg-type]
+
+
+def floats_of_moved(tool: pin.SE3, way: float) -> tuple[float, ...]:
+    (x, y, z), rotation = floats_of(tool)
+    return (x + way, y, z, *rotation)
+
+
+class Run:
+    """A teleop layer whose arms are where their last targets are."""
+
+    def __init__(self, settings: TeleopSettings | None = None) -> None:
+        self.teleop = Teleop(settings or TeleopSettings(), SIDES)
+        self.now = 10.0
+        self.tools = dict(TOOLS)
+        self.targets: dict[str, ArmTarget] = {}
+        self.blocked = False
+
+    def tick(self, *chunks: ActionChunk, samples: tuple[HandSample, ...] = ()) -> None:
+        self.now += TICK
+        self.targets = self.teleop.update(samples, self.tools, self.now, self.tools, chunks=chunks)
+        if not self.blocked:
+            self.tools |= {arm: target.pose for arm, target in self.targets.items() if target.pose is not None}
+
+    def ways(self, seconds: float, *chunks: ActionChunk) -> Array:
+        """Of the left tool along x, after each tick [m]."""
+        found = []
+        for _ in range(round(seconds / TICK)):
+            self.tick(*chunks)
+            chunks = ()
+            found.append(self.tools["left"].translation[0] - TOOLS["left"].translation[0])
+        return np.array(found)
+
+    def states(self) -> set[str]:
+        return {str(state) for state in self.teleop.states.values()}
+
+    def reasons(self, arm: str = "left") -> list[str]:
+        return [kinds(event.reason) for event in self.teleop.take_events() if event.arm == arm]
+
+
+def test_the_first_target_is_the_tool_and_actions_are_reached_at_their_times() -> None:
+    run = Run()
+    times = run.now + TICK + PERIOD * np.arange(6)
+    wanted = 0.1 * (times - times[0]) ** 2
+    ways = run.ways(5.0 * PERIOD, chunk(times, wanted))
+    assert run.states() == {"policy"}
+    assert ways[0] == pytest.approx(0.0, abs=1e-12)
+    for index in range(1, 5):
+        assert ways[round(index * PERIOD / TICK)] == pytest.approx(wanted[index], abs=1e-9)
+    assert np.abs(np.diff(ways)).max() < 0.1 * TICK
+
+
+def test_a_newer_chunk_counts_from_its_first_time_on_and_the_difference_fades_without_a_jump() -> None:
+    run = Run()
+    start = run.now + TICK
+    old = chunk(start + PERIOD * np.arange(20), np.zeros(20))
+    new = chunk(start + 0.2 + PERIOD * np.arange(20), np.full(20, 0.03))
+    ways = run.ways(0.5, old, new)
+    assert np.abs(ways[:200]).max() < 1e-12
+    assert ways[-1] == pytest.approx(0.03, abs=1e-9)
+    assert np.abs(np.diff(ways)).max() <= 0.6 * TICK + 1e-9
+
+
+def test_a_newer_chunk_replaces_those_too_whose_time_has_not_come() -> None:
+    run = Run()
+    later = chunk(run.now + 0.3 + PERIOD * np.arange(10), np.full(10, 0.03))
+    newer = chunk(run.now + PERIOD * np.arange(20), np.zeros(20))
+    assert np.abs(run.ways(0.6, later, newer)).max() < 1e-12
+
+
+def test_a_late_chunk_is_followed_from_where_it_still_counts_and_one_of_the_past_is_left_out() -> None:
+    run = Run()
+    past = chunk(run.now - 2.0 + PERIOD * np.arange(10), np.full(10, 0.05))
+    run.ways(0.1, past)
+    assert run.states() == {"idle"}
+    late = chunk(run.now - 0.2 + PERIOD * np.arange(10), 0.01 * np.arange(10.0))
+    ways = run.ways(0.2, late)
+    assert ways[-1] == pytest.approx(0.08, abs=1e-3)
+
+
+def test_motions_lead_on_from_the_target_and_a_single_late_one_is_made_as_a_whole() -> None:
+    run = Run()
+    motion = np.tile([0.01, 0.0, 0.0, 0.0, 0.0, 0.2], (1, 1))
+    for index in range(5):
+        run.ways(PERIOD, ActionChunk(np.array([run.now - 0.02]), PERIOD, motions=dict.fromkeys(SIDES, motion)))
+        turned = pin.log3(TOOLS["left"].rotation.T @ run.tools["left"].rotation)
+        assert turned[2] == pytest.approx(0.2 * (index + 1), rel=0.05)
+
+
+def test_a_policy_that_stalls_ends_in_rest_with_a_reason_and_goes_on_with_a_chunk_that_begins_at_the_tool() -> None:
+    run = Run()
+    run.ways(0.1, chunk(np.array([run.now]), np.array([0.01])))
+    run.ways(SILENT - 0.11)
+    assert run.states() == {"policy"}
+    run.ways(0.02)
+    assert run.states() == {"lost"}
+    assert all(target.pose is None for target in run.targets.values())
+    assert run.reasons() == ["policy_acts", "policy_silent"]
+    run.ways(0.1, chunk(np.array([run.now]), np.array([0.02])))
+    assert run.states() == {"policy"}
+
+
+@pytest.mark.parametrize(
+    ("way", "reason"),
+    [(np.array([0.2]), "policy_jumped"), (np.array([0.0, 0.0, 0.16]), "policy_jumped")],
+    ids=["from the tool", "between two actions"],
+)
+def test_an_action_that_jumps_stops_both_arms_and_is_not_followed(way: Array, reason: str) -> None:
+    run = Run()
+    run.ways(0.1, chunk(np.array([run.now]), np.array([0.0])))
+    before = run.tools["left"]
+    run.ways(0.1, chunk(run.now + PERIOD * np.arange(len(way)), way, arms=("left",)))
+    assert run.states() == {"lost"}
+    assert run.tools["left"] is before
+    assert run.reasons() == ["policy_acts", reason]
+    assert run.reasons("right") == []
+
+
+def test_what_cannot_be_used_is_told_once_while_nothing_moves() -> None:
+    run = Run()
+    fault = ActionChunk(np.zeros(0), PERIOD, fault=Reason.of(ReasonKind.POLICY_UNUSABLE, text="no numbers"))
+    for _ in range(10):
+        run.tick(fault)
+    assert run.states() == {"idle"}
+    assert run.reasons() == ["policy_refused: policy_unusable"]
+
+
+def test_times_of_another_clock_are_refused() -> None:
+    run = Run()
+    run.tick(chunk(np.array([run.now + 1e9]), np.array([0.0])))
+    assert run.reasons() == ["policy_refused: policy_unusable"]
+
+
+def test_grippers_change_at_the_time_of_the_action() -> None:
+    run = Run()
+    openings = {"left": np.array([1.0, 0.25])}
+    run.ways(PERIOD - 2 * TICK, chunk([run.now, run.now + PERIOD], np.zeros(2), grippers=openings))
+    assert run.targets["left"].gripper == 1.0
+    run.ways(4 * TICK)
+    assert run.targets["left"].gripper == 0.25
+    assert run.targets["right"].gripper == 1.0
+
+
+def test_the_leash_holds_the_target_near_a_tool_that_something_blocks() -> None:
+    run = Run()
+    run.blocked = True
+    times = run.now + PERIOD * np.arange(20)
+    run.ways(0.9, chunk(times, 0.01 * np.arange(20.0)))
+    target = run.targets["left"].pose
+    assert target is not None
+    assert target.translation[0] - TOOLS["left"].translation[0] == pytest.approx(0.1)
+
+
+def test_targets_stay_in_the_workspace() -> None:
+    box = {"x": [0.3, 0.52], "y": [0.0, 0.6], "z": [0.1, 0.7]}
+    run = Run(TeleopSettings.model_validate({"workspace": {"left": box}}))
+    assert run.ways(0.9, chunk(run.now + PERIOD * np.arange(20), 0.004 * np.arange(20.0))).max() == pytest.approx(0.02)
+
+
+def test_an_operator_whose_data_ceased_is_asked_before_the_policy_goes_on() -> None:
+    run = Run()
+
+    def hands(lower: bool) -> tuple[HandSample, ...]:
+        return tuple(sample(hand, pose(), run.now + TICK, lower=lower) for hand in SIDES)
+
+    for k in range(400):
+        run.tick(samples=hands(50 <= k < 150))
+    assert run.states() == {"engaged"}
+    run.ways(0.3, chunk(run.now + PERIOD * np.arange(20), np.zeros(20)))
+    assert run.states() == {"lost"}
+    run.ways(0.3, chunk(run.now + PERIOD * np.arange(20), np.zeros(20)))
+    assert run.states() == {"lost"}
