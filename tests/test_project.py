@@ -32,7 +32,8 @@ IMPORTS = {
     "pillow": "PIL",
     "protobuf": "google",
 }
-WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core"}  # come with pin, mujoco, lerobot and pydantic
+# Come with pin, mujoco, lerobot, pydantic and viser.
+WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core", "trimesh", "websockets"}
 NODES = set(ROS.rglob("*.py"))
 OTHERS = set((ROOT / PACKAGE).rglob("*.py")) - NODES
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("[qb]*/**/*.md")])
@@ -74,7 +75,7 @@ def imported(files: Iterable[Path]) -> set[str]:
 
 
 def test_every_dependency_is_imported_by_the_package_and_everything_that_is_imported_is_one() -> None:
-    optional = modules("bench", "xacro", "export", "lerobot", "modbus")
+    optional = modules("bench", "xacro", "export", "lerobot", "modbus", "web")
     assert modules() <= imported(OTHERS)
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
     built = {file.parent.name for file in (ROS / "interfaces").glob("*/package.xml")}

@@ -10,6 +10,8 @@ import re
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from playwright.sync_api import Page
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.viewer.web.scene import FIELD_OF_VIEW, first_view
-from tests.support.processes import CELL, cell, wait_until
+from tests.support.processes import CELL, cell
 
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = [
@@ -29,17 +31,21 @@ ARGUMENTS = [
     *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"),
 ]
 VIEW = {"width": 720, "height": 400}
-_PATIENCE = 60.0  # with a page drawn by the processor [s]
-_GATE = "  gate:\n    timeout: 2.0\n"  # [s], so that a processor that is busy drawing stops no arm
+_PATIENCE = 40.0  # with a page drawn by the processor [s]
+# A processor that is busy drawing stops no arm.
+_PATIENT = (("    timeout: 0.15 ", "    timeout: 2.0 "), ("loop_rate_hz: 1000.0 ", "loop_rate_hz: 500.0 "))
 
 
 class WebRun:
     """``q2r2 run`` with its page, driven by it."""
 
-    def __init__(self, folder: Path, *options: str, port: int = 0, patient: bool = True) -> None:
+    def __init__(self, folder: Path, *options: str, port: int = 0) -> None:
         file = folder / "cell.yaml"
         text = Path(CELL).read_text(encoding="utf-8")
-        file.write_text(re.sub(r"(?m)^  gate:\n    timeout: \S+.*\n", _GATE, text) if patient else text)
+        for usual, patient in _PATIENT:
+            assert usual in text
+            text = text.replace(usual, patient)
+        file.write_text(text, encoding="utf-8")
         self._errors = folder / "stderr"
         command = [sys.executable, "-m", "q2r2_control", "run", str(file), "--plant", "kinematic", "--headless"]
         command += ["--json", "--web", "--web-port", str(port), *options]
@@ -61,15 +67,10 @@ class WebRun:
         summary: dict[str, Any] = json.loads(output)
         return summary
 
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.wait()
-
-    def stop(self) -> dict[str, Any]:
+    def interrupt(self) -> None:
         """As Ctrl-C does."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
-        return self.end()
 
 
 def leave_a_processor_to_the_loop() -> None:
@@ -82,6 +83,14 @@ def table(page: Page) -> dict[str, list[str]]:
     """Rows of the panel's table: what is said of the left and of the right arm."""
     rows = page.locator("table tr").evaluate_all("rows => rows.map(row => [...row.cells].map(cell => cell.innerText))")
     return {row[0]: row[1:] for row in rows}
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    """Wait until ``condition`` of a page holds; the last value is in the failure."""
+    deadline = time.monotonic() + _PATIENCE
+    while not (found := condition()):
+        assert time.monotonic() < deadline, f"waited in vain: {found}"
+        time.sleep(0.1)
 
 
 def wait_for(page: Page, text: str) -> None:

@@ -10,9 +10,10 @@ pytest.importorskip("playwright")
 
 from playwright.sync_api import BrowserContext, Page, sync_playwright
 
-from tests.web.browser import ARGUMENTS, CHROMIUM, VIEW, leave_a_processor_to_the_loop
+from tests.web.browser import ARGUMENTS, CHROMIUM, VIEW, WebRun, leave_a_processor_to_the_loop
 
 Open = Callable[[str], Page]
+Start = Callable[..., WebRun]
 
 
 @pytest.fixture(scope="session")
@@ -38,10 +39,22 @@ def open_page(browser: BrowserContext) -> Iterator[Open]:
         return pages[-1]
 
     yield open_one
+    for i, page in enumerate(pages):
+        if not page.is_closed():
+            page.screenshot(path=f"/tmp/w_fail{i}.png")
     for page in pages:
         page.close()
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return tmp_path
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Start runs with a page, each of which ends with the test."""
+    runs: list[WebRun] = []
+
+    def start_one(*options: str, port: int = 0) -> WebRun:
+        runs.append(WebRun(tmp_path, *options, port=port))
+        return runs[-1]
+
+    yield start_one
+    for run in runs:
+        run.interrupt()

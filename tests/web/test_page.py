@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 
-from tests.support.processes import wait_until
-from tests.web.browser import WebRun, on_screen, pixels, table, tool, tool_at_home, wait_for
-from tests.web.conftest import Open
+from tests.web.browser import on_screen, pixels, table, tool, tool_at_home, wait_for, wait_until
+from tests.web.conftest import Open, Start
 
 ORANGE = (255.0, 107.0, 13.0)  # of the arms' rings
 
 
-def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page: Open, folder: Path) -> None:
-    run = WebRun(folder, "--input", "scripted", "--trajectory", "circle")
+def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page: Open, start: Start) -> None:
+    run = start("--input", "scripted", "--trajectory", "circle")
     page = open_page(run.url)
     wait_for(page, "certified")
     wait_until(lambda: table(page)["state"] == ["engaged", "engaged"])
@@ -29,10 +27,11 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     summary = run.end()
     assert summary["at_rest"]
     # The same page shows the next run at this address.
-    again = WebRun(folder, "--input", "scripted", port=urlsplit(run.url).port or 0)
+    again = start("--input", "scripted", port=urlsplit(run.url).port or 0)
     wait_until(lambda: table(page)["state"][0] != "paused")
     wait_for(page, "follows the hand")
-    again.stop()
+    again.interrupt()
+    assert again.end()["at_rest"]
 
 
 def _orange(picture: np.ndarray) -> tuple[int, int]:
@@ -41,8 +40,8 @@ def _orange(picture: np.ndarray) -> tuple[int, int]:
     return int(near[:, :middle].sum()), int(near[:, middle:].sum())
 
 
-def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open_page: Open, folder: Path) -> None:
-    run = WebRun(folder, "--input", "web")
+def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open_page: Open, start: Start) -> None:
+    run = start("--input", "web")
     page = open_page(run.url)
     wait_for(page, "certified")
     before = tool(page)
@@ -69,5 +68,5 @@ def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open
     page.close()
     wait_until(lambda: table(other)["state"][0] == "lost")
     assert "connection lost" in table(other)["why"][0]
-    summary = run.stop()
-    assert summary["at_rest"]
+    run.interrupt()
+    assert run.end()["at_rest"]

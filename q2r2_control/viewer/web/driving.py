@@ -15,7 +15,7 @@ from q2r2_control.viewer.web.figure import place
 
 _SIZE = 0.22  # of a gizmo [m]
 _PERIOD = 0.02  # between samples [s]
-_ANSWER = 0.5  # a page that does not answer for longer drives no more [s]
+_ANSWER = 2.0  # a page that does not answer for longer drives no more [s]
 _Gizmos = dict[str, viser.TransformControlsHandle]  # by arm
 
 
