@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak test-lerobot lint bench docs picture soak wheel release-check clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak test-lerobot test-web lint bench docs picture soak wheel release-check clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -26,11 +26,11 @@ demo: setup
 	$(BIN)/q2r2 demo
 
 test: setup
-	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot -m 'not slow'
+	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot --ignore tests/web -m 'not slow'
 
 # Tests that play minutes of motion, or whole runs again and again.
 test-slow: setup
-	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot -m 'slow and not soak'
+	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot --ignore tests/web -m 'slow and not soak'
 
 # Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
 test-ros: setup
@@ -43,7 +43,17 @@ test-ros-slow: setup
 
 # Tests that .ci/run leaves out.
 test-soak: setup
-	$(BIN)/python -m pytest --ignore tests/lerobot -m soak
+	$(BIN)/python -m pytest --ignore tests/lerobot --ignore tests/web -m soak
+
+# The page of a run in a real browser. Debian's Chromium, since the browsers of playwright are downloads of its own.
+test-web: $(VENV)/.installed-web
+	@command -v /usr/bin/chromium > /dev/null || { apt-get update -qq && apt-get install -y -qq chromium; } > /dev/null \
+		|| { echo 'make test-web needs /usr/bin/chromium: apt-get install chromium'; exit 1; }
+	$(BIN)/python -m pytest tests/web
+
+$(VENV)/.installed-web: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --editable '.[web]' 'playwright>=1.49'
+	touch $@
 
 # q2r2 export lerobot with the package that it needs. That takes some gigabytes, so it has an environment of its own.
 # All in one call of pip, which chooses the torch and torchvision that lerobot allows.

@@ -51,6 +51,8 @@ class ReasonKind(StrEnum):
     VERDICT = "verdict", "verdict on episode {episode}: {line}"
     # Requests of a program.
     HOME_REQUESTED = "home_requested", "a program asks for the way home"
+    PAUSE_REQUESTED = "pause_requested", "a program asks for a pause"
+    RECORDING_REQUESTED = "recording_requested", "a program asks for {action}"
     SETTINGS_REQUESTED = "settings_requested", "a program changes settings: {changes}"
     CONTROL_REQUESTED = "control_requested", "a program changes control: {changes}"
     SETTINGS_CHANGED = "settings_changed", "settings changed"

@@ -32,8 +32,8 @@ IMPORTS = {
     "pillow": "PIL",
     "protobuf": "google",
 }
-# These come with pin, mujoco, lerobot, pydantic and matplotlib.
-WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core", "packaging"}
+# These come with pin, mujoco, lerobot, pydantic, matplotlib and viser.
+WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core", "packaging", "trimesh", "websockets"}
 NODES = set(ROS.rglob("*.py"))
 OTHERS = set((ROOT / PACKAGE).rglob("*.py")) - NODES
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("[qb]*/**/*.md")])
@@ -75,7 +75,7 @@ def imported(files: Iterable[Path]) -> set[str]:
 
 
 def test_every_dependency_is_imported_by_the_package_and_everything_that_is_imported_is_one() -> None:
-    optional = modules("bench", "xacro", "export", "lerobot", "modbus")
+    optional = modules("bench", "xacro", "export", "lerobot", "modbus", "web")
     assert modules() <= imported(OTHERS)
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
     built = {file.parent.name for file in (ROS / "interfaces").glob("*/package.xml")}

@@ -42,6 +42,7 @@ from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.tables import print_table
+from q2r2_control.viewer.web.view import PageView
 
 _PERIOD = 1.0 / 30.0  # [s]
 
@@ -97,6 +98,7 @@ class RunOptions:
     tasks: tuple[AssemblyTask, ...] = ()  # to be judged
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
+    page: tuple[str, int] | None = None  # address of the page in the browser
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,21 +117,28 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
         raise ConfigError(f"{config.name}: controller: external is driven by q2r2 ros up; {builtin}")
     if options.window:
         check_window(options.plant)
+    # Processes before the pipeline, which takes longer to build than they take to start.
+    if options.page is None:
+        return _run_recorded(config, options, None)
+    with PageView(*options.page) as page:
+        return _run_recorded(config, options, page)
+
+
+def _run_recorded(config: Config, options: RunOptions, page: PageView | None) -> CellRun:
     if options.record is None:
-        return _run_cell(config, options, None)
-    # Before the pipeline, which takes longer to build than the recorder's process to start.
+        return _run_cell(config, options, None, page)
     pictures = bool(config.simulated_cameras) and issubclass(load_class(PLANTS, options.plant), MujocoPlant)
     recorder = Recorder(options.record, options.name, waits=options.fast, pictures=pictures)
     try:
         with recorder:
-            run = _run_cell(config, options, recorder)
+            run = _run_cell(config, options, recorder, page)
     except PlantError:
         _print_lines(Console(stderr=True), _recording_lines(recorder.summary))
         raise
     return replace(run, recording=recorder.summary)
 
 
-def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None) -> CellRun:
+def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, page: PageView | None) -> CellRun:
     console = Console(stderr=True)
     with notice_of_compiling():
         source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
@@ -145,6 +154,8 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None) ->
     if options.tasks and isinstance(pipeline.plant, MujocoPlant):
         watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
         pipeline.listeners.append(watch)
+    if page is not None:
+        say(f"page: {page.begin(pipeline, options.name, recorder is not None)}", console)
     summary = _run(pipeline, options, recorder, console)
     results = () if watch is None else watch.results()
     if recorder is not None and results:

@@ -39,6 +39,7 @@ from q2r2_control.inputs.base import options_of
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, trajectory_named
+from q2r2_control.inputs.web import web_cell
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import not_commissioned
 from q2r2_control.types import CommandMode
@@ -54,6 +55,9 @@ Viewer = Annotated[bool, Option("--viewer", help="Open MuJoCo's window; closing 
 Human = Annotated[bool, Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
 Seed = Annotated[int, Option(min=0, help="Of what --human adds.")]
 Record = Annotated[Path | None, Option(metavar="DIR", help="Record the run to a new folder in DIR.")]
+Web = Annotated[bool, Option("--web", help="Show the run in a browser, at http://127.0.0.1:8080; the extra `web`.")]
+WebHost = Annotated[str, Option(metavar="HOST", help="Address of the page; beyond 127.0.0.1 its URL has a token.")]
+WebPort = Annotated[int, Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0: any free one.")]
 RealTime = Annotated[bool, Option("--rt", help="Lock memory and run under SCHED_FIFO, as far as permitted.")]
 
 Host = Annotated[str | None, Option(help="Address to bind, not the config's; 0.0.0.0: all, :: IPv6 too.")]
@@ -76,6 +80,9 @@ def run(
     port: Port = None,
     viewer: Viewer = False,
     headless: Headless = False,
+    web: Web = False,
+    web_host: WebHost = "127.0.0.1",
+    web_port: WebPort = 8080,
     rt: RealTime = False,
     record: Record = None,
     task: Task = None,
@@ -95,6 +102,8 @@ def run(
     if (plant or cell.plant) == "fri" and not i_know and (why := not_commissioned(cell, find_resource(config))):
         raise ConfigError(f"{config}: {why}; q2r2 commission {config} commissions it; --i-know runs it all the same")
     source = input or cell.input
+    if source == "web":
+        cell, web = web_cell(cell), True
     asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
     asked |= {"policy": policy, "takeover": takeover}
     asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}
@@ -114,6 +123,7 @@ def run(
         input_options=given,
         table=_shows_table(headless, viewer),
         window=viewer,
+        page=(web_host, web_port) if web else None,
         force=force,
         real_time=rt,
         record=record,
@@ -138,6 +148,9 @@ def demo(
     fast: Fast = False,
     viewer: Viewer = False,
     headless: Headless = False,
+    web: Web = False,
+    web_host: WebHost = "127.0.0.1",
+    web_port: WebPort = 8080,
     human: Human = False,
     seed: Seed = 0,
     seeds: Annotated[
@@ -176,6 +189,7 @@ def demo(
         input_options={"trajectory": trajectory, "human": human, "seed": seed},
         table=_shows_table(headless, viewer),
         window=viewer,
+        page=(web_host, web_port) if web else None,
         real_time=rt,
         tasks=chosen,
         record=record,

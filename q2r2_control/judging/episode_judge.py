@@ -16,7 +16,7 @@ from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode import Episode, read_episode
 from q2r2_control.judging.judge import judge_episode, part_of, parts_of
-from q2r2_control.recording.helper_process import HelperProcess, reason_of
+from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.recording.reader import EpisodeSpan, spans_of
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.summary.tick import Tick

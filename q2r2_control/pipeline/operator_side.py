@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Event, Reason, ReasonKind
@@ -34,22 +35,29 @@ class PendingRequests:
     """Requests of a program, set from any thread; each is done at the next tick, and recorded for a replay."""
 
     home: bool = False
+    pause: bool = False
+    mark: Action | None = None  # of the recording
     settings: TeleopSettings | None = None
     control: Mapping[str, float] | None = None  # of the controller, by name
     of_recording: list[Reason] = field(default_factory=list)  # verdicts on episodes, and why it ended
 
     def __bool__(self) -> bool:
-        return self.home or self.settings is not None or self.control is not None or bool(self.of_recording)
+        asked = self.home or self.pause or self.settings is not None or self.control is not None
+        return asked or self.mark is not None or bool(self.of_recording)
 
     def clear(self) -> None:
         """Ask for nothing any more."""
-        self.home, self.settings, self.control = False, None, None
+        self.home, self.pause, self.mark, self.settings, self.control = False, False, None, None, None
         self.of_recording.clear()
 
     def reasons(self, current: TeleopSettings) -> Iterator[Reason]:
         """One for each request; settings by what is not as it is in the ``current`` ones."""
         if self.home:
             yield Reason(ReasonKind.HOME_REQUESTED)
+        if self.pause:
+            yield Reason(ReasonKind.PAUSE_REQUESTED)
+        if self.mark is not None:
+            yield Reason.of(ReasonKind.RECORDING_REQUESTED, action=str(self.mark))
         if self.settings is not None:
             changed = _difference(current.model_dump(mode="json"), self.settings.model_dump(mode="json"))
             yield Reason.of(ReasonKind.SETTINGS_REQUESTED, changes=changed)
@@ -61,6 +69,10 @@ class PendingRequests:
         """Request what a recorded ``reason`` says was requested. Raises ValueError for settings that are none."""
         if reason.kind is ReasonKind.HOME_REQUESTED:
             self.home = True
+        elif reason.kind is ReasonKind.PAUSE_REQUESTED:
+            self.pause = True
+        elif reason.kind is ReasonKind.RECORDING_REQUESTED:
+            self.mark = Action(reason.detail["action"])
         elif reason.kind is ReasonKind.CONTROL_REQUESTED:
             self.control = reason.detail["changes"]
         elif reason.kind is ReasonKind.SETTINGS_REQUESTED:
@@ -171,19 +183,23 @@ class OperatorSide:
             pulses.grasps(self._grips[arm].look(commanded, opening, tick.now))
 
     def _fulfil(self, now: float) -> None:
-        home, settings, control = self._requests.home, self._requests.settings, self._requests.control
+        requests = replace(self._requests)
         for reason in self._requests.reasons(self._teleop.settings):
             self._teleop.record_event(now, reason)
         self._requests.clear()
-        if home:
+        if requests.home:
             self._teleop.home(now)
-        if settings is not None:
+        if requests.pause:
+            self._teleop.pause(now, Reason(ReasonKind.PAUSE_REQUESTED))
+        if requests.mark is not None:
+            self._teleop.mark(now, requests.mark)
+        if (settings := requests.settings) is not None:
             problem = self._teleop.change(settings, now)
             self._record_change(ReasonKind.SETTINGS_CHANGED, problem, now)
             for pulses in self._pulses.values() if problem is None else ():
                 pulses.strength = settings.haptics.strength
-        if control is not None:
-            refused = self._controller.change(control)
+        if requests.control is not None:
+            refused = self._controller.change(requests.control)
             problem = None if refused is None else Reason.of(ReasonKind.CONTROL_REFUSED, text=refused)
             self._record_change(ReasonKind.CONTROL_CHANGED, problem, now)
 

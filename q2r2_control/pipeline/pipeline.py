@@ -11,6 +11,7 @@ from contextlib import suppress
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
@@ -96,6 +97,14 @@ class Pipeline:
     def go_home(self) -> None:
         """Bring both arms home, as an operator may; from any thread. Any press ends it; events say how it went."""
         self.requests.home = True
+
+    def pause(self) -> None:
+        """Let both arms hold until a new press; from any thread."""
+        self.requests.pause = True
+
+    def mark(self, action: Action) -> None:
+        """Begin, end or mark an episode of the recording, as an operator may; from any thread."""
+        self.requests.mark = action
 
     def change_teleop(self, settings: TeleopSettings) -> None:
         """Other settings of the operator's for the rest of this run, without a jump; from any thread.

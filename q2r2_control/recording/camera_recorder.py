@@ -17,7 +17,7 @@ from PIL import Image
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import PlantError
-from q2r2_control.recording.helper_process import HelperProcess, reason_of
+from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.recording.messages import Message, Topic, picture, picture_topic
 from q2r2_control.summary.tick import Tick
 

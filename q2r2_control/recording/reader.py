@@ -25,8 +25,8 @@ from zstandard import ZstdError
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event, ReasonKind
+from q2r2_control.process.helper_process import reason_of
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, LOOP, ROBOT, About, Conclusion
-from q2r2_control.recording.helper_process import reason_of
 from q2r2_control.recording.messages import (
     PICTURE,
     SAMPLES,

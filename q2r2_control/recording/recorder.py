@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.camera_recorder import CameraRecorder
-from q2r2_control.recording.helper_process import HelperProcess, reason_of
 from q2r2_control.recording.messages import Message, Topic, run_topics
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, RecordingSetup, Written

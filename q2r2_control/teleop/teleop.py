@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import pinocchio as pin
 
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.quaternions import se3_of
@@ -180,6 +181,10 @@ class Teleop:
         """The things that the operator should know of both arms."""
         for arm in self._arms.values():
             arm.record_event(now, reason)
+
+    def mark(self, now: float, action: Action) -> None:
+        """A program marks the recording, as a hand may; see :class:`EpisodeMarks`."""
+        next(iter(self._arms.values())).record_event(now, Reason(self.marks.apply(action)))
 
     def reset(self, now: float, arm: str, reason: Reason) -> None:
         """An arm holds, its hand has to be seen anew before it drives the arm, and a stop of all arms is over."""

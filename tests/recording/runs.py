@@ -17,9 +17,9 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.process.helper_process import HelperProcess
 from q2r2_control.recording.about import About
 from q2r2_control.recording.bag import BagWriter
-from q2r2_control.recording.helper_process import HelperProcess
 from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import ROOM, Recorder, RecordingSummary

@@ -158,10 +158,18 @@ def run_helper(module: str) -> None:
     """Inside the process: call ``module.main``; the last answer is a RuntimeError of what went wrong."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # for the run, which ends this process
         signal.signal(number, signal.SIG_IGN)
+    stream, sys.stdout = sys.stdout.buffer, sys.stderr  # what a library prints is no answer
+    lock = Lock()  # answers may come from several threads
+
+    def answer(content: Any) -> None:
+        with lock, suppress(BrokenPipeError):  # of a run that was killed
+            pickle.dump(content, stream)
+            stream.flush()
+
     try:
-        import_module(module).main(_requests(), _answer)
+        import_module(module).main(_requests(), answer)
     except Exception as error:
-        _answer(RuntimeError(reason_of(error)))
+        answer(RuntimeError(reason_of(error)))
 
 
 def _requests() -> Iterator[Any]:
@@ -169,12 +177,6 @@ def _requests() -> Iterator[Any]:
     with suppress(EOFError, pickle.UnpicklingError):
         while True:
             yield pickle.load(sys.stdin.buffer)
-
-
-def _answer(answer: Any) -> None:
-    with suppress(BrokenPipeError):  # of a run that was killed
-        pickle.dump(answer, sys.stdout.buffer)
-        sys.stdout.buffer.flush()
 
 
 def reason_of(error: BaseException) -> str:

@@ -1,0 +1,137 @@
+"""Gizmos at the tools, with which one page at a time moves them, as a hand does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from threading import RLock, Thread
+from typing import Any
+
+import pinocchio as pin
+import viser
+
+from q2r2_control.viewer.web.exchange import Frame, PageHand, PageLost, PageSetup
+from q2r2_control.viewer.web.figure import place
+
+_SIZE = 0.22  # of a gizmo [m]
+_PERIOD = 0.02  # between samples [s]
+_ANSWER = 2.0  # a page that does not answer for longer drives no more [s]
+_Gizmos = dict[str, viser.TransformControlsHandle]  # by arm
+
+
+class Driving:
+    """The page that drags first drives until it lets go. Others watch meanwhile, and have no gizmos.
+
+    A browser says nothing of a mouse that rests. So the page that drives is asked again and again for an answer, which
+    its own script gives; each answer is a sample of the hands. Without them the gate stops the arms.
+    """
+
+    def __init__(self, server: viser.ViserServer, setup: PageSetup, answer: Callable[[Any], None]) -> None:
+        self._arms, self._answer = tuple(setup.joints), answer
+        self._lock = RLock()
+        self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # of each page
+        self._driver: int | None = None
+        self._dragged: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {}  # arm -> position, x y z w
+        self._tools: dict[str, tuple[float, ...]] = {}  # arm -> x y z qx qy qz qw
+        server.on_client_connect(self._connect)
+        server.on_client_disconnect(self._disconnect)
+
+    @property
+    def words(self) -> str:
+        """Who drives."""
+        driver = self._driver
+        return "drag a tool's arrows or rings to move it" if driver is None else f"page {driver} drives"
+
+    def add_buttons(self, gui: viser.GuiApi) -> None:
+        """A button for each gripper."""
+        for arm in self._arms:
+
+            @gui.add_button(f"Close or open the {arm} gripper").on_click
+            def _(event: viser.GuiEvent, arm: str = arm) -> None:
+                with self._lock:
+                    if self._driver in (None, event.client_id):
+                        for pressed in (False, True, False):
+                            self._send(arm, pressed)
+
+    def show(self, frame: Frame) -> None:
+        """Put the gizmos that nobody drags where the tools are."""
+        with self._lock:
+            self._tools = {arm: tuple(pin.SE3ToXYZQUATtuple(tool)) for arm, tool in frame.tick.tools.items()}
+            for page, (_, gizmos) in self._gizmos.items():
+                for arm, gizmo in gizmos.items():
+                    gizmo.visible = self._driver in (None, page)
+                    if self._driver != page or arm not in self._dragged:
+                        place(gizmo, frame.tick.tools[arm])
+
+    async def _connect(self, client: viser.ClientHandle) -> None:
+        page, gizmos = client.client_id, _Gizmos()
+        client.gui.add_html(f"<div style='font-size:12px;padding:0 0.6em'>this is page {page}</div>")
+        for arm in self._arms:
+            gizmos[arm] = client.scene.add_transform_controls(f"/gizmos/{arm}", scale=_SIZE, depth_test=False)
+
+            async def drag(event: viser.TransformControlsEvent, arm: str = arm) -> None:
+                # No await, so that the pose is the one of this event.
+                self._drag(page, arm, event)
+
+            gizmos[arm].on_update(drag)
+        with self._lock:
+            self._gizmos[page] = client, gizmos
+
+    async def _disconnect(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            self._gizmos.pop(client.client_id, None)
+            if self._driver == client.client_id:
+                self._lose()
+
+    def _drag(self, page: int, arm: str, event: viser.TransformControlsEvent) -> None:
+        with self._lock:
+            if event.phase == "start" and self._driver in (None, page):
+                begins, self._driver = self._driver is None, page
+                self._dragged[arm] = _pose_of(event.target)
+                for held in (False, True):  # a control has to be seen released before it counts
+                    self._send(arm, drag=held)
+                if begins:
+                    Thread(target=self._ask, args=(page,), daemon=True).start()
+            elif self._driver == page and arm in self._dragged:
+                self._dragged[arm] = _pose_of(event.target)
+                self._send(arm, drag=event.phase != "end")
+                if event.phase == "end":
+                    del self._dragged[arm]
+                    self._driver = page if self._dragged else None
+
+    def _ask(self, page: int) -> None:
+        """Ask the page that drives for answers, each of which is a sample."""
+        while True:
+            with self._lock:
+                if self._driver != page:
+                    return
+                client, _ = self._gizmos[page]
+            began = time.monotonic()
+            try:
+                client.local_storage.get_item("alive", timeout=_ANSWER)
+            except (RuntimeError, TimeoutError):
+                with self._lock:
+                    if self._driver == page:
+                        self._lose()
+                return
+            with self._lock:
+                for arm in self._dragged if self._driver == page else ():
+                    self._send(arm)
+            time.sleep(max(began + _PERIOD - time.monotonic(), 0.0))
+
+    def _lose(self) -> None:
+        self._driver = None
+        self._dragged.clear()
+        self._answer(PageLost())
+
+    def _send(self, arm: str, gripper: bool = False, drag: bool | None = None) -> None:
+        held = arm in self._dragged
+        if not held and arm not in self._tools:
+            return
+        position, quaternion = self._dragged[arm] if held else (self._tools[arm][:3], self._tools[arm][3:])
+        self._answer(PageHand(arm, position, quaternion, held if drag is None else drag, gripper))
+
+
+def _pose_of(gizmo: viser.TransformControlsHandle) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    w, *xyz = map(float, gizmo.wxyz)
+    return tuple(map(float, gizmo.position)), (*xyz, w)

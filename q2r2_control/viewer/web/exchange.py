@@ -1,0 +1,78 @@
+"""The data that a run and the server of its page exchange."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+import pinocchio as pin
+
+from q2r2_control.config.cell import Config
+from q2r2_control.events import Event
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import ActiveLimit, Array
+
+
+@dataclass(frozen=True)
+class PageSetup:
+    """The first message to the server: the cell, and where to listen."""
+
+    host: str
+    port: int  # 0: any free one
+    title: str
+    config: Config
+    urdf: str
+    joint_names: tuple[str, ...]
+    joints: Mapping[str, Array]  # of each arm, indices of ``joint_names``
+    fingers: Mapping[str, tuple[str, ...]]  # of each arm, joints of its gripper
+    home: Array  # (nv,) [rad]
+    lower: Array  # (nv,) position limits [rad]
+    upper: Array
+    model: pin.Model
+    collision_model: pin.GeometryModel  # whose pairs are monitored
+    parts: Mapping[str, int]  # loose objects by name -> where their pose begins in ``Frame.moved``
+    recorded: bool  # whether a recorder runs
+    driven: bool  # whether the page is the run's input
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The newest tick, and what has come together since the last frame."""
+
+    tick: Tick
+    events: tuple[Event, ...]
+    binding: tuple[ActiveLimit, ...]  # limits that held a step back
+    ticks: int
+    moved: Array | None  # MuJoCo's positions of all that moves
+
+
+class Ready(NamedTuple):
+    """The server's first answer: it listens."""
+
+    url: str
+
+
+class PageHand(NamedTuple):
+    """A hand that a page moves; the numbers are a browser's, and nothing has checked them."""
+
+    hand: str
+    position: tuple[float, ...]  # world [m]
+    quaternion: tuple[float, ...]  # x y z w
+    drag: bool
+    gripper: bool
+
+
+class PageLost(NamedTuple):
+    """The page that drove is gone."""
+
+
+class PageRequest(StrEnum):
+    """What a button of the page asks for."""
+
+    STOP = "stop"
+    PAUSE = "pause"
+    HOME = "home"
+    RECORD = "record"
+    MARK = "mark"

@@ -1,0 +1,166 @@
+"""The scene of the page: robot, ghost, targets, trails, the tightest pair, and what stands in the cell."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import viser
+
+from q2r2_control.robot.pairs import pair_names
+from q2r2_control.teleop.arm_states import ArmState
+from q2r2_control.types import Array
+from q2r2_control.viewer.web.exchange import Frame, PageSetup
+from q2r2_control.viewer.web.figure import Colour, JointTree, RobotFigure, colour_of, place
+
+GREEN, AMBER, RED, BLUE, GREY = (46, 160, 90), (230, 160, 30), (214, 57, 57), (60, 120, 216), (140, 146, 152)
+_COLOURS: dict[str, Colour] = {
+    ArmState.ENGAGED: GREEN,
+    ArmState.CARRIED: GREEN,
+    ArmState.PAUSING: AMBER,
+    ArmState.PAUSED: AMBER,
+    ArmState.ALIGNING: AMBER,
+    ArmState.HOMING: BLUE,
+    ArmState.LOST: RED,
+    ArmState.STOPPED: RED,
+}
+_TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (222, 110, 40))
+_TRAIL = 90  # points
+_TRAIL_PERIOD = 0.05  # between them, by the run's time [s]
+_AWAY = 0.01  # the ghost shows where a joint is farther from its reference than this [rad]
+_NEAR = 0.1  # a pair with more to spare is calm [m]
+_CAMERA = np.array([2.3, 0.9, 0.9])  # from the middle of the arms [m]
+FIELD_OF_VIEW = math.radians(40.0)  # of the camera, upwards
+_BACKGROUND: Colour = (238, 241, 244)
+
+
+def state_colour(state: str) -> Colour:
+    return _COLOURS.get(state, GREY)
+
+
+def first_view(model: pin.Model, home: Array) -> tuple[Array, Array]:
+    """Where the camera begins, and what it looks at (3,) [m]: in front of the arms, above them, where it sees both."""
+    data = model.createData()
+    pin.forwardKinematics(model, data, home)
+    places = np.array([placement.translation for placement in list(data.oMi)[1:]])
+    middle: Array = (places.min(axis=0) + places.max(axis=0)) / 2.0
+    return middle + _CAMERA, middle
+
+
+class CellScene:
+    """Draws frames. Only :meth:`show` is called after the beginning, by one thread."""
+
+    def __init__(self, server: viser.ViserServer, setup: PageSetup) -> None:
+        scene, config = server.scene, setup.config
+        self._setup = setup
+        self._model, self._pairs = setup.model, setup.collision_model
+        self._names = pair_names(self._pairs)
+        self._data, self._pair_data = self._model.createData(), self._pairs.createData()
+        self._tree = JointTree(setup)
+        scene.set_up_direction("+z")
+        scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, dtype=np.uint8))
+        scene.add_grid(
+            "/floor",
+            *(6.0, 6.0),
+            position=(0.0, 0.0, (config.floor or 0.0) - 0.001),
+            cell_size=0.1,
+            section_size=0.5,
+            cell_color=(214, 219, 224),
+            section_color=(188, 195, 202),
+            plane_color=(246, 247, 249),
+            plane_opacity=1.0,
+            shadow_opacity=0.2,
+        )
+        self._robot, self._ghost = (
+            RobotFigure(scene, "/robot", self._tree),
+            RobotFigure(scene, "/ghost", self._tree, True),
+        )
+        self.ghost_always = False
+        arms = list(setup.joints)
+        look = {"axes_length": 0.08, "axes_radius": 0.003, "origin_radius": 0.012, "visible": False}
+        self._targets = {arm: scene.add_frame(f"/targets/{arm}", **look) for arm in arms}
+        self._tools = {arm: scene.add_frame(f"/tools/{arm}", show_axes=False) for arm in arms}
+        for arm in arms:
+            scene.add_label(f"/tools/{arm}/name", arm, position=(0.0, 0.0, 0.1), anchor="bottom-center")
+        nothing = np.zeros((_TRAIL - 1, 2, 3), dtype=np.float32)
+        self._trails = {
+            arm: scene.add_line_segments(f"/trails/{arm}", nothing, _faded(colour), line_width=2.5)
+            for arm, colour in zip(arms, _TRAIL_COLOURS, strict=False)
+        }
+        self._trail_points: dict[str, Array] = {}
+        self._trail_time = -math.inf
+        self._pair = scene.add_line_segments("/tightest_pair", np.zeros((1, 2, 3)), GREY, line_width=4.0)
+        self._pair_label = scene.add_label("/tightest_pair_distance", "", anchor="bottom-center", visible=False)
+        self._parts = {
+            name: scene.add_box(f"/parts/{name}", colour_of(part.colour), part.size, visible=False)
+            for name, part in config.mujoco.objects.items()
+            if name in setup.parts
+        }
+        for arm, box in config.teleop.workspace.items():
+            lower, upper = np.array([box.x, box.y, box.z]).T
+            scene.add_box(
+                f"/workspaces/{arm}", GREY, upper - lower, position=(lower + upper) / 2.0, wireframe=True, opacity=0.5
+            )
+        camera = server.initial_camera
+        camera.position, camera.look_at = first_view(self._model, setup.home)
+        camera.fov = FIELD_OF_VIEW
+
+    def show(self, frame: Frame) -> None:
+        """Draw one frame."""
+        tick = frame.tick
+        self._robot.show(self._tree.posture(tick.state.q, tick.grippers))
+        away = bool(np.abs(tick.state.q - tick.reference.q).max() > _AWAY) or self.ghost_always
+        self._ghost.root.visible = away
+        if away:
+            self._ghost.show(self._tree.posture(tick.reference.q, tick.grippers))
+        for arm, tool in tick.tools.items():
+            place(self._tools[arm], tool)
+            target, node = tick.targets[arm].pose, self._targets[arm]
+            node.visible = target is not None
+            if target is not None:
+                node.origin_color = state_colour(tick.states[arm])
+                place(node, target)
+        self._show_trails(frame)
+        self._show_pair(frame)
+        for name, box in self._parts.items():
+            if frame.moved is not None:
+                at = self._setup.parts[name]
+                box.position, box.wxyz = frame.moved[at : at + 3], frame.moved[at + 3 : at + 7]
+                box.visible = True
+
+    def _show_trails(self, frame: Frame) -> None:
+        tick = frame.tick
+        if tick.t < self._trail_time + _TRAIL_PERIOD:
+            return
+        self._trail_time = tick.t
+        for arm, trail in self._trails.items():
+            here = tick.tools[arm].translation.astype(np.float32)
+            points = self._trail_points.get(arm)
+            points = np.tile(here, (_TRAIL, 1)) if points is None else np.vstack([points[1:], here])
+            self._trail_points[arm] = points
+            trail.points = np.stack([points[:-1], points[1:]], axis=1)
+
+    def _show_pair(self, frame: Frame) -> None:
+        report = frame.tick.reference.report
+        known = report.tightest_pair in self._names and math.isfinite(report.margin)
+        self._pair.visible = self._pair_label.visible = known
+        if not known:
+            return
+        index, q = self._names.index(report.tightest_pair), frame.tick.reference.q
+        pin.updateGeometryPlacements(self._model, self._data, self._pairs, self._pair_data, q)
+        result = pin.computeDistance(self._pairs, self._pair_data, index)
+        ends = np.array([result.getNearestPoint1(), result.getNearestPoint2()])
+        calm = min(max(report.margin / _NEAR, 0.0), 1.0)
+        colour = tuple(round(calm * one + (1.0 - calm) * other) for one, other in zip(GREEN, RED, strict=True))
+        self._pair.points, self._pair.colors = ends[None], np.array([[colour, colour]], dtype=np.uint8)
+        self._pair_label.text = f"{1e3 * report.margin:.0f} mm to spare"
+        self._pair_label.position = ends.mean(axis=0)
+
+
+def _faded(colour: Colour) -> Array:
+    """Colours (segments, 2, 3) of a trail, from the background's at its old end."""
+    part = np.linspace(0.0, 1.0, _TRAIL)[:, None]
+    colours = (part * colour + (1.0 - part) * _BACKGROUND).astype(np.uint8)
+    made: Array = np.stack([colours[:-1], colours[1:]], axis=1)
+    return made

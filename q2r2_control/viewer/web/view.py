@@ -1,0 +1,136 @@
+"""The run's side of its page: hands ticks to the process that serves it, and does what its buttons ask for."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
+from importlib.util import find_spec
+from threading import Event as Flag
+from typing import Any
+
+from q2r2_control.config.bindings import Action
+from q2r2_control.errors import ConfigError
+from q2r2_control.events import Event
+from q2r2_control.inputs.web import WebInput
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.process.helper_process import HelperProcess, reason_of
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import ActiveLimit
+from q2r2_control.viewer.web.exchange import Frame, PageHand, PageLost, PageRequest, PageSetup, Ready
+
+_PERIOD = 1.0 / 30.0  # between frames [s]
+_READY = 30.0  # for the process to be ready, before the run [s]
+_PATIENCE = 2.0  # for it to end [s]
+
+_logger = logging.getLogger(__name__)
+
+
+class PageView(AbstractContextManager["PageView"]):
+    """A listener of one run, as a context around it. Nothing in a browser can keep the loop waiting.
+
+    A tick stores references, 30 times a second a thread gets them; where it is not done with the last ones, newer ones
+    come later instead. A page that fails is one line, and the run goes on.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        """Start the process, which takes a second. Raises :class:`ConfigError` where viser is not installed."""
+        if find_spec("viser") is None:
+            raise ConfigError("--web needs viser: pip install 'q2r2_control[web]'")
+        self._host, self._port = host, port
+        self._ready = Flag()
+        self.url: str | None = None  # None: not begun
+        self._due = 0.0  # of the next frame, by the clock on the wall [s]
+        self._events: list[Event] = []
+        self._binding: dict[ActiveLimit, None] = {}
+        self._ticks = 0
+        self._plant: MujocoPlant | None = None  # whose loose objects are shown
+        self._input: WebInput | None = None  # that the page drives
+        self._requests: dict[PageRequest, Callable[[], None]] = {}
+        try:
+            # Room for one frame: a newer one is better than a queue.
+            self._process = HelperProcess("serves the page", "q2r2_control.viewer.web.server", self._on_answer, room=1)
+        except OSError as error:
+            raise ConfigError(f"--web: {reason_of(error)}") from error
+
+    def begin(self, pipeline: Pipeline, title: str, recorded: bool) -> str:
+        """Serve the page of a run that is about to begin; returns its URL. Raises :class:`ConfigError`."""
+        robot, plant = pipeline.robot, pipeline.plant
+        self._input = pipeline.input if isinstance(pipeline.input, WebInput) else None
+        parts = {}
+        if isinstance(plant, MujocoPlant):
+            self._plant = plant
+            names = pipeline.config.mujoco.objects
+            parts = {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in names}
+        self._requests = {
+            PageRequest.STOP: pipeline.stop,
+            PageRequest.PAUSE: pipeline.pause,
+            PageRequest.HOME: pipeline.go_home,
+            PageRequest.RECORD: partial(pipeline.mark, Action.RECORD_TOGGLE),
+            PageRequest.MARK: partial(pipeline.mark, Action.RECORD_MARK),
+        }
+        setup = PageSetup(
+            host=self._host,
+            port=self._port,
+            title=title,
+            config=pipeline.config,
+            urdf=robot.urdf,
+            joint_names=robot.joint_names,
+            joints={arm: its.joints for arm, its in robot.arms.items()},
+            fingers={arm: its.finger_joints for arm, its in robot.arms.items()},
+            home=robot.home,
+            lower=robot.position_lower,
+            upper=robot.position_upper,
+            model=robot.model,
+            collision_model=robot.collision_model,
+            parts=parts,
+            recorded=recorded,
+            driven=self._input is not None,
+        )
+        self._process.send(setup)
+        waited = 0.0
+        while self._process.alive and waited < _READY and not self._ready.wait(0.1):
+            waited += 0.1
+        if self.url is None:
+            raise ConfigError(self._process.fault or f"--web: the page was not ready within {_READY:g} s")
+        pipeline.listeners.append(self)
+        return self.url
+
+    def __call__(self, tick: Tick) -> None:
+        """Store one tick, and send it where a frame is due."""
+        self._ticks += 1
+        if tick.events:
+            self._events += tick.events
+        if tick.reference.report.binding:
+            self._binding.update(dict.fromkeys(tick.reference.report.binding))
+        now = time.monotonic()
+        if now < self._due or self.url is None:
+            return
+        if not self._process.alive:
+            self.url = None
+            _logger.warning("the page is gone, the run goes on: %s", self._process.fault)
+            return
+        moved = None if self._plant is None else self._plant.observed_qpos
+        frame = Frame(tick, tuple(self._events), tuple(self._binding), self._ticks, moved)
+        if self._process.send(frame, 1):
+            self._due = now + _PERIOD
+            self._events, self._binding, self._ticks = [], {}, 0
+
+    def _on_answer(self, answer: Any) -> None:
+        """In a thread of its own."""
+        if isinstance(answer, Ready):
+            self.url = answer.url
+            self._ready.set()
+        elif isinstance(answer, PageRequest):
+            self._requests[answer]()
+        elif self._input is not None and isinstance(answer, PageHand):
+            controls = {"drag": float(answer.drag), "gripper": float(answer.gripper)}
+            self._input.receive(answer.hand, answer.position, answer.quaternion, controls)
+        elif self._input is not None and isinstance(answer, PageLost):
+            self._input.lose()
+
+    def __exit__(self, *_: object) -> None:
+        self._process.finish(_PATIENCE)

@@ -1,0 +1,35 @@
+"""What a program asks of a run: it is done at the next tick, and a replay asks for the same."""
+
+from __future__ import annotations
+
+from q2r2_control.config.bindings import Action
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import ReasonKind
+from q2r2_control.pipeline.operator_side import PendingRequests
+from tests.pipeline.loops import pipeline, when_moving
+from tests.support.processes import changes
+
+
+def test_a_pause_holds_both_arms_until_a_new_press() -> None:
+    loop = pipeline()
+    loop.listeners.append(when_moving(loop.pause))
+    summary = loop.run(3.0, realtime=False)
+    for arm in ("left", "right"):
+        assert changes(list(summary.events), arm)[-1] == ("engaged", "lost", "pause_requested")
+    assert summary.at_rest
+
+
+def test_a_mark_without_a_recording_is_refused() -> None:
+    loop = pipeline()
+    loop.listeners.append(when_moving(lambda: loop.mark(Action.RECORD_MARK)))
+    kinds = [event.kind for event in loop.run(2.5, realtime=False).events if event.arm == "left"]
+    assert kinds[-2:] == [ReasonKind.RECORDING_REQUESTED, ReasonKind.NO_RECORDING]
+
+
+def test_a_replay_asks_for_the_same() -> None:
+    asked, again = PendingRequests(home=True, pause=True, mark=Action.RECORD_TOGGLE), PendingRequests()
+    settings = TeleopSettings()
+    for reason in asked.reasons(settings):
+        for _ in ("left", "right"):  # both arms have the event
+            again.repeat(reason, settings)
+    assert again == asked

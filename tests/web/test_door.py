@@ -1,0 +1,83 @@
+"""Who is let in: browsers of this machine's own page, and beyond it those with the token."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from http.client import HTTPConnection
+
+import pytest
+import viser
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.viewer.web.door import Door, is_loopback
+
+
+@pytest.fixture(scope="module", params=["127.0.0.1", "0.0.0.0"], ids=["loopback", "all addresses"])
+def door(request: pytest.FixtureRequest) -> Iterator[Door]:
+    made = Door(request.param, 0)
+    with made.guards():
+        server = viser.ViserServer(host=request.param, port=made.port, verbose=False)
+    yield made
+    server.stop()
+
+
+def status(door: Door, path: str = "/", **headers: str) -> int:
+    """Of a page that is asked for."""
+    connection = HTTPConnection("127.0.0.1", door.port)
+    connection.request("GET", path, headers=headers)
+    return connection.getresponse().status
+
+
+def admitted(door: Door, origin: str, cookie: str = "") -> bool:
+    """Whether a page of ``origin`` may connect."""
+    protocol = [Subprotocol(f"viser-v{viser.__version__}")]
+    url = f"ws://127.0.0.1:{door.port}"
+    try:
+        connect(url, origin=Origin(origin), subprotocols=protocol, additional_headers={"Cookie": cookie}).close()
+    except InvalidStatus as error:
+        return error.response.status_code != 403
+    return True
+
+
+def test_only_the_own_page_connects(door: Door) -> None:
+    own = f"http://127.0.0.1:{door.port}"
+    _, _, query = door.url.partition("?token=")
+    cookie = f"q2r2_page={query}"
+    assert admitted(door, own, cookie)
+    assert not admitted(door, "http://example.org", cookie)
+    assert not admitted(door, "null", cookie)
+    if query:
+        assert not admitted(door, own)
+        assert not admitted(door, own, "q2r2_page=guess")
+        assert (status(door), status(door, f"/?token={query}")) == (403, 200)
+    else:
+        assert status(door) == 200
+        assert status(door, Host=f"example.org:{door.port}") == 403  # a name that was made to lead here
+
+
+def test_no_more_pages_than_a_few_connect(door: Door) -> None:
+    _, _, query = door.url.partition("?token=")
+    protocol = [Subprotocol(f"viser-v{viser.__version__}")]
+    origin, headers = Origin(f"http://127.0.0.1:{door.port}"), {"Cookie": f"q2r2_page={query}"}
+    pages = [
+        connect(f"ws://127.0.0.1:{door.port}", origin=origin, subprotocols=protocol, additional_headers=headers)
+        for _ in range(8)
+    ]
+    assert not admitted(door, origin, headers["Cookie"])
+    for page in pages:
+        page.close()
+
+
+def test_a_port_that_is_taken_is_one_clear_line() -> None:
+    door = Door("127.0.0.1", 0)
+    with pytest.raises(ConfigError, match=f"cannot listen on 127.0.0.1 port {door.port}: .*allowed: a free port"):
+        Door("127.0.0.1", door.port)
+    door.socket.close()
+
+
+def test_loopback_is_told_from_the_rest() -> None:
+    assert [is_loopback(host) for host in ("127.0.0.1", "::1", "localhost")] == [True] * 3
+    assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.1.5", "example.org")))
