@@ -99,7 +99,7 @@ wheel: setup
 	$(BIN)/python -m build
 
 # The metadata; then the wheel in a fresh environment, used from an empty folder.
-FRESH := build/fresh
+FRESH := .venv-fresh
 
 release-check: wheel
 	$(BIN)/twine check --strict dist/*
@@ -116,4 +116,4 @@ soak: setup
 	$(BIN)/q2r2 soak
 
 clean:
-	rm -rf $(VENV) $(LEROBOT) build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(LEROBOT) $(FRESH) build dist install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
