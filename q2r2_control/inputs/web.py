@@ -22,7 +22,7 @@ _MOTION = ("stance", "axes", "position_scale", "rotation_scale", "axis_scales", 
 
 
 def web_cell(config: Config) -> Config:
-    """The cell with a page's controls. What a page drags is the tool itself, so hand and tool move alike."""
+    """The cell with a page's controls. A page drags the tool itself, which moves as far as its hand."""
     usual = TeleopSettings()
     changes = {name: getattr(usual, name) for name in _MOTION} | {"bindings": _BINDINGS}
     return config.model_copy(update={"teleop": config.teleop.model_copy(update=changes)})

@@ -50,7 +50,7 @@ def test_a_drag_moves_the_tool_as_far_and_letting_go_pauses_it() -> None:
     assert engaged == ("idle", "engaged", "dead_man_held")
     assert paused == ("engaged", "paused", "dead_man_released")
     assert changes(list(summary.events), "right") == []
-    assert page.tools[-1] - page.tools[0] == pytest.approx(WAY, abs=2e-3)
+    assert page.tools[-1] - page.tools[0] == pytest.approx(WAY, abs=4e-3)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What a program asks of a run: it is done at the next tick, and a replay asks for the same."""
+"""Requests of a program to a run: each is done at the next tick, and a replay asks for the same."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from playwright.sync_api import BrowserContext, Page, sync_playwright
 
 from tests.web.browser import ARGUMENTS, CHROMIUM, VIEW, WebRun, leave_a_processor_to_the_loop
 
+HIDDEN = "[class*=mantine-Notification] {display: none !important}"  # a warning of slow drawing, which covers an arm
 Open = Callable[[str], Page]
 Start = Callable[..., WebRun]
 
@@ -36,12 +37,10 @@ def open_page(browser: BrowserContext) -> Iterator[Open]:
     def open_one(url: str) -> Page:
         pages.append(browser.new_page())
         pages[-1].goto(url)
+        pages[-1].add_style_tag(content=HIDDEN)
         return pages[-1]
 
     yield open_one
-    for i, page in enumerate(pages):
-        if not page.is_closed():
-            page.screenshot(path=f"/tmp/w_fail{i}.png")
     for page in pages:
         page.close()
 

@@ -28,8 +28,7 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     assert summary["at_rest"]
     # The same page shows the next run at this address.
     again = start("--input", "scripted", port=urlsplit(run.url).port or 0)
-    wait_until(lambda: table(page)["state"][0] != "paused")
-    wait_for(page, "follows the hand")
+    wait_until(lambda: table(page).get("why", ["the run ends"])[0] != "the run ends")
     again.interrupt()
     assert again.end()["at_rest"]
 

@@ -22,8 +22,8 @@ _Gizmos = dict[str, viser.TransformControlsHandle]  # by arm
 class Driving:
     """The page that drags first drives until it lets go. Others watch meanwhile, and have no gizmos.
 
-    A browser says nothing of a mouse that rests. So the page that drives is asked again and again for an answer, which
-    its own script gives; each answer is a sample of the hands. Without them the gate stops the arms.
+    A browser says nothing of a mouse that rests. Therefore the page that drives is asked again and again for an answer,
+    which its own script gives; each answer is a sample of the hands. Without them the gate stops the arms.
     """
 
     def __init__(self, server: viser.ViserServer, setup: PageSetup, answer: Callable[[Any], None]) -> None:

@@ -69,7 +69,7 @@ class PageLost(NamedTuple):
 
 
 class PageRequest(StrEnum):
-    """What a button of the page asks for."""
+    """The requests of the page's buttons."""
 
     STOP = "stop"
     PAUSE = "pause"

@@ -25,7 +25,7 @@ _COLOURS: dict[str, Colour] = {
     ArmState.LOST: RED,
     ArmState.STOPPED: RED,
 }
-_TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (222, 110, 40))
+_TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (150, 80, 190))
 _TRAIL = 90  # points
 _TRAIL_PERIOD = 0.05  # between them, by the run's time [s]
 _AWAY = 0.01  # the ghost shows where a joint is farther from its reference than this [rad]
