@@ -26,7 +26,7 @@ demo: setup
 	$(BIN)/q2r2 demo
 
 test: setup
-	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot --ignore tests/web -m 'not slow'
+	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot --ignore tests/web -m 'not slow and not soak'
 
 # Tests that play minutes of motion, or whole runs again and again.
 test-slow: setup
@@ -34,8 +34,8 @@ test-slow: setup
 
 # Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
 test-ros: setup
-	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone and not slow'; failed=$$?; \
-		$(BIN)/python -m pytest tests/ros -m 'alone and not slow' && exit $$failed
+	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone and not slow and not soak'; failed=$$?; \
+		$(BIN)/python -m pytest tests/ros -m 'alone and not slow and not soak' && exit $$failed
 
 # Tests that play motions with whole sets of nodes for minutes, or builds packages.
 test-ros-slow: setup
