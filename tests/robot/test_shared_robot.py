@@ -32,7 +32,7 @@ def _arm(side: str) -> dict[str, Any]:
     finger = f"{side[0]}_gripper_l_finger_joint"
     return {
         "tip": f"{side}_gripper",
-        "home": [0.0, -0.55, 0.0, 0.75, 0.0, 1.26, 0.0],
+        "home": [0.0, -0.7, 0.0, 1.0, 0.0, 1.26, 0.0],
         "gripper": {"joints": [finger], "open_position": 0.02, "closed_position": 0.0},
     }
 
