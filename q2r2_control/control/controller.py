@@ -61,6 +61,7 @@ class CartesianController:
         self._live = LiveSettings(robot, settings, model, data, self._objects)
         self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
         self._stop, self._tasks = data.safety.certified, data.tasks
+        self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step
         self._solution = np.zeros(self._nv)  # of the QP, whatever array has it
         self._problem = QpProblem(
             H=data.tasks.H,
@@ -152,6 +153,8 @@ class CartesianController:
         usable = _passes(dt)
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         state = self._state
+        for kept, array in zip(self._before, (state.q, state.v, self._stop), strict=True):
+            kept[:] = array
         self._targets.aim_posture(posture)
         summary = StepSummary()
         known, longest = self._targets.offer(targets), self.settings.max_substep
@@ -190,6 +193,16 @@ class CartesianController:
             return
         self._observed, _, _ = self._move(self._model_pointer, self._data_pointer, self._solution, False, dt, 0.0)
         self._apart = self._observed[-1] >= -ROUNDING
+
+    def withdraw(self, reference: Reference) -> None:
+        """Undo the last step, whose ``reference`` came too late for the plant: be where the arms went on braking from.
+
+        The state and the certified stop are those before the step, and ``reference`` becomes that state.
+        """
+        for array, kept in zip((self._state.q, self._state.v, self._stop), self._before, strict=True):
+            array[:] = kept
+        reference.q[:], reference.v[:] = self._state.q, self._state.v
+        self._observe_again(self._unchanged)
 
     def hold_at(self, q: Array | None) -> None:
         """Let arms without a target go to joint positions ``q`` (nv,) [rad] and hold there, within every promise.

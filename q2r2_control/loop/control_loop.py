@@ -134,9 +134,9 @@ class ControlLoop:
                 supervisor.targets.release(arm)
             elif refusal := supervisor.update_target(arm, pose, now):
                 refusals[arm] = refusal
-        commanded = self.limit_grippers(grippers, openings, now)
         if braked > 0.0:
             self.controller.brake(braked)
+        commanded = self.limit_grippers(grippers, openings, now)
         was_inactive = supervisor.phase is Phase.INACTIVE
         reference = supervisor.tick(now, dt, posture)
         if was_inactive and supervisor.phase is Phase.ACTIVE and state is not None:

@@ -23,6 +23,7 @@ from q2r2_control.loop.control_loop import ControlLoop, LoopStep
 from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock
 from q2r2_control.pipeline.operator_side import OperatorSide, PendingRequests
 from q2r2_control.pipeline.run_recorder import RunRecorder
+from q2r2_control.pipeline.target_lead import TargetLead
 from q2r2_control.plants.base import Plant, SessionPlant, check_mode, make_plant
 from q2r2_control.process.scheduling import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
@@ -188,6 +189,7 @@ class Pipeline:
         self._clock = self.make_clock(realtime)
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)
+        self._lead = TargetLead()
         if sessions is None or sessions.fault() is None:
             self.loop.activate(self._state, self._clock.now)
             self.supervisor.events.clear()
@@ -248,10 +250,13 @@ class Pipeline:
         openings, tools = self.plant.gripper_openings(), self._measured_tools(state)
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
-        step = self._control(state, openings, now, dt, braked)
+        step = self._control(state, openings, now, gap, dt, braked)
         assert step.reference is not None  # the plant is the loop's own
         assert step.command is not None
         self.plant.apply(step.command)
+        withdrawn = self._sessions is not None and self._sessions.withdraws()
+        if withdrawn:
+            self.controller.withdraw(step.reference)
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
         # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
@@ -263,7 +268,7 @@ class Pipeline:
             start=self._start,
             now=now,
             dt=gap,
-            step=braked + dt,
+            step=braked + (0.0 if withdrawn else dt),
             following=self._following,
             connected=self._operator.connected,
             samples=samples,
@@ -308,10 +313,12 @@ class Pipeline:
         return q
 
     def _control(
-        self, state: RobotState, openings: Mapping[str, float], now: float, dt: float, braked: float
+        self, state: RobotState, openings: Mapping[str, float], now: float, gap: float, dt: float, braked: float
     ) -> LoopStep:
         """From measurements and targets to a command. While a run ends, the operator asks for nothing."""
         poses = {arm: target.command for arm, target in self._targets.items()} if self._following else {}
+        if self._sessions is not None:
+            poses = self._lead.ahead(poses, gap, self._sessions.delay())
         grippers = {arm: target.gripper for arm, target in self._targets.items()}
         step = self.loop.step(state, poses, now, dt, grippers, openings, braked, self._posture())
         self._grippers = step.grippers

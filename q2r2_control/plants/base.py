@@ -87,6 +87,12 @@ class SessionPlant(Protocol):
         The next command is for the end of both.
         """
 
+    def withdraws(self) -> bool:
+        """Whether the newest command came too late: the arms go on along the stop of the command before it."""
+
+    def delay(self) -> float:
+        """From the time that a command is for until the arms are measured there [s]."""
+
     def fault(self) -> Reason | None:
         """Why the arms cannot be commanded now, or ceased to be since the last call; None: they can."""
 

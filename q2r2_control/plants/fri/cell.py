@@ -2,7 +2,8 @@
 
 **The loop's time and the cabinets'.** Each tick of the loop moves the reference to one period after the tick. The
 cabinets are answered from it a little later (``DELAY``). Where the loop is so late that an answer may pass its end, the
-certified stop is what the cabinets get. :meth:`FriCell.due` then lets the reference follow the same stop first.
+certified stop is what the cabinets get. :meth:`FriCell.due` then lets the reference follow the same stop first. Where
+an answer passed it although, in the middle of a tick, the command of that tick is withdrawn.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
 # From the decision how far the reference goes until the path has it [s].
-_MARGIN = 0.004
+_MARGIN = 0.002
+_NO_COMMANDS = 0.1  # so long without one that came in time is told [s]
 # In which an arm loses most of its speed where no overlay comes: several periods of a cabinet [s].
 _BRAKING_TIME = 0.03
 # Of a reference that begins where its arm is held, or, with torques, where it is measured [rad].
@@ -50,7 +52,7 @@ class FriCell:
         self._data = robot.model.createData()
         self._lock = Lock()
         self._now = self._start = self._end = -math.inf  # of the newest tick, and of its piece of the path [s]
-        self._overtaken = False
+        self._withdraws, self._in_time = False, -math.inf  # the newest command, and when one was not [s]
 
     def answer(self, arm: str, datagram: bytes, now: float) -> bytes | None:
         """The answer to a datagram from the cabinet of ``arm`` that came at ``now`` [s], if one is due."""
@@ -81,13 +83,17 @@ class FriCell:
             overlay = command.tau - pin.computeGeneralizedGravity(model, data, measured)  # which the cabinet bears
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         with self._lock:
+            following = [session for session in self.sessions.values() if session.following]
+            self._withdraws = any(session.answered > self._start for session in following)
+            if self._withdraws:
+                self._end = self._start
+                return
+            self._in_time = self._now
             for arm, session in self.sessions.items():
                 joints = self._joints[arm]
                 q, v = command.q[joints], command.v[joints]
                 stop = np.ones(JOINTS) if deceleration is None else deceleration[joints]  # one at rest needs none
-                if session.following and session.answered > self._start:
-                    session.following, self._overtaken = False, True  # its stop goes on to the end
-                elif not session.following and self._begins(session, q, v):
+                if not session.following and self._begins(session, q, v):
                     session.following = session.fault(self._now) is None
                     session.path = ReferencePath(self._start, session.path.rest)
                 if session.following and self._end > session.path.end:  # a second command in a tick is no motion
@@ -114,8 +120,22 @@ class FriCell:
                 dropped, session.dropped = session.dropped, False
                 fault = session.fault(self._now) or (Reason.of(ReasonKind.FRI_DROPPED, arm=arm) if dropped else None)
                 found = found or fault
-            overtaken, self._overtaken = self._overtaken, False
-            return found or (Reason(ReasonKind.FRI_OVERTAKEN) if overtaken else None)
+            late = self._withdraws and self._now - self._in_time > _NO_COMMANDS
+            return found or (Reason(ReasonKind.FRI_OVERTAKEN) if late else None)
+
+    def withdraws(self) -> bool:
+        """Whether the newest command came after an answer that it was for: the arms go on along the stop before it."""
+        return self._withdraws
+
+    def delay(self) -> float:
+        """From the end of a command until a tick finds the arm there [s].
+
+        A cabinet begins to go there with its next message and takes a period for it. The newest message is half of one
+        old in the mean. Torques count at once.
+        """
+        if any(session.wanted is CommandKind.TORQUE for session in self.sessions.values()):
+            return 0.0
+        return DELAY + 2.5 * max(session.period for session in self.sessions.values())
 
     def openings(self) -> dict[str, float]:
         """Measured opening of each gripper that has an input, 0 closed .. 1 open."""

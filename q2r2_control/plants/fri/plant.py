@@ -27,7 +27,7 @@ from q2r2_control.wording import sentence
 _WAIT = 5.0  # for each cabinet's first message, and for its session, without which a run begins all the same [s]
 _KEPT = 100_000  # answer times
 _POLL = 0.05  # of looking whether the plant was closed [s]
-_SWITCH = 2e-4  # Python's threads take turns as often as this, or an answer would wait for the loop [s]
+_SWITCH = 5e-5  # Python's threads take turns as often as this, or an answer would wait for the loop [s]
 # Linux stamps datagrams as they arrive (SO_TIMESTAMPNS) by its real-time clock; longer waits are jumps of that [s].
 _TIMESTAMP, _TIMESPEC, _EXTRA, _LONGEST_WAIT = 35, struct.Struct("@qq"), 64, 0.1
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
@@ -111,6 +111,14 @@ class FriPlant:
     def due(self, now: float) -> tuple[float, float]:
         """See :meth:`FriCell.due`."""
         return self.cell.due(now)
+
+    def withdraws(self) -> bool:
+        """See :meth:`FriCell.withdraws`."""
+        return self.cell.withdraws()
+
+    def delay(self) -> float:
+        """See :meth:`FriCell.delay`."""
+        return self.cell.delay()
 
     def fault(self) -> Reason | None:
         """See :meth:`FriCell.fault`."""

@@ -23,7 +23,7 @@ from q2r2_control.plants.fri.wire import (
 from q2r2_control.types import Array
 
 # An answer is for so long before its question arrived, by which time the loop has ticked, on a busy machine too [s].
-DELAY = 0.006
+DELAY = 0.004
 _SILENT = 0.1  # a cabinet without a message for longer is gone [s]
 _LONGEST_LAG = 0.25  # a cabinet that asks so much too seldom is not followed any more [s]
 _AT_REST = 1e-9  # [rad]
@@ -61,6 +61,11 @@ class ArmSession:
         self._problem: ProtocolError | None = None  # with the newest datagram
 
     @property
+    def period(self) -> float:
+        """Between two answers [s]; 0 where the cabinet was not heard."""
+        return 0.0 if self.newest is None else self.newest.period * self.newest.multiplier
+
+    @property
     def words(self) -> str:
         """How the cabinet says that it is."""
         newest = self.newest
@@ -76,7 +81,7 @@ class ArmSession:
                 return Reason.of(ReasonKind.FRI_UNREADABLE, arm=self._arm, source=self._source, text=str(self._problem))
             return Reason.of(ReasonKind.FRI_SILENT, arm=self._arm, source=self._source)
         if self._is_too_slow(newest):
-            period, allowed = 1e3 * newest.period * newest.multiplier, 1e3 * _TORQUE_PERIOD
+            period, allowed = 1e3 * self.period, 1e3 * _TORQUE_PERIOD
             return Reason.of(ReasonKind.FRI_TOO_SELDOM, arm=self._arm, period=period, allowed=allowed)
         if newest.session is not Session.COMMANDING_ACTIVE:
             states = newest.session, newest.quality, newest.safety, newest.drives

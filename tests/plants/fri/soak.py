@@ -78,7 +78,7 @@ def make_loop(
     hands = PressingHands()
     start = robot.home if start is None else start
     if mode is CommandMode.TORQUE:
-        network["arms"] = SimulatedArms(robot, config)
+        network.setdefault("arms", SimulatedArms(robot, config))
     plant = VirtualCabinets(robot, settings, start, 1.0 / config.loop_rate_hz, **network)
     hands.pipeline = made = FreezingLoop(config, robot, hands, plant, mode)
     return made

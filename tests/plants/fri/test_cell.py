@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,15 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.answers import ReferencePath
 from q2r2_control.plants.fri.cabinet import Trip
+from q2r2_control.plants.fri.cabinet_server import SimulatedArms
 from q2r2_control.plants.fri.wire import Session
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, CommandMode
 from tests.pipeline.loops import FreezingLoop
-from tests.plants.fri.soak import Soak, make_loop
+from tests.plants.fri.soak import ACCELERATION, Soak, make_loop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 
@@ -34,6 +37,13 @@ def started(pipeline: FreezingLoop) -> VirtualCabinets:
 
 def trips(plant: VirtualCabinets) -> list[Trip]:
     return [trip for cabinet in plant.cabinets.values() for trip in cabinet.trips]
+
+
+def error(summary: RunSummary, arm: str) -> float:
+    """From target to measured tool [mm RMS]."""
+    found = summary.arms[arm].position_error_mm_rms
+    assert found is not None
+    return found
 
 
 def test_a_run_waits_for_the_cabinets_and_refuses_presses_until_then(config: Config) -> None:
@@ -53,10 +63,8 @@ def test_both_arms_follow_the_hands_through_their_cabinets(config: Config) -> No
     assert trips(plant) == []
     for arm in SIDES:
         assert plant.cabinets[arm].session is Session.COMMANDING_ACTIVE
-        figures = summary.arms[arm]
-        assert figures.engaged_s > 3.0
-        assert figures.position_error_mm_rms is not None
-        assert figures.position_error_mm_rms < 6.0
+        assert summary.arms[arm].engaged_s > 3.0
+        assert error(summary, arm) < 6.0
 
 
 @pytest.mark.parametrize(
@@ -85,6 +93,59 @@ def test_a_loop_that_is_late_brakes_on_the_stop_that_the_cabinets_get(config: Co
     summary = pipeline.run(4.0, realtime=False)
     assert trips(plant) == []
     assert all(summary.arms[arm].engaged_s > 3.0 for arm in SIDES), "and the arms go on"
+
+
+def test_a_command_that_answers_have_passed_is_withdrawn_and_the_arms_go_on(config: Config) -> None:
+    pipeline = make_loop(config, jitter=0.0005)
+    plant, random, period = started(pipeline), np.random.default_rng(0), 1.0 / config.loop_rate_hz
+    withdrawn: list[bool] = []
+    pieces: list[tuple[float, np.ndarray, np.ndarray]] = []
+
+    def think(tick: Tick) -> None:
+        withdrawn.append(plant.withdraws())
+        pieces.append((tick.step, tick.reference.q, tick.reference.v))
+        plant.thinking = 0.02 * random.random() if random.random() < 0.03 else 0.0
+        pipeline.freeze(max(plant.thinking - period, 0.0))
+
+    pipeline.listeners.append(think)
+    summary = pipeline.run(6.0, realtime=False)
+    assert sum(withdrawn) > 30
+    assert trips(plant) == []
+    for arm in SIDES:
+        assert summary.arms[arm].engaged_s > 5.0, "no arm is paused for it"
+        assert error(summary, arm) < 20.0, "and the tools follow"
+    for (_, q, v), (step, to, speed) in pairwise(pieces):
+        assert (np.abs(speed - v) <= ACCELERATION * step + 1e-9).all()
+        assert (np.abs(to - q - 0.5 * step * (speed + v)) <= 0.5 * ACCELERATION * step**2 + 1e-9).all()
+
+
+def test_a_loop_that_is_always_too_late_says_so(config: Config) -> None:
+    pipeline = make_loop(config)
+    plant = started(pipeline)
+
+    def think(tick: Tick) -> None:
+        late = tick.now > 2.0
+        plant.thinking = 0.02 if late else 0.0
+        pipeline.freeze(0.02 if late else 0.0)
+
+    pipeline.listeners.append(think)
+    events = pipeline.run(3.0, realtime=False).events
+    assert trips(plant) == []
+    assert ReasonKind.FRI_OVERTAKEN in {event.reason.root.kind for event in events}
+
+
+@pytest.mark.parametrize("mode", [CommandMode.POSITION, CommandMode.TORQUE])
+def test_arms_follow_as_well_as_without_cabinets(config: Config, mode: CommandMode) -> None:
+    robot = Robot.from_config(config)
+    pipeline = make_loop(config, mode=mode, jitter=0.0005, arms=SimulatedArms(robot, config))
+    plant = started(pipeline)
+    summary = pipeline.run(4.0, realtime=False)
+    hands, direct_arms = ScriptedInput("circle", frequency_hz=0.5), MujocoPlant(pipeline.robot, config)
+    direct = Pipeline(pipeline.config, pipeline.robot, hands, direct_arms, mode).run(4.0, realtime=False)
+    assert trips(plant) == []
+    for arm in SIDES:
+        assert summary.arms[arm].engaged_s > 3.0
+        assert error(summary, arm) < 1.3 * error(direct, arm)
 
 
 def test_the_reference_brakes_as_the_path_does(robot: Robot) -> None:
@@ -130,24 +191,3 @@ def test_an_arm_that_stands_beyond_its_margin_is_led_back(config: Config, robot:
     assert trips(plant) == []
     assert plant.heard["left"][0][6] == pytest.approx(start[joint], abs=1e-4)
     assert plant.heard["left"][-1][6] <= robot.position_upper[joint] - margin + 1e-4
-
-
-def test_arms_that_get_torques_follow_as_well_as_without_cabinets(config: Config) -> None:
-    pipeline = make_loop(config, mode=CommandMode.TORQUE, jitter=0.0005)
-    plant = started(pipeline)
-    summary = pipeline.run(4.0, realtime=False)
-    direct = Pipeline(
-        pipeline.config,
-        pipeline.robot,
-        ScriptedInput("circle", frequency_hz=0.5),
-        MujocoPlant(pipeline.robot, config),
-        "torque",
-    )
-    wanted = direct.run(4.0, realtime=False)
-    assert trips(plant) == []
-    for arm in SIDES:
-        figures, reference = summary.arms[arm], wanted.arms[arm]
-        assert figures.engaged_s > 3.0
-        assert figures.position_error_mm_rms is not None
-        assert reference.position_error_mm_rms is not None
-        assert figures.position_error_mm_rms < 1.3 * reference.position_error_mm_rms

@@ -55,6 +55,7 @@ class VirtualCabinets:
         self._rates = dict(zip(settings, rates, strict=True))
         self.on_message: Callable[[str, float], None] = lambda arm, t: None
         self.asleep_until = -1.0  # nothing of this computer's is done before [s]
+        self.thinking = 0.0  # time that passes between the beginning of a tick and its command [s]
         self._mode = CommandMode.POSITION
 
     def begin(self, mode: CommandMode) -> None:
@@ -75,20 +76,24 @@ class VirtualCabinets:
         self.due(0.0)
 
     def due(self, now: float) -> tuple[float, float]:
-        while self._events and self._events[0][0] <= now:
-            self.now, _, act, arguments = heapq.heappop(self._events)
-            act(*arguments)
-        self.now = now
+        self._pass(now)
         return self.cell.due(now)
 
     def fault(self) -> Reason | None:
         return self.cell.fault()
+
+    def withdraws(self) -> bool:
+        return self.cell.withdraws()
+
+    def delay(self) -> float:
+        return self.cell.delay()
 
     def sessions(self) -> dict[str, str]:
         return {arm: session.words for arm, session in self.cell.sessions.items()}
 
     def apply(self, command: Command) -> None:
         check_command(command, self._robot, self.modes)
+        self._pass(self.now + self.thinking)
         self.cell.apply(command)
 
     def advance(self, dt: float) -> None:
@@ -102,6 +107,13 @@ class VirtualCabinets:
 
     def close(self) -> None:
         pass
+
+    def _pass(self, now: float) -> None:
+        """Let happen what does until ``now`` [s]."""
+        while self._events and self._events[0][0] <= now:
+            self.now, _, act, arguments = heapq.heappop(self._events)
+            act(*arguments)
+        self.now = now
 
     def _at(self, t: float, act: Callable[..., None], *arguments: object) -> None:
         self._serial += 1

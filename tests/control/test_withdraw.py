@@ -1,0 +1,60 @@
+"""A step that came too late for the plant is undone, and the arms brake on from where they were."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import SIDES, Reference
+from tests.support.processes import cell
+
+DT = 0.002
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(cell())
+
+
+def crossing(controller: CartesianController) -> dict[str, pin.SE3 | None]:
+    """Each tool is sent to where the other one is."""
+    left, right = (controller.tool_pose(arm) for arm in SIDES)
+    return {"left": pin.SE3(left.rotation, right.translation), "right": pin.SE3(right.rotation, left.translation)}
+
+
+def test_an_undone_step_leaves_state_and_stop_as_they_were(robot: Robot) -> None:
+    controller = CartesianController(robot)
+    targets = crossing(controller)
+    for _ in range(100):
+        before = controller.step(targets, DT)
+    stop = controller.stop_deceleration
+    late = controller.step(targets, DT)
+    assert np.abs(late.q - before.q).max() > 1e-4
+    controller.withdraw(late)
+    np.testing.assert_array_equal(late.q, before.q)
+    np.testing.assert_array_equal(late.v, before.v)
+    np.testing.assert_array_equal(controller.stop_deceleration, stop)
+    np.testing.assert_allclose(controller.tool_pose("left"), robot.tool_pose(before.q, "left"), atol=1e-9)
+
+
+def test_arms_that_are_sent_into_each_other_keep_every_promise_with_late_steps(robot: Robot) -> None:
+    controller, random = CartesianController(robot), np.random.default_rng(0)
+    cap = robot.capped_acceleration(controller.settings.acceleration_limit)
+    targets, before = crossing(controller), Reference(robot.home, np.zeros_like(robot.home), robot.home, None)  # type: ignore[arg-type]
+    nearest = np.inf
+    for tick in range(3000):
+        braked = 0.0
+        if tick and random.random() < 0.3:
+            controller.withdraw(before)
+            braked = float(random.uniform(0.0, 0.01))
+            controller.brake(braked)
+        reference = controller.step(targets, DT)
+        assert reference.report.certified
+        limit = cap * (braked + DT) + 1e-9
+        assert (np.abs(reference.v - before.v) <= limit).all()
+        nearest = min(nearest, (robot.distance_values(reference.q) - controller.kept_distances).min())
+        before = reference
+    assert -1e-9 <= nearest < 0.01
