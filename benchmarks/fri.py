@@ -60,7 +60,18 @@ def measure_directly(mode: CommandMode, duration: float) -> float:
 
 def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) -> dict[str, Any]:
     """Both hands go round circles for ``duration`` [s]; ``options`` of q2r2 fri-cabinet."""
-    words = [sys.executable, "-m", "q2r2_control", "fri-cabinet", _CONFIG, "--json", "--mode", mode, *options]
+    words = [
+        sys.executable,
+        "-m",
+        "q2r2_control",
+        "fri-cabinet",
+        _CONFIG,
+        "--json",
+        "--mode",
+        mode,
+        *(["--rt"] if rt else ()),
+        *options,
+    ]
     cabinets = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     config = load_config(_CONFIG)
     robot = Robot.from_config(config)
@@ -85,7 +96,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
         "answer_ms": dict(
             zip(("p50", "p99", "max"), 1e3 * np.percentile(plant.answer_times, (50, 99, 100)), strict=True)
         ),
-        "lost_messages": {arm: session.lost for arm, session in plant.cell.sessions.items()},
+        "lost_messages": {arm: state.lost for arm, state in plant.states().items()},
         "engaged_s": {arm: figures.engaged_s for arm, figures in summary.arms.items()},
         "error_mm_rms": {arm: figures.position_error_mm_rms for arm, figures in summary.arms.items()},
         "cabinets": json.loads(said)["cabinets"],

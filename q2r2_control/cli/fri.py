@@ -7,14 +7,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from json import loads
 from typing import Annotated, Any
 
 from rich.console import Console
 from typer import Option
 
-from q2r2_control.cli.output import ConfigFile, Json, positive, print_report, say
+from q2r2_control.cli.output import ConfigFile, Json, RealTime, positive, print_report, say
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, tasks_named
@@ -22,7 +22,7 @@ from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
 from q2r2_control.plants.fri.wire import CommandKind, Operation, Session, in_words
-from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, stop_on_signals
+from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, real_time, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
@@ -85,6 +85,7 @@ def fri_cabinet(
     seed: Annotated[int, Option(min=0, help="Of what is lost and late.")] = 0,
     task: Annotated[list[str] | None, Option(help="A task of q2r2 demo to be judged.")] = None,
     duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
+    rt: RealTime = False,
     json: Json = False,
 ) -> None:
     """Stand in for the Sunrise cabinets of a cell: q2r2 run CONFIG --plant fri, in another terminal, drives its arms.
@@ -123,7 +124,11 @@ def fri_cabinet(
             last = now
 
     began = time.monotonic()
-    with stop_on_signals(stop.ask), few_garbage_collections():
+    with ExitStack() as stack:
+        stack.enter_context(stop_on_signals(stop.ask))
+        stack.enter_context(few_garbage_collections())
+        if rt and (refused := stack.enter_context(real_time())) is not None:
+            say(refused, console)
         server.run(lambda now: stop.asked or (longest is not None and now >= longest), look)
     data: dict[str, Any] = {"seconds": time.monotonic() - began, "cabinets": {}}
     rows = []
@@ -138,10 +143,12 @@ def fri_cabinet(
 
 
 @contextmanager
-def rehearsal(config: str, mode: CommandMode, tasks: Sequence[AssemblyTask]) -> Iterator[list[TaskResult]]:
+def rehearsal(
+    config: str, mode: CommandMode, tasks: Sequence[AssemblyTask], period: float, rt: bool
+) -> Iterator[list[TaskResult]]:
     """Cabinets of a cell in a process of their own; at the end, results of the ``tasks`` as they measured them.
 
-    Raises :class:`PlantError` where they ended a session or say nothing.
+    ``period`` between two messages [ms]. Raises :class:`PlantError` where they ended a session or say nothing.
     """
     words = [
         "fri-cabinet",
@@ -149,8 +156,9 @@ def rehearsal(config: str, mode: CommandMode, tasks: Sequence[AssemblyTask]) -> 
         "--mode",
         mode,
         "--period",
-        "5" if mode is CommandMode.TORQUE else "10",
+        str(period),
         "--json",
+        *(["--rt"] if rt else ()),
         *(word for task in tasks for word in ("--task", task.name)),
     ]
     child = subprocess.Popen(

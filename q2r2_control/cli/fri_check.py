@@ -87,17 +87,16 @@ class Heard:
 
 def listen(plant: FriPlant, duration: float, asked: Callable[[], bool] = lambda: False) -> Heard:
     """Listen to the cabinets of a plant that was reset, for ``duration`` [s] or until it is ``asked`` to end."""
-    heard: dict[str, list[tuple[Monitoring, float]]] = {arm: [] for arm in plant.cell.sessions}
+    heard: dict[str, list[tuple[Monitoring, float]]] = {arm: [] for arm in plant.states()}
     end = time.monotonic() + duration
     while (now := time.monotonic()) < end and not asked():
-        for arm, messages in heard.items():
-            newest = plant.cell.newest(arm)
-            if not messages or newest[0] is not messages[-1][0]:
-                messages.append(newest)
+        for arm, state in plant.states().items():
+            if state.newest is not None and (not heard[arm] or state.arrival > heard[arm][-1][1]):
+                heard[arm].append((state.newest, state.arrival))
         time.sleep(_LOOKS)
     plant.due(now)
     fault, answers = plant.fault(), np.array(plant.answer_times)
-    reports = [cabinet_report(arm, messages, plant.cell.sessions[arm].lost) for arm, messages in heard.items()]
+    reports = [cabinet_report(arm, messages, plant.states()[arm].lost) for arm, messages in heard.items()]
     notes = [f"{arm}: gripper {gripper.in_words()}" for arm, gripper in plant.grippers.items()]
     notes += machine_notes() + network_notes(plant.addresses)
     for its in reports:

@@ -120,7 +120,7 @@ def postures_over(plant: FriPlant, duration: float) -> Array:
         plant.due(time.monotonic())
         seen.append(plant.state().q)
         time.sleep(0.01)
-    heard = min(session.arrival for session in plant.cell.sessions.values())
+    heard = min(state.arrival for state in plant.states().values())
     if time.monotonic() - heard > _LISTENS:
         fault = plant.fault()
         raise PlantError("a cabinet is silent" if fault is None else sentence(fault))

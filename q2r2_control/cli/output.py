@@ -30,6 +30,7 @@ _COMPILING = "compiling the controller for this machine, once for each version o
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
 ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
+RealTime = Annotated[bool, Option("--rt", help="Lock memory and run under SCHED_FIFO, as far as permitted.")]
 Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
 Task = Annotated[str | None, Option(help="With --record: what is done, noted in the recording.")]
 Operator = Annotated[str | None, Option(help="With --record: whose hands, noted as well.")]

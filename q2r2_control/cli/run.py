@@ -21,6 +21,7 @@ from q2r2_control.cli.output import (
     ConfigFile,
     Json,
     Operator,
+    RealTime,
     Task,
     as_json_text,
     notes_of,
@@ -58,7 +59,6 @@ Record = Annotated[Path | None, Option(metavar="DIR", help="Record the run to a 
 Web = Annotated[bool, Option("--web", help="Show the run in a browser, at http://127.0.0.1:8080; the extra `web`.")]
 WebHost = Annotated[str, Option(metavar="HOST", help="Address of the page; beyond 127.0.0.1 its URL has a token.")]
 WebPort = Annotated[int, Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0: any free one.")]
-RealTime = Annotated[bool, Option("--rt", help="Lock memory and run under SCHED_FIFO, as far as permitted.")]
 
 Host = Annotated[str | None, Option(help="Address to bind, not the config's; 0.0.0.0: all, :: IPv6 too.")]
 Port = Annotated[int | None, Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
@@ -144,6 +144,9 @@ def demo(
     plant: Annotated[str, Option(metavar="[mujoco|fri]", help="fri: through two KUKA cabinets that are simulated.")] = (
         "mujoco"
     ),
+    period: Annotated[
+        float, Option(min=1, max=10, help="With --plant fri: between two messages of a cabinet [ms].")
+    ] = 5.0,
     duration: Annotated[float | None, Option(help="Ends earlier [s].")] = None,
     fast: Fast = False,
     viewer: Viewer = False,
@@ -196,7 +199,7 @@ def demo(
         notes={"task": "; ".join(task.about for task in chosen)},
     )
     if plant == "fri":
-        with rehearsal(_FRI_CONFIG, mode, chosen) as results:
+        with rehearsal(_FRI_CONFIG, mode, chosen, period, rt) as results:
             done = run_cell(load_config(_FRI_CONFIG), options)
         done = replace(done, tasks=tuple(results))
     else:

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -50,15 +50,8 @@ class HelperProcess:
         this process does not have them.
         """
         self._what, self._on_answer, self._room, self._idle = what, on_answer, room, idle
-        paths = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", f"from {__name__} import run_helper; run_helper({module!r})"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=environment | os.environ | paths,
-            process_group=0,  # a terminal's Ctrl-C is for the run
-        )
+        code = f"from {__name__} import run_helper; run_helper({module!r})"
+        self._process = start_python(code, environment, stdout=subprocess.PIPE)
         self.pid = self._process.pid
         self.fault: str | None = None  # why it has ended before it was to, or without doing all
         self._ending = self._killed = False
@@ -154,10 +147,34 @@ class HelperProcess:
         self.fault = self.fault or fault
 
 
+def start_python(
+    code: str, environment: dict[str, str], stdout: int = subprocess.DEVNULL, files: Sequence[int] = ()
+) -> subprocess.Popen[bytes]:
+    """A new process that runs ``code`` with this one's modules and its open ``files``, and gets input by a pipe.
+
+    ``environment``: variables, where this process does not have them.
+    """
+    paths = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
+    return subprocess.Popen(
+        [sys.executable, "-P", "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=stdout,
+        stderr=subprocess.DEVNULL,
+        env=environment | os.environ | paths,
+        pass_fds=files,
+        process_group=0,  # a terminal's Ctrl-C is for the run
+    )
+
+
+def leave_signals_to_the_run() -> None:
+    """Inside such a process: the run ends it."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+
+
 def run_helper(module: str) -> None:
     """Inside the process: call ``module.main``; the last answer is a RuntimeError of what went wrong."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # for the run, which ends this process
-        signal.signal(number, signal.SIG_IGN)
+    leave_signals_to_the_run()
     stream, sys.stdout = sys.stdout.buffer, sys.stderr  # what a library prints is no answer
     lock = Lock()  # answers may come from several threads
 

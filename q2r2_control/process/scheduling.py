@@ -28,13 +28,13 @@ _ADVICE = (
 
 
 @contextmanager
-def real_time() -> Iterator[str | None]:
+def real_time(priority: int = _PRIORITY) -> Iterator[str | None]:
     """Lock the process's memory and let the calling thread run under SCHED_FIFO, as far as that is permitted.
 
     Yields None, or one line that says what was refused and how to permit it. Threads and processes that are started
     meanwhile do not inherit the scheduler: one that draws or listens must not keep the loop waiting.
     """
-    refused = [line for line in (_lock_memory(), _schedule_first([0], _PRIORITY)) if line]
+    refused = [line for line in (_lock_memory(), _schedule_first([0], priority)) if line]
     try:
         yield f"real time: {'; '.join(refused)}; the run goes on without; {_ADVICE}" if refused else None
     finally:

@@ -192,7 +192,7 @@ def test_ctrl_c_brings_the_arms_to_rest_first(cell: Path, interrupted: list[Pend
     assert "motion: stopped by Ctrl-C" in refused(cell, TO_THE_END)
     for arm in SIDES:
         assert interrupted[0].cabinets[arm].trips == []
-        path = interrupted[0].cell.sessions[arm].path
+        path = interrupted[0].lines[arm].path
         assert np.abs(path.rest - path.at(path.end)).max() < 1e-9
 
 

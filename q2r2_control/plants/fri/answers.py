@@ -114,7 +114,7 @@ class AnswerTimes:
         """``period`` between two answers; ``delay``: an answer is for that long before its question arrived."""
         self._period, self._delay = period, delay
         self._questions = 0
-        self._arrival, self._counter = 0.0, 0  # of the newest question, averaged
+        self.arrival, self._counter = 0.0, 0  # of the newest question, averaged
         self._answers: dict[int, _Answer] = {}  # the last ones by their counter
         self._newest: _Answer | None = None  # that is for the latest time
 
@@ -149,9 +149,9 @@ class AnswerTimes:
     def _even(self, question: int, arrival: float) -> float:
         self._questions += 1
         if self._questions == 1:
-            self._arrival = arrival
+            self.arrival = arrival
         else:
-            expected = self._arrival + (question - self._counter) * self._period
-            self._arrival = expected + (arrival - expected) / min(self._questions, _SETTLED)
+            expected = self.arrival + (question - self._counter) * self._period
+            self.arrival = expected + (arrival - expected) / min(self._questions, _SETTLED)
         self._counter = question
-        return self._arrival
+        return self.arrival

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.plants.fri.answers import AnswerTimes, ReferencePath
+from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import (
     JOINTS,
     Command,
@@ -16,7 +16,6 @@ from q2r2_control.plants.fri.wire import (
     IoValue,
     Monitoring,
     Session,
-    in_words,
     read_monitoring,
     write_command,
 )
@@ -24,8 +23,6 @@ from q2r2_control.types import Array
 
 # An answer is for so long before its question arrived, by which time the loop has ticked, on a busy machine too [s].
 DELAY = 0.004
-_SILENT = 0.1  # a cabinet without a message for longer is gone [s]
-_LONGEST_LAG = 0.25  # a cabinet that asks so much too seldom is not followed any more [s]
 _AT_REST = 1e-9  # [rad]
 _RESTARTED = 1000  # a counter that is back by more is that of a session that began anew
 _COUNTERS = 1 << 32
@@ -33,68 +30,64 @@ _MOST_AHEAD = 20  # messages that may come at once after a moment without any
 # A torque that nobody renews is a push without end: one that brakes follows it, and after a while no answer, so that
 # the cabinet ends the session [s].
 _TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
-_TORQUE_PERIOD = 0.005  # between two answers at most: with 0.01 the arm swings up at the default stiffness [s]
+# Of a reference that begins where its arm is held, or, with torques, where it is measured [rad].
+_SAME, _NEAR = 1e-6, 0.02
+_FROM_REST = 20.0  # more than a joint's acceleration in the first tick [rad/s^2]
 
 
 class ArmSession:
-    """One arm. While ``following``, its answers are on the reference's ``path``; else it is held where it is."""
+    """One arm. While it follows, its answers are on the reference's ``path``; else it is held where it is."""
 
-    def __init__(self, arm: str, source: str, version: int | None = None) -> None:
-        """``source``: the cabinet in words; ``version`` of FRI, None: either."""
-        self._arm, self._source, self._version = arm, source, version
-        self.wanted = CommandKind.POSITION  # or TORQUE: an overlay of torques
-        self.newest: Monitoring | None = None
-        self.arrival = -math.inf  # of the newest message [s]
-        self.velocity: Array = np.zeros(JOINTS)  # measured [rad/s]
+    def __init__(
+        self,
+        arm: str,
+        source: str,
+        version: int | None = None,
+        wanted: CommandKind = CommandKind.POSITION,
+        torque_limit: Array | None = None,
+    ) -> None:
+        """``source``: the cabinet in words; ``version`` of FRI, None: either; ``torque_limit`` (n,): of overlays."""
+        self.state, self._version = SessionState(arm, source, wanted), version
         self.path = ReferencePath(0.0, np.zeros(JOINTS))
-        self.following = self.dropped = False  # and whether the arm ceased to follow
-        self.answered = -math.inf  # the latest time that an answer was for [s]
-        self.tau, self.tau_came = np.zeros(JOINTS), -math.inf  # overlay [Nm], and when it was decided on [s]
-        self.damping = np.zeros(JOINTS)  # that brakes where no overlay comes [Nm s/rad]
-        self.torque_limit = np.full(JOINTS, math.inf)  # of overlays [Nm]
-        self.outputs: dict[str, IoValue] = {}  # of the cabinet, by name
-        self._lag = 0.0  # of the answers behind where they are to be [s]
-        self.lost = self.unreadable = 0  # messages of the cabinet
+        self._tau, self._tau_came = np.zeros(JOINTS), -math.inf  # overlay [Nm], and when it was decided on [s]
+        self._damping = np.zeros(JOINTS)  # that brakes where no overlay comes [Nm s/rad]
+        self._torque_limit = np.full(JOINTS, math.inf) if torque_limit is None else torque_limit
+        self._outputs: dict[str, IoValue] = {}
         self._answers = 0
         self._times: AnswerTimes | None = None
         self._begun = False  # the cabinet's own position is known, where the path begins
-        self._problem: ProtocolError | None = None  # with the newest datagram
 
-    @property
-    def period(self) -> float:
-        """Between two answers [s]; 0 where the cabinet was not heard."""
-        return 0.0 if self.newest is None else self.newest.period * self.newest.multiplier
+    def is_still(self, now: float) -> bool:
+        """Whether nothing moves the arm at ``now`` [s] if no more commands come."""
+        if not self.state.following or self.state.is_silent(now):
+            return True
+        if self.state.wanted is CommandKind.TORQUE:
+            return now - self._tau_came > _TORQUE_GONE
+        return bool(np.abs(self.path.at(self.state.answered) - self.path.rest).max() <= _AT_REST)
 
-    @property
-    def words(self) -> str:
-        """How the cabinet says that it is."""
-        newest = self.newest
-        if newest is None:
-            return "not heard"
-        return f"{in_words(newest.session)}, connection {in_words(newest.quality)}, drives {in_words(newest.drives)}"
+    def follow(self, command: ArmCommand) -> None:
+        """Take a tick's command. One for a time that was answered already is refused: the stop goes on to its end."""
+        state = self.state
+        if state.following and state.answered > command.start:
+            state.following, state.rest = False, self.path.rest
+            state.overtaken += 1
+        elif not state.following and self._begins(command):
+            state.following = state.fault(command.now) is None
+            self.path = ReferencePath(command.start, self.path.rest)
+        if state.following and command.end > self.path.end:  # a second command in a tick is no motion
+            self.path.extend(command.end, command.q, command.v, command.deceleration, command.start)
+            state.rest = self.path.rest
+        self._outputs |= command.outputs
+        if command.tau is not None and command.damping is not None:
+            self._tau, self._tau_came, self._damping = command.tau, command.now, command.damping
 
-    def fault(self, now: float) -> Reason | None:
-        """Why the arm cannot be commanded at ``now`` [s], or None."""
-        newest, age = self.newest, now - self.arrival
-        if newest is None or age > _SILENT:
-            if self._problem is not None:
-                return Reason.of(ReasonKind.FRI_UNREADABLE, arm=self._arm, source=self._source, text=str(self._problem))
-            return Reason.of(ReasonKind.FRI_SILENT, arm=self._arm, source=self._source)
-        if self._is_too_slow(newest):
-            period, allowed = 1e3 * self.period, 1e3 * _TORQUE_PERIOD
-            return Reason.of(ReasonKind.FRI_TOO_SELDOM, arm=self._arm, period=period, allowed=allowed)
-        if newest.session is not Session.COMMANDING_ACTIVE:
-            states = newest.session, newest.quality, newest.safety, newest.drives
-            doing, quality, safety, drives = map(in_words, states)
-            return Reason.of(
-                ReasonKind.FRI_SESSION, arm=self._arm, session=doing, quality=quality, safety=safety, drives=drives
-            )
-        if self.following and self._lag > _LONGEST_LAG:
-            return Reason.of(ReasonKind.FRI_BEHIND, arm=self._arm, period=1e3 * newest.period, lag=self._lag)
-        if newest.command is not self.wanted:
-            asked, wanted = newest.command.name.lower(), self.wanted.name.lower()
-            return Reason.of(ReasonKind.FRI_COMMAND_MODE, arm=self._arm, asked=asked, wanted=wanted)
-        return None
+    def _begins(self, command: ArmCommand) -> bool:
+        """Whether the reference was at rest a tick ago, where the arm is."""
+        state, step = self.state, command.end - command.start
+        torques = state.wanted is CommandKind.TORQUE and state.newest
+        there, allowed = (np.array(torques.q), _NEAR) if torques else (self.path.rest, _SAME)
+        way, speed = np.abs(command.q - there), np.abs(command.v)
+        return bool((speed <= _FROM_REST * step).all() and (way <= speed * step + allowed).all())
 
     def answer(self, datagram: bytes, now: float) -> bytes | None:
         """Take a message that came at ``now`` [s]; returns the datagram that answers it, if one is due."""
@@ -102,7 +95,7 @@ class ArmSession:
             message = read_monitoring(datagram)
             self._check(message, now)
         except ProtocolError as error:
-            self.unreadable, self._problem = self.unreadable + 1, error
+            self.state.unreadable, self.state.problem = self.state.unreadable + 1, str(error)
             return None
         if not self._take(message, now) or message.counter % message.multiplier:
             return None
@@ -118,8 +111,8 @@ class ArmSession:
         """Raises :class:`ProtocolError` for a message that cannot be this cabinet's."""
         if self._version not in (None, message.version):
             raise ProtocolError(f"FRI {message.version}: allowed by the YAML: {self._version}")
-        before, passed = self.newest, now - self.arrival
-        if before is None or passed > _SILENT:
+        before, passed = self.state.newest, now - self.state.arrival
+        if before is None or self.state.is_silent(now):
             return
         if message.version != before.version:
             raise ProtocolError(f"FRI {message.version} amid messages of FRI {before.version}")
@@ -129,8 +122,9 @@ class ArmSession:
 
     def _take(self, message: Monitoring, now: float) -> bool:
         """Note a message; False for one that is older than the newest."""
-        before, self._problem = self.newest, None
-        if before is None or now - self.arrival > _SILENT:
+        state, before = self.state, self.state.newest
+        state.problem = None
+        if before is None or state.is_silent(now):
             passed = 0
             self._begin_anew()
         else:
@@ -143,54 +137,58 @@ class ArmSession:
         if before is not None and (message.period, message.multiplier) != (before.period, before.multiplier):
             self._begin_anew()
         if passed > 0 and before is not None:
-            self.lost += passed - 1
+            state.lost += passed - 1
             speed = np.subtract(message.q, before.q) / (passed * message.period)
-            self.velocity = 0.5 * (self.velocity + speed)
+            state.velocity = 0.5 * (state.velocity + speed)
         elif passed == 0 and before is not None and message.counter != before.counter:
-            self.velocity = np.zeros(JOINTS)
-        self.newest, self.arrival = message, now
+            state.velocity = np.zeros(JOINTS)
+        state.newest, state.arrival = message, now
         return True
 
     def _begin_anew(self) -> None:
         """The arm is where its cabinet says next."""
-        self.dropped |= self.following
-        self.following = self._begun = False
+        self._cease()
+        self._begun = False
         self._times = None
 
-    def _is_too_slow(self, message: Monitoring) -> bool:
-        return self.wanted is CommandKind.TORQUE and message.period * message.multiplier > _TORQUE_PERIOD
+    def _cease(self) -> None:
+        self.state.ended += self.state.following
+        self.state.following = False
 
     def _command(self, message: Monitoring, now: float) -> Command | None:
         counter, reflected = self._answers, message.counter
         if message.session < Session.COMMANDING_WAIT:
             self._begin_anew()
             mirrored = message.commanded_q or message.q  # which FRI 1 expects, and FRI 2 does without
-            return Command(counter, reflected, mirrored if message.version == 1 else None, io=self.outputs)
+            return Command(counter, reflected, mirrored if message.version == 1 else None, io=self._outputs)
         if self._times is None:
             self._times = AnswerTimes(message.period * message.multiplier, DELAY)
         if message.session is Session.COMMANDING_WAIT or not self._begun:
             # The first command has to equal the cabinet's own position, and the reference begins there.
-            self.dropped |= self.following
-            self.following, self._begun = False, True
+            self._cease()
+            self._begun = True
             self.path = ReferencePath(now, np.array(message.ipo_q or message.q))
+            self.state.rest = self.path.rest
             self._times.restart()
-        if self.wanted is CommandKind.TORQUE:
+        if self.state.wanted is CommandKind.TORQUE:
             return self._torque(message, now)
         time = self._times.at(message.counter, now, counter, message.reflected)
-        self.answered, self._lag = max(self.answered, time), now - DELAY - time
+        state = self.state
+        state.answered, state.lag = max(state.answered, time), now - DELAY - time
+        state.expected = self._times.arrival
         there = self.path.at(time)
-        if abs(self._lag) > message.period and np.abs(there - self.path.rest).max() <= _AT_REST:
+        if abs(state.lag) > message.period and np.abs(there - self.path.rest).max() <= _AT_REST:
             self._times.restart()  # where nothing moves, the next answer may be for any time
-        return Command(counter, reflected, tuple(there.tolist()), io=self.outputs)
+        return Command(counter, reflected, tuple(there.tolist()), io=self._outputs)
 
     def _torque(self, message: Monitoring, now: float) -> Command | None:
         """The newest overlay, or one that brakes, with the cabinet's own position as KUKA's example clients have it."""
-        age = now - self.tau_came
-        if self._is_too_slow(message) or (message.session is Session.COMMANDING_ACTIVE and age > _TORQUE_GONE):
+        age = now - self._tau_came
+        if self.state.is_too_slow or (message.session is Session.COMMANDING_ACTIVE and age > _TORQUE_GONE):
             return None
-        wanted = self.tau if self.following and age <= _TORQUE_LASTS else -self.damping * self.velocity
-        tau = tuple(np.clip(wanted, -self.torque_limit, self.torque_limit).tolist())
-        return Command(self._answers, message.counter, message.ipo_q or message.q, tau, self.outputs)
+        wanted = self._tau if self.state.following and age <= _TORQUE_LASTS else -self._damping * self.state.velocity
+        tau = tuple(np.clip(wanted, -self._torque_limit, self._torque_limit).tolist())
+        return Command(self._answers, message.counter, message.ipo_q or message.q, tau, self._outputs)
 
 
 def _ahead(message: Monitoring, before: Monitoring) -> int:

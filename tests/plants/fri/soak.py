@@ -174,7 +174,7 @@ class Soak:
                 for place in self.random.integers(0, max(len(wrong), 1), 3) if wrong else ():
                     wrong[place] = self.random.integers(0, 256)
                 if wrong != whole:
-                    self.plant.cell.answer(arm, bytes(wrong), self.plant.now)
+                    self.plant.answer(arm, bytes(wrong))
 
 
 def steady(pipeline: FreezingLoop, duration: float) -> bool:

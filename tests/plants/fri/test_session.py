@@ -9,6 +9,7 @@ import pytest
 
 from q2r2_control.events import ReasonKind
 from q2r2_control.plants.fri.session import ArmSession
+from q2r2_control.plants.fri.session_state import ArmCommand
 from q2r2_control.plants.fri.wire import (
     Command,
     CommandKind,
@@ -31,7 +32,7 @@ class Cabinet:
     """Sends messages 5 ms apart to a session, and reads the answers."""
 
     def __init__(self, session: ArmSession | None = None) -> None:
-        self.session, self.sent = session or ArmSession("left", "cabinet"), 0
+        self.session, self.sent, self.heard = session or ArmSession("left", "cabinet"), 0, 0
 
     @property
     def now(self) -> float:
@@ -39,8 +40,13 @@ class Cabinet:
 
     def ask(self, message: Monitoring) -> Command | None:
         self.sent += 1
-        answer = self.session.answer(write_monitoring(replace(message, counter=self.sent)), self.now)
-        return None if answer is None else read_command(answer)[1]
+        message = replace(message, counter=self.sent, reflected=self.heard)
+        answer = self.session.answer(write_monitoring(message), self.now)
+        if answer is None:
+            return None
+        command = read_command(answer)[1]
+        self.heard = command.counter
+        return command
 
 
 def test_an_idle_cabinet_gets_no_answer_and_one_that_monitors_gets_no_position() -> None:
@@ -71,24 +77,34 @@ def test_every_multiplier_th_message_is_answered() -> None:
     assert [answer is None for answer in answers] == [True, True, False, True, True, False]
 
 
+def torque_cabinet(limit: float = 100.0) -> Cabinet:
+    return Cabinet(ArmSession("left", "cabinet", None, CommandKind.TORQUE, np.full(7, limit)))
+
+
 def begin_torques(cabinet: Cabinet) -> Monitoring:
-    """A session of torques is in commanding wait; returns the message of an active one."""
-    cabinet.session.wanted = CommandKind.TORQUE
+    """A session of torques is in commanding wait, and a command came; returns the message of an active one."""
+    active = replace(ACTIVE, command=CommandKind.TORQUE)
     cabinet.ask(replace(WAITING, command=CommandKind.TORQUE))
-    cabinet.session.following, cabinet.session.tau, cabinet.session.tau_came = True, np.ones(7), cabinet.now
-    cabinet.session.velocity, cabinet.session.damping = np.full(7, 0.2), np.full(7, 20.0)
-    return replace(ACTIVE, command=CommandKind.TORQUE)
+    cabinet.ask(active)
+    overlay, still = np.ones(7), np.zeros(7)
+    cabinet.session.follow(
+        ArmCommand(
+            cabinet.now, cabinet.now, cabinet.now + 0.002, np.array(Q), still, overlay, {}, overlay, 20.0 * overlay
+        )
+    )
+    cabinet.session.state.velocity = np.full(7, 0.2)
+    return active
 
 
 def test_torques_go_with_the_cabinets_own_position() -> None:
-    cabinet = Cabinet()
+    cabinet = torque_cabinet()
     answer = cabinet.ask(begin_torques(cabinet))
     assert answer is not None
     assert (answer.q, answer.tau) == (IPO, (1.0,) * 7)
 
 
 def test_a_torque_without_a_newer_one_becomes_one_that_brakes_and_ends_with_the_answers() -> None:
-    cabinet = Cabinet()
+    cabinet = torque_cabinet()
     active = begin_torques(cabinet)
     q = iter(np.linspace(Q, np.add(Q, 0.025), 26)[1:])  # at 0.2 rad/s
     answers = [cabinet.ask(replace(active, q=tuple(next(q).tolist()))) for _ in range(25)]
@@ -97,19 +113,18 @@ def test_a_torque_without_a_newer_one_becomes_one_that_brakes_and_ends_with_the_
 
 
 def test_no_torque_is_beyond_the_limit() -> None:
-    cabinet = Cabinet()
+    cabinet = torque_cabinet(limit=0.5)
     active = begin_torques(cabinet)
-    cabinet.session.torque_limit = np.full(7, 0.5)
     answer = cabinet.ask(active)
     assert answer is not None
     assert answer.tau == (0.5,) * 7
 
 
 def test_torques_are_refused_to_a_cabinet_that_asks_too_seldom() -> None:
-    cabinet = Cabinet()
+    cabinet = torque_cabinet()
     begin_torques(cabinet)
     assert cabinet.ask(replace(WAITING, command=CommandKind.TORQUE, multiplier=2)) is None
-    fault = cabinet.session.fault(cabinet.now)
+    fault = cabinet.session.state.fault(cabinet.now)
     assert fault is not None
     assert sentence(fault) == "left: the cabinet asks every 10 ms; allowed for torques: 5 at most"
 
@@ -118,25 +133,49 @@ def test_a_drop_is_told_and_the_arm_follows_no_more() -> None:
     cabinet = Cabinet()
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
-    cabinet.session.following = True
-    assert cabinet.session.fault(cabinet.now) is None
+    cabinet.session.state.following = True
+    assert cabinet.session.state.fault(cabinet.now) is None
     cabinet.ask(MONITORING)
-    assert cabinet.session.dropped
-    assert not cabinet.session.following
-    fault = cabinet.session.fault(cabinet.now)
+    assert cabinet.session.state.ended == 1
+    assert not cabinet.session.state.following
+    fault = cabinet.session.state.fault(cabinet.now)
     assert fault is not None
     assert fault.kind is ReasonKind.FRI_SESSION
     assert fault.detail["session"] == "monitoring ready"
+
+
+def test_a_command_for_a_time_that_was_answered_is_refused_and_the_arm_stops_as_it_was_certified() -> None:
+    cabinet, ones = Cabinet(), np.ones(7)
+    cabinet.ask(WAITING)
+    cabinet.ask(ACTIVE)
+    for _ in range(10):  # a reference that leaves IPO at 1 rad/s^2, for 50 ms
+        end = cabinet.now + 0.003
+        passed = end - 0.013
+        way, speed = 0.5 * passed**2, passed
+        cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, IPO + way * ones, speed * ones, ones))
+        cabinet.ask(ACTIVE)
+    state = cabinet.session.state
+    assert state.following
+    cabinet.session.follow(ArmCommand(cabinet.now, state.answered - 1e-3, cabinet.now, np.array(IPO), 0.0 * ones, ones))
+    assert (state.following, state.overtaken) == (False, 1)
+    answers = [cabinet.ask(ACTIVE) for _ in range(40)]
+    stop = np.array([answer.q for answer in answers if answer and answer.q])
+    assert np.diff(stop, axis=0).min() >= 0.0, "it goes on, slower and slower"
+    np.testing.assert_allclose(stop[-1], state.rest, atol=1e-9)
+    # From there a reference at rest is followed again.
+    now = cabinet.now
+    cabinet.session.follow(ArmCommand(now, now, now + 0.002, state.rest, 0.0 * ones, ones))
+    assert state.following
 
 
 def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> None:
     cabinet = Cabinet()
     kinds = []
     for now in (0.0, 0.3):
-        fault = cabinet.session.fault(now)
+        fault = cabinet.session.state.fault(now)
         kinds.append(None if fault is None else fault.kind)
         cabinet.ask(replace(ACTIVE, command=CommandKind.TORQUE))
-    fault = cabinet.session.fault(cabinet.now)
+    fault = cabinet.session.state.fault(cabinet.now)
     assert kinds == [ReasonKind.FRI_SILENT, ReasonKind.FRI_SILENT]
     assert fault is not None
     assert fault.kind is ReasonKind.FRI_COMMAND_MODE
@@ -150,7 +189,7 @@ def test_an_older_message_is_not_answered_and_lost_ones_are_counted() -> None:
     assert cabinet.ask(MONITORING) is None
     cabinet.sent = 6
     assert cabinet.ask(MONITORING) is not None
-    assert cabinet.session.lost == 3
+    assert cabinet.session.state.lost == 3
 
 
 @pytest.mark.parametrize(
@@ -166,10 +205,10 @@ def test_an_older_message_is_not_answered_and_lost_ones_are_counted() -> None:
 def test_a_message_that_cannot_be_the_cabinets_changes_nothing(wrong: bytes) -> None:
     cabinet = Cabinet()
     cabinet.ask(MONITORING)
-    before = cabinet.session.newest
+    before = cabinet.session.state.newest
     assert cabinet.session.answer(wrong, cabinet.now + 0.005) is None
-    assert cabinet.session.newest is before
-    assert cabinet.session.unreadable == 1
+    assert cabinet.session.state.newest is before
+    assert cabinet.session.state.unreadable == 1
 
 
 def test_a_hundred_thousand_wrong_datagrams_raise_nothing() -> None:
@@ -181,4 +220,4 @@ def test_a_hundred_thousand_wrong_datagrams_raise_nothing() -> None:
         for place in random.integers(0, len(wrong), 1 + index % 3):
             wrong[place] = random.integers(0, 256)
         session.answer(bytes(wrong[: None if index % 5 else random.integers(0, len(wrong))]), 1e-3 * index)
-    assert session.unreadable > 50_000
+    assert session.state.unreadable > 50_000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
+from copy import copy
 
 import numpy as np
 
@@ -62,10 +63,9 @@ class VirtualCabinets:
         self._mode = mode
 
     def reset(self, q: Array | None = None) -> None:
-        sessions = {arm: ArmSession(arm, "cabinet", None) for arm in self.cabinets}
-        for session in sessions.values():
-            session.wanted = _KINDS[self._mode]
-        self.cell = FriCell(self._robot, sessions, self._period)
+        limits = {arm: self._robot.torque_limit[self._robot.arms[arm].joints] for arm in self.cabinets}
+        self.lines = {arm: ArmSession(arm, "cabinet", None, _KINDS[self._mode], limit) for arm, limit in limits.items()}
+        self.cell = FriCell(self._robot, [copy(session.state) for session in self.lines.values()], self._period)
         self.now, self._serial = _BEGIN, 0  # the loop begins at 0
         self._events: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
         self.heard: dict[str, list[Array]] = {
@@ -89,12 +89,14 @@ class VirtualCabinets:
         return self.cell.delay()
 
     def sessions(self) -> dict[str, str]:
-        return {arm: session.words for arm, session in self.cell.sessions.items()}
+        return {arm: state.words for arm, state in self.cell.states.items()}
 
     def apply(self, command: Command) -> None:
         check_command(command, self._robot, self.modes)
         self._pass(self.now + self.thinking)
-        self.cell.apply(command)
+        for arm, its in self.cell.apply(command, self.now).items():
+            self.lines[arm].follow(its)
+            self.cell.update(copy(self.lines[arm].state))
 
     def advance(self, dt: float) -> None:
         """Time passes by itself, until the next tick."""
@@ -137,6 +139,12 @@ class VirtualCabinets:
             self._at(max(self.now + self._late(), self.asleep_until), self._receive, arm, write_monitoring(message))
 
     def _receive(self, arm: str, datagram: bytes) -> None:
-        answer = self.cell.answer(arm, datagram, self.now)
+        answer = self.answer(arm, datagram)
         if answer is not None and self._random.random() >= self._loss:
             self._at(self.now + self._late(), self.cabinets[arm].receive, answer)
+
+    def answer(self, arm: str, datagram: bytes) -> bytes | None:
+        """What the process that answers does with a datagram."""
+        answer = self.lines[arm].answer(datagram, self.now)
+        self.cell.update(copy(self.lines[arm].state))
+        return answer
