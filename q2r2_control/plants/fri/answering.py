@@ -51,6 +51,7 @@ class AnsweringProcess:
         files = [theirs.fileno(), *(line.file for line in lines)]
         with theirs:
             self._process = start_python(f"from {__name__} import main; main({theirs.fileno()})", {}, files=files)
+        self.pid = self._process.pid
         # An answer goes before the loop, where that has a priority.
         priority = thread_priority()
         self._link.send(pickle.dumps((priority and priority + 1, list(lines))))
@@ -64,7 +65,7 @@ class AnsweringProcess:
         return True
 
     def receive(self) -> list[SessionState]:
-        """What has come since the last call. Raises :class:`PlantError` where the process has ended."""
+        """The states that have come since the last call. Raises :class:`PlantError` where the process has ended."""
         states = []
         with suppress(BlockingIOError):
             while True:

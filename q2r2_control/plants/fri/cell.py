@@ -24,6 +24,7 @@ from q2r2_control.types import Command, CommandMode, RobotState
 
 # From the decision how far the reference goes until the sessions have it [s].
 _MARGIN = 0.002
+_PASSING = 0.0015  # from a measurement until it has passed cabinet, network and processes, about [s]
 _NO_COMMANDS = 0.1  # so long without one that came in time is told [s]
 # In which an arm loses most of its speed where no overlay comes: several periods of a cabinet [s].
 _BRAKING_TIME = 0.03
@@ -123,7 +124,7 @@ class FriCell:
         """
         states = self.states.values()
         is_torque = any(state.wanted is CommandKind.TORQUE for state in states)
-        return 0.0 if is_torque else DELAY + 2.5 * max(state.period for state in states)
+        return 0.0 if is_torque else DELAY + _PASSING + 2.5 * max(state.period for state in states)
 
     def openings(self) -> dict[str, float]:
         """Measured opening of each gripper that has an input, 0 closed .. 1 open."""

@@ -1,4 +1,4 @@
-"""The process that answers the cabinets: it ends with the loop, and the loop knows when it has ended."""
+"""The process that answers the cabinets goes by the loop's commands, and each of the two knows of the other's end."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,40 +15,91 @@ from q2r2_control.errors import PlantError
 from q2r2_control.plants.fri.answering import AnsweringProcess, Line, open_socket
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
-from q2r2_control.plants.fri.wire import Monitoring, Quality, Session, read_command, write_monitoring
-from tests.support.waiting import eventually
+from q2r2_control.plants.fri.wire import Command, Monitoring, Quality, Session, read_command, write_monitoring
+from tests.support.headset_server import eventually
 
 Q = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
 MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.005, 1, Q)
 
 
-class Ends:
-    """The process between one cabinet and the loop."""
+class Between:
+    """The process, with this test as its cabinet and its loop."""
 
     def __init__(self) -> None:
         self.cabinet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.cabinet.settimeout(10.0)
+        self.cabinet.bind(("127.0.0.1", 0))
         ours = open_socket("127.0.0.1", 0)
         self.address, self.sent = ours.getsockname(), 0
         file = ours.detach()
         self.process = AnsweringProcess([Line(ArmSession("left", "cabinet"), "127.0.0.1", file)])
         socket.close(file)
-        self.state: SessionState | None = None
-        eventually(lambda: self.ask() is not None)  # what comes before it has begun is dropped
+        self.states: list[SessionState] = []
+        self.cabinet.settimeout(0.2)
+        eventually(self.is_answered)  # messages that come before it has begun are dropped
+        self.cabinet.settimeout(20.0)
 
-    def ask(self) -> object:
-        """The answer to the next message, or None while there is none."""
+    def ask(self) -> Command:
         self.sent += 1
-        self.cabinet.sendto(write_monitoring(MONITORING.__class__(2, self.sent, *vars_of(MONITORING)[2:])), self.address)
-        self.cabinet.settimeout(0.2 if self.state is None else 10.0)
+        self.cabinet.sendto(write_monitoring(replace(MONITORING, counter=self.sent)), self.address)
+        return read_command(self.cabinet.recv(2000))[1]
+
+    def is_answered(self) -> bool:
         try:
-            answer = read_command(self.cabinet.recv(2000))[1]
+            return self.ask().reflected == self.sent
         except TimeoutError:
-            return None
-        eventually(self.hear)
-        return answer
+            return False
 
     def hear(self) -> bool:
-        for state in self.process.receive():
-            self.state = state
-        return self.state is not None
+        self.states += self.process.receive()
+        return bool(self.states) and self.states[-1].newest == replace(MONITORING, counter=self.sent)
+
+
+@pytest.fixture
+def between() -> Iterator[Between]:
+    made = Between()
+    try:
+        yield made
+    finally:
+        made.process.close()
+        made.cabinet.close()
+
+
+def test_the_loop_gets_the_state_after_each_message_and_an_answer_goes_by_what_was_sent_before_it(
+    between: Between,
+) -> None:
+    between.ask()
+    eventually(between.hear)
+    assert between.states[-1].took is not None
+    still, q = np.zeros(7), np.array(Q)
+    assert between.process.send({"left": ArmCommand(0.0, 0.0, 0.001, q, still, 1.0 + still, {"Gripper.Opening": 0.5})})
+    assert between.ask().io == {"Gripper.Opening": 0.5}
+
+
+def test_messages_from_elsewhere_are_not_answered(between: Between) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.2", 0))
+        other.settimeout(0.2)
+        other.sendto(write_monitoring(replace(MONITORING, counter=between.sent + 1)), between.address)
+        between.ask()
+        with pytest.raises(TimeoutError):
+            other.recv(2000)
+
+
+def test_it_ends_with_the_loop(between: Between) -> None:
+    between.process.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(between.process.pid, 0)
+
+
+def test_a_loop_whose_process_was_killed_is_told(between: Between) -> None:
+    os.kill(between.process.pid, signal.SIGKILL)
+
+    def is_told() -> bool:
+        try:
+            between.process.receive()
+        except PlantError as error:
+            return "the process that answers the cabinets" in str(error)
+        return False
+
+    eventually(is_told)
+    assert not between.process.send({})

@@ -144,7 +144,7 @@ class VirtualCabinets:
             self._at(self.now + self._late(), self.cabinets[arm].receive, answer)
 
     def answer(self, arm: str, datagram: bytes) -> bytes | None:
-        """What the process that answers does with a datagram."""
+        """A datagram as the process that answers takes it."""
         answer = self.lines[arm].answer(datagram, self.now)
         self.cell.update(copy(self.lines[arm].state))
         return answer
