@@ -12,7 +12,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from subprocess import TimeoutExpired
@@ -56,10 +56,10 @@ class AnsweringProcess:
         priority = thread_priority()
         self._link.send(pickle.dumps((priority and priority + 1, list(lines))))
 
-    def send(self, commands: Mapping[str, ArmCommand]) -> bool:
-        """Whether the commands of a tick will be taken before the next answer."""
+    def send(self, packed: bytes) -> bool:
+        """Whether pickled commands, by arm, will be taken before the next answer."""
         try:
-            self._link.send(pickle.dumps(commands))
+            self._link.send(packed)
         except OSError:  # it stands still, or has ended, which :meth:`receive` says
             return False
         return True

@@ -26,7 +26,7 @@ from q2r2_control.types import Array
 
 CATCH_UP = 0.05  # of an even time's rate
 CATCH_UP_RAMP = 0.4  # of that rate [1/s]
-_SETTLED = 500  # messages over which the arrivals are averaged
+_SETTLED = 500  # messages in which a clock that is slower than it was taken for is followed
 _PIECES = 1024  # of the reference that are kept
 _REMEMBERED = 64  # answers of which the time is known
 
@@ -107,32 +107,49 @@ class _Answer(NamedTuple):
     rate: float  # of that time since the answer before
 
 
+class MessageClock:
+    """When a cabinet's messages would come if nothing made them late, in [s] of our clock.
+
+    A message may be late, and none is early: one that comes before it was expected shows the cabinet's clock.
+    """
+
+    def __init__(self, arrival: float) -> None:
+        """``arrival`` of the first message."""
+        self._taken, self.expected = 1, arrival  # messages so far, and the time of the newest
+
+    def take(self, arrival: float, passed: float) -> None:
+        """A newer message, ``passed`` [s] after the one before by the cabinet's clock."""
+        self._taken += 1
+        expected = self.expected + passed
+        late = arrival - expected
+        self.expected = arrival if late < 0.0 else expected + late / min(self._taken, _SETTLED)
+
+
 class AnswerTimes:
     """The even times of one cabinet's answers, all in [s] of our clock."""
 
     def __init__(self, period: float, delay: float) -> None:
-        """``period`` between two answers; ``delay``: an answer is for that long before its question arrived."""
+        """``period`` between two answers; ``delay``: an answer is for that long before its question is expected."""
         self._period, self._delay = period, delay
-        self._questions = 0
-        self.arrival, self._counter = 0.0, 0  # of the newest question, averaged
+        self._question = -1  # the newest one
         self._answers: dict[int, _Answer] = {}  # the last ones by their counter
         self._newest: _Answer | None = None  # that is for the latest time
 
     def restart(self) -> None:
         """The arm stands still at a new path's begin, so that the next answer may be for any time."""
-        self._answers, self._newest, self._questions = {}, None, 0
+        self._answers, self._newest = {}, None
 
-    def at(self, question: int, arrival: float, counter: int, heard: int) -> float:
-        """The time that our answer ``counter`` to a ``question`` is for, that came at ``arrival``.
+    def at(self, question: int, expected: float, counter: int, heard: int) -> float:
+        """The time that our answer ``counter`` to a ``question`` is for, that is ``expected`` at a time.
 
         ``heard``: counter of our newest answer that the cabinet knows of.
         """
-        newest = self._newest
+        newest, repeated, self._question = self._newest, question == self._question, question
         self._answers.pop(counter - _REMEMBERED, None)
-        if newest is not None and question == self._counter:  # it came twice
+        if newest is not None and repeated:
             self._answers[counter] = newest
             return newest.time
-        wanted = self._even(question, arrival) - self._delay
+        wanted = expected - self._delay
         # From the answer that the cabinet goes on from: what it did not hear was never done.
         before = self._answers.get(heard, newest) or _Answer(wanted - self._period, 1.0)
         lag = (wanted - before.time) / self._period - 1.0  # in answers
@@ -145,13 +162,3 @@ class AnswerTimes:
         self._answers[counter] = answer
         self._newest = answer if newest is None else max(newest, answer)
         return answer.time
-
-    def _even(self, question: int, arrival: float) -> float:
-        self._questions += 1
-        if self._questions == 1:
-            self.arrival = arrival
-        else:
-            expected = self.arrival + (question - self._counter) * self._period
-            self.arrival = expected + (arrival - expected) / min(self._questions, _SETTLED)
-        self._counter = question
-        return self.arrival

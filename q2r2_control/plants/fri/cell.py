@@ -9,7 +9,7 @@ an answer may have passed it in the middle of a tick, the command of that tick i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import pinocchio as pin
@@ -67,16 +67,9 @@ class FriCell:
         self._end = self._start + step
         return braked, step
 
-    def apply(self, command: Command, now: float) -> dict[str, ArmCommand]:
-        """For each arm what its session is sent at ``now`` [s]: the reference at the end of the tick of :meth:`due`.
-
-        Nothing is sent where the command is withdrawn.
-        """
-        self._withdraws = False
-        if any(state.following and state.latest(now) > self._start for state in self.states.values()):
-            self.withdraw()
-            return {}
-        self._in_time, sent = self._now, {}
+    def apply(self, command: Command) -> dict[str, ArmCommand]:
+        """For each arm what its session is to be sent: the reference at the end of the tick of :meth:`due`."""
+        sent = {}
         is_torque = command.mode is CommandMode.TORQUE
         if is_torque:
             model, data, measured = self._robot.model, self._data, self.state().q
@@ -108,9 +101,14 @@ class FriCell:
     def _counts(self) -> dict[str, tuple[int, int]]:
         return {arm: (state.ended, state.overtaken) for arm, state in self.states.items()}
 
-    def withdraw(self) -> None:
-        """The command of this tick is sent to nobody."""
-        self._end, self._withdraws = self._start, True
+    def take(self, now: float, send: Callable[[], bool]) -> None:
+        """Send a tick's commands at ``now`` [s], or withdraw them where answers may be ahead of them already."""
+        late = any(state.following and state.latest(now) > self._start for state in self.states.values())
+        self._withdraws = late or not send()
+        if self._withdraws:
+            self._end = self._start
+        else:
+            self._in_time = self._now
 
     def withdraws(self) -> bool:
         """Whether the newest command came after an answer that it was for: the arms go on along the stop before it."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pickle
 import socket
 import time
 from collections import deque
+from functools import partial
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.fri import GripperIoConfig, ModbusGripperConfig
@@ -136,10 +138,9 @@ class FriPlant:
     def apply(self, command: Command) -> None:
         check_command(command, self._robot, self.modes)
         assert self._answering is not None
+        packed = pickle.dumps(self.cell.apply(command))
         self.states()
-        commands = self.cell.apply(command, time.monotonic())
-        if commands and not self._answering.send(commands):
-            self.cell.withdraw()
+        self.cell.take(time.monotonic(), partial(self._answering.send, packed))
         for arm, gripper in self.grippers.items():
             if arm in command.grippers:
                 gripper.command(float(command.grippers[arm]))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.plants.fri.answers import AnswerTimes, ReferencePath
+from q2r2_control.plants.fri.answers import AnswerTimes, MessageClock, ReferencePath
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import (
     JOINTS,
@@ -55,6 +55,7 @@ class ArmSession:
         self._outputs: dict[str, IoValue] = {}
         self._answers = 0
         self._times: AnswerTimes | None = None
+        self._clock = MessageClock(-math.inf)
         self._begun = False  # the cabinet's own position is known, where the path begins
 
     def is_still(self, now: float) -> bool:
@@ -136,6 +137,11 @@ class ArmSession:
                 self._begin_anew()
         if before is not None and (message.period, message.multiplier) != (before.period, before.multiplier):
             self._begin_anew()
+            self._clock = MessageClock(now)
+        elif passed == 0 and (before is None or message.counter != before.counter):
+            self._clock = MessageClock(now)
+        elif passed > 0:
+            self._clock.take(now, passed * message.period)
         if passed > 0 and before is not None:
             state.lost += passed - 1
             speed = np.subtract(message.q, before.q) / (passed * message.period)
@@ -172,10 +178,10 @@ class ArmSession:
             self._times.restart()
         if self.state.wanted is CommandKind.TORQUE:
             return self._torque(message, now)
-        time = self._times.at(message.counter, now, counter, message.reflected)
+        time = self._times.at(message.counter, self._clock.expected, counter, message.reflected)
         state = self.state
         state.answered, state.lag = max(state.answered, time), now - DELAY - time
-        state.expected = self._times.arrival
+        state.expected = self._clock.expected
         there = self.path.at(time)
         if abs(state.lag) > message.period and np.abs(there - self.path.rest).max() <= _AT_REST:
             self._times.restart()  # where nothing moves, the next answer may be for any time

@@ -15,7 +15,7 @@ from q2r2_control.types import Array
 TORQUE_PERIOD = 0.005  # between two answers at most: with 0.01 the arm swings up at the default stiffness [s]
 _SILENT = 0.1  # a cabinet without a message for longer is gone [s]
 _LONGEST_LAG = 0.25  # a cabinet that asks so much too seldom is not followed any more [s]
-_EARLY = 1e-3  # a message may come so much before its mean time [s]
+_EARLY = 5e-4  # a message may come so much before it is expected [s]
 
 
 @dataclass
@@ -33,7 +33,7 @@ class SessionState:
     ended: int = 0  # how often the arm ceased to follow, since the cabinet ended its session
     overtaken: int = 0  # and since a command came after an answer that it was for
     answered: float = -math.inf  # the latest time that an answer was for
-    expected: float = -math.inf  # when the message of that answer comes in the mean
+    expected: float = -math.inf  # when the message of that answer would have come, had nothing made it late
     lag: float = 0.0  # of the answers behind where they are to be
     took: float | None = None  # from the newest message's arrival until its answer was sent; None: it got none
     lost: int = 0  # messages of the cabinet

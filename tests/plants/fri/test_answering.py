@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import socket
 from collections.abc import Iterator
@@ -71,7 +72,8 @@ def test_the_loop_gets_the_state_after_each_message_and_an_answer_goes_by_what_w
     eventually(between.hear)
     assert between.states[-1].took is not None
     still, q = np.zeros(7), np.array(Q)
-    assert between.process.send({"left": ArmCommand(0.0, 0.0, 0.001, q, still, 1.0 + still, {"Gripper.Opening": 0.5})})
+    command = ArmCommand(0.0, 0.0, 0.001, q, still, 1.0 + still, {"Gripper.Opening": 0.5})
+    assert between.process.send(pickle.dumps({"left": command}))
     assert between.ask().io == {"Gripper.Opening": 0.5}
 
 
@@ -102,4 +104,4 @@ def test_a_loop_whose_process_was_killed_is_told(between: Between) -> None:
         return False
 
     eventually(is_told)
-    assert not between.process.send({})
+    assert not between.process.send(pickle.dumps({}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP, AnswerTimes, ReferencePath
+from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP, AnswerTimes, MessageClock, ReferencePath
 from q2r2_control.types import Array
 
 SPEED, ACCELERATION = 1.5, 9.0  # greatest of the reference
@@ -22,7 +22,7 @@ def answered(period: float, drift: float, jitter: float, loss: float, seed: int,
     """Positions that the cabinet hears, one after the other."""
     random = np.random.default_rng(seed)
     path, times = ReferencePath(0.0, swing(0.0)[0]), AnswerTimes(period, DELAY)
-    heard_positions, heard, ticks = [], -1, 0
+    heard_positions, heard, ticks, clock, before = [], -1, 0, MessageClock(0.0), 0
     asked = np.arange(1, int(duration / period)) * period * (1.0 + drift)
     for question, sent in enumerate(asked):
         arrival = sent + random.uniform(0.0, jitter)
@@ -31,7 +31,9 @@ def answered(period: float, drift: float, jitter: float, loss: float, seed: int,
             path.extend(ticks * TICK, *swing(ticks * TICK), np.array([ACCELERATION]))
         if random.random() < loss:
             continue  # the question
-        time = times.at(question, arrival, question, heard)
+        clock.take(arrival, (question + 1 - before) * period)
+        before = question + 1
+        time = times.at(question, clock.expected, question, heard)
         assert time <= path.end, "nothing is extrapolated while our loop is on time"
         if random.random() < loss:
             continue  # the answer

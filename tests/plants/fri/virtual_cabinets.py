@@ -94,9 +94,15 @@ class VirtualCabinets:
     def apply(self, command: Command) -> None:
         check_command(command, self._robot, self.modes)
         self._pass(self.now + self.thinking)
-        for arm, its in self.cell.apply(command, self.now).items():
-            self.lines[arm].follow(its)
-            self.cell.update(copy(self.lines[arm].state))
+        commands = self.cell.apply(command)
+
+        def send() -> bool:
+            for arm, its in commands.items():
+                self.lines[arm].follow(its)
+                self.cell.update(copy(self.lines[arm].state))
+            return True
+
+        self.cell.take(self.now, send)
 
     def advance(self, dt: float) -> None:
         """Time passes by itself, until the next tick."""
