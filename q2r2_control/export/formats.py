@@ -1,12 +1,14 @@
 """The formats of ``q2r2 export``: CSV, HDF5 and two LeRobotDatasets.
 
 CSV and HDF5 have a file for each episode; HDF5 is laid out as ``record_sim_episodes.py`` in
-https://github.com/tonyzhaozh/act does it.
+https://github.com/tonyzhaozh/act does it. A further file shows all episodes as https://github.com/ARISE-Initiative/robomimic
+reads them.
 """
 
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +31,12 @@ _DATA = (
 )
 _OPENING, _OPENING_UNIT = "_gripper", "0 closed .. 1 open"
 _COMPRESSION = 1  # of gzip's levels, the fastest
+ROBOMIMIC = "robomimic.h5"  # not .hdf5: some trainers of ACT read each file of that name
+# Where robomimic looks in a demonstration, and what it finds there: a link, so numbers and pictures are kept once.
+_LINKS = {
+    **{"actions": "action", "rewards": "rewards", "dones": "dones"},
+    **{"obs/qpos": "observations/qpos", "obs/qvel": "observations/qvel"},
+}
 
 
 def write_table(episode: EpisodeVectors, path: Path) -> None:
@@ -87,6 +95,8 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
             data = file.create_dataset(name, data=values)
             data.attrs["names"] = list(labels)
             data.attrs["units"] = [_OPENING_UNIT if label.endswith(_OPENING) else unit for label in labels]
+        for name, flags in zip(("dones", "rewards"), episode.outcome().values(), strict=True):
+            file.create_dataset(name, data=flags.astype(np.float32))
         images = file.create_group("observations/images")
         for camera, pictures in episode.cameras.items():
             # Each picture is packed by itself, so that one can be read without the others.
@@ -98,10 +108,26 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
 
 
 def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
-    """Move HDF5 files into a new ``folder``, as ``episode_0.hdf5`` and so on."""
+    """Move HDF5 files into a new ``folder``, as ``episode_0.hdf5`` and so on, and link to all of them for robomimic."""
+    h5py, total = require_h5py(), 0
     folder.mkdir()
-    for number, file in enumerate(files):
-        file.replace(folder / f"episode_{number}.hdf5")
+    with h5py.File(folder / ROBOMIMIC, "w") as joined:
+        demos = joined.create_group("data")
+        for number, file in enumerate(files):
+            moved = file.replace(folder / f"episode_{number}.hdf5")
+            demo = demos.create_group(f"demo_{number}")
+            with h5py.File(moved) as episode:
+                frames, cell = len(episode["action"]), episode.attrs["cell"]
+                pictures = {
+                    f"obs/{camera}": f"observations/images/{camera}" for camera in episode["observations/images"]
+                }
+            for name, target in (_LINKS | pictures).items():
+                demo[name] = h5py.ExternalLink(moved.name, target)
+            demo.attrs["num_samples"] = frames
+            total += frames
+        # Of an environment it wants to be told, also where it trains without one: type 2 is Gym's.
+        demos.attrs["env_args"] = json.dumps({"env_name": cell, "type": 2, "env_kwargs": {}})
+        demos.attrs["total"] = total
 
 
 @dataclass(frozen=True)

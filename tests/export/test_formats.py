@@ -15,7 +15,7 @@ import pytest
 from q2r2_control.errors import RecordingError
 from q2r2_control.export import lerobot
 from q2r2_control.export.episodes import EpisodeVectors
-from q2r2_control.export.formats import FORMATS
+from q2r2_control.export.formats import FORMATS, ROBOMIMIC
 from q2r2_control.export.lerobot import SOURCES, join_shards, video_key
 from tests.cli.command import q2r2
 from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
@@ -94,6 +94,23 @@ def test_each_episode_is_an_hdf5_file_of_what_act_asks_for_with_the_next_action(
             assert (about["fps"], about["task"], about["cell"]) == (30, episode.task, "two_arms")
             assert (about["recording"], about["note_operator"]) == (f"run-{number + 1}.mcap", "Ada")
             assert (about["sim"], about["action_ahead_frames"], about.get("success")) == (1, 1, episode.success)
+
+
+def test_robomimic_finds_the_same_numbers_in_one_file_of_links(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
+    made = export("hdf5", EPISODES_FOR_ACT, tmp_path, ["a", "b"])
+    moved = made.rename(tmp_path / "elsewhere")
+    with h5py.File(moved / ROBOMIMIC) as file:
+        assert json.loads(file["data"].attrs["env_args"])["env_name"] == "two_arms"
+        assert file["data"].attrs["total"] == 65
+        for number, episode in enumerate(EPISODES_FOR_ACT):
+            demo = file[f"data/demo_{number}"]
+            assert demo.attrs["num_samples"] == episode.frames
+            np.testing.assert_array_equal(demo["obs/qpos"], episode.vectors["observation.state"])
+            np.testing.assert_array_equal(demo["actions"][:-1], episode.vectors["action"][1:])
+            np.testing.assert_array_equal(demo[f"obs/{CAMERA}"], list(episode.cameras[CAMERA]))
+            assert np.flatnonzero(demo["dones"]).tolist() == [episode.frames - 1]
+            assert demo["rewards"][-1] == bool(episode.success)
 
 
 ACTION = {"dtype": "float32", "shape": [2], "names": ["left_A1", "left_A2"]}
