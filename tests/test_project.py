@@ -75,7 +75,7 @@ def imported(files: Iterable[Path]) -> set[str]:
 
 
 def test_every_dependency_is_imported_by_the_package_and_everything_that_is_imported_is_one() -> None:
-    optional = modules("bench", "xacro", "export", "lerobot", "modbus", "web")
+    optional = modules("bench", "xacro", "export", "gym", "lerobot", "modbus", "web")
     assert modules() <= imported(OTHERS)
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
     built = {file.parent.name for file in (ROS / "interfaces").glob("*/package.xml")}
