@@ -65,7 +65,8 @@ test-lerobot: $(LEROBOT)/.installed
 $(LEROBOT)/.installed: pyproject.toml setup.py
 	$(PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
-	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' 'pytest>=8' 'hypothesis>=6.100'
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' --editable plugins/lerobot_robot_q2r2 \
+		'pytest>=8' 'hypothesis>=6.100'
 	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # its loader needs torch, which is there
 	touch $@
 

@@ -170,7 +170,9 @@ def prose(file: Path) -> Iterator[str]:
 
 def test_sentences_open_with_their_subject() -> None:
     files = [
-        file for name in (PACKAGE, "tests", "benchmarks", "examples", "robots") for file in (ROOT / name).rglob("*.py")
+        file
+        for name in (PACKAGE, "tests", "benchmarks", "examples", "plugins", "robots")
+        for file in (ROOT / name).rglob("*.py")
     ]
     opening = re.compile(r"\b(?:What|Whatever|Whoever) .*|^So .*|[.!?]\sSo .*")
     found = {file.name: hit[0] for file in [*PAGES, *files] for text in prose(file) if (hit := opening.search(text))}
