@@ -14,13 +14,15 @@ class StepPromises:
 
     def __init__(self) -> None:
         self._why: dict[str, str] = {}  # arm -> its last event
-        self._held: dict[str, None] = {}  # what was held back in this step, in the order of time
+        self._held: dict[str, None] = {}  # arms and grippers in this step, in the order of time
+        self._limits: dict[str, dict[str, None]] = {}  # of what kind -> joints or pairs
         self.begin()
 
     def begin(self) -> None:
         self._distance = self._margin = math.inf
         self._pair, self._certified = "", True
         self._held.clear()
+        self._limits.clear()
 
     def __call__(self, tick: Tick) -> None:
         report = tick.reference.report
@@ -35,14 +37,15 @@ class StepPromises:
         for arm, pair in tick.held_grippers.items():
             self._held[f"{arm} gripper: kept by {', '.join(pair)}"] = None
         for limit in report.binding:
-            self._held[f"{limit.kind}: {', '.join(limit.names)}"] = None
+            self._limits.setdefault(str(limit.kind), {})[" and ".join(limit.names)] = None
 
     def as_info(self) -> dict[str, Any]:
         """As :class:`q2r2_control.gym.task_env.TaskEnv` says."""
+        limits = [f"{kind}: {', '.join(names)}" for kind, names in self._limits.items()]
         return {
             "nearest_distance": self._distance,
             "nearest_pair": self._pair,
             "margin": self._margin,
             "certified": self._certified,
-            "held_back": "; ".join(self._held),
+            "held_back": "; ".join((*self._held, *limits)),
         }

@@ -46,8 +46,8 @@ class TaskEnv(gymnasium.Env):
 
     No action breaks a limit or a distance. ``info["promises"]`` has what a step came to: ``nearest_distance`` [m] of
     any pair, ``nearest_pair``, ``margin`` [m] to the distance that a pair keeps, ``certified``, and in ``held_back``
-    why arms or grippers do less than was asked, or nothing. ``info["measured"]`` has the figures of the judge,
-    ``info["reason"]`` what they lack. A fault that stops the arms ends the episode, with its reason.
+    why arms or grippers do less than was asked, and limits that were reached. ``info["measured"]`` has the figures of
+    the judge, ``info["reason"]`` what they lack. A fault that stops the arms ends the episode, with its reason.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
