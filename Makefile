@@ -62,10 +62,12 @@ LEROBOT := .venv-lerobot
 test-lerobot: $(LEROBOT)/.installed
 	HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/python -m pytest tests/lerobot
 
-$(LEROBOT)/.installed: pyproject.toml setup.py
+$(LEROBOT)/.installed: pyproject.toml setup.py plugins/lerobot_robot_q2r2/pyproject.toml
 	$(PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
-	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[lerobot]' 'pytest>=8' 'hypothesis>=6.100'
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' --editable plugins/lerobot_robot_q2r2 \
+		'pytest>=8' 'hypothesis>=6.100'
+	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # its loader needs torch, which is there
 	touch $@
 
 lint: setup

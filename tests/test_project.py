@@ -75,7 +75,7 @@ def imported(files: Iterable[Path]) -> set[str]:
 
 
 def test_every_dependency_is_imported_by_the_package_and_everything_that_is_imported_is_one() -> None:
-    optional = modules("bench", "xacro", "export", "lerobot", "modbus", "web")
+    optional = modules("bench", "xacro", "export", "gym", "lerobot", "modbus", "web")
     assert modules() <= imported(OTHERS)
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
     built = {file.parent.name for file in (ROS / "interfaces").glob("*/package.xml")}
@@ -170,7 +170,9 @@ def prose(file: Path) -> Iterator[str]:
 
 def test_sentences_open_with_their_subject() -> None:
     files = [
-        file for name in (PACKAGE, "tests", "benchmarks", "examples", "robots") for file in (ROOT / name).rglob("*.py")
+        file
+        for name in (PACKAGE, "tests", "benchmarks", "examples", "plugins", "robots")
+        for file in (ROOT / name).rglob("*.py")
     ]
     opening = re.compile(r"\b(?:What|Whatever|Whoever) .*|^So .*|[.!?]\sSo .*")
     found = {file.name: hit[0] for file in [*PAGES, *files] for text in prose(file) if (hit := opening.search(text))}

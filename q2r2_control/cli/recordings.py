@@ -146,8 +146,9 @@ def export(
 ) -> None:
     """Make a dataset to train on of recordings of q2r2 run --record, an episode each.
 
-    lerobot: a LeRobotDataset, with a video of each camera; needs the extra `lerobot`. hdf5: a file each, for trainers
-    of ACT; needs the extra `export`. csv: tables of the same numbers.
+    lerobot: a LeRobotDataset, with a video of each camera; needs the extra `lerobot`. lerobot-v2.1: the same for openpi
+    and Isaac GR00T. hdf5: a file each, for ACT and robomimic. Both need the extra `export`. csv: tables of the same
+    numbers.
     """
     if (chosen := FORMATS.get(name)) is None:
         raise ConfigError(f"export {name}: allowed: {', '.join(FORMATS)}")
@@ -175,3 +176,5 @@ def export(
     whole = len(made.kept) + len(made.skipped) == len(files)
     count = f"{len(made.kept)} of" if whole else f"{len(made.kept)} episodes of"
     print(f"{output}: {count} {len(files)} recordings at {fps} frames per second")
+    if chosen.advice is not None:
+        print(chosen.advice(output))

@@ -1,21 +1,16 @@
-"""The formats of ``q2r2 export``: CSV, HDF5 and LeRobotDataset.
+"""The formats of ``q2r2 export``: CSV, HDF5 and two LeRobotDatasets.
 
 CSV and HDF5 have a file for each episode; HDF5 is laid out as ``record_sim_episodes.py`` in
-https://github.com/tonyzhaozh/act does it. The package https://github.com/huggingface/lerobot writes a LeRobotDataset of
-each episode, and joins them.
+https://github.com/tonyzhaozh/act does it. A further file shows all episodes as https://github.com/ARISE-Initiative/robomimic
+reads them.
 """
 
 from __future__ import annotations
 
 import csv
-import ctypes
 import json
-import os
-import shutil
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +19,8 @@ import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import EpisodeVectors, Write
+from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
+from q2r2_control.export.lerobot_v21 import join_v21, openpi_config, require_v21, write_v21
 
 _AHEAD = 1  # frames by which actions in HDF5 are
 # Name in the HDF5 file, name of the feature, unit of a joint.
@@ -34,12 +31,12 @@ _DATA = (
 )
 _OPENING, _OPENING_UNIT = "_gripper", "0 closed .. 1 open"
 _COMPRESSION = 1  # of gzip's levels, the fastest
-
-SOURCES = "meta/recordings.json"  # which recording an episode is of; lerobot itself does not read it
-_NAME = "q2r2/recordings"  # datasets have one on the hub, where these are never sent
-# The package asks no hub, and what it and the encoder of videos print are no results of a command.
-_ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1", "SVT_LOG": "1"}
-_CAP_SYS_NICE, _CAPABILITY_VERSION = 23, 0x20080522  # linux/capability.h
+ROBOMIMIC = "robomimic.h5"  # not .hdf5: some trainers of ACT read each file of that name
+# Where robomimic looks in a demonstration, and what it finds there: a link, so numbers and pictures are kept once.
+_LINKS = {
+    **{"actions": "action", "rewards": "rewards", "dones": "dones"},
+    **{"obs/qpos": "observations/qpos", "obs/qvel": "observations/qvel"},
+}
 
 
 def write_table(episode: EpisodeVectors, path: Path) -> None:
@@ -98,6 +95,8 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
             data = file.create_dataset(name, data=values)
             data.attrs["names"] = list(labels)
             data.attrs["units"] = [_OPENING_UNIT if label.endswith(_OPENING) else unit for label in labels]
+        for name, flags in zip(("dones", "rewards"), episode.outcome().values(), strict=True):
+            file.create_dataset(name, data=flags.astype(np.float32))
         images = file.create_group("observations/images")
         for camera, pictures in episode.cameras.items():
             # Each picture is packed by itself, so that one can be read without the others.
@@ -109,103 +108,26 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
 
 
 def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
-    """Move HDF5 files into a new ``folder``, as ``episode_0.hdf5`` and so on."""
+    """Move HDF5 files into a new ``folder``, as ``episode_0.hdf5`` and so on, and link to all of them for robomimic."""
+    h5py, total = require_h5py(), 0
     folder.mkdir()
-    for number, file in enumerate(files):
-        file.replace(folder / f"episode_{number}.hdf5")
-
-
-def require_lerobot() -> None:
-    """Raises :class:`ConfigError` where lerobot is not installed; it is not imported, which takes seconds."""
-    if find_spec("lerobot") is None:
-        raise ConfigError("export lerobot needs lerobot: pip install 'q2r2_control[lerobot]'")
-
-
-def video_key(camera: str) -> str:
-    return f"observation.images.{camera}"
-
-
-def write_shard(episode: EpisodeVectors, folder: Path) -> None:
-    """Write a dataset of one episode into a new ``folder``; what is there is removed."""
-    shutil.rmtree(folder, ignore_errors=True)
-    os.environ.update(_ENVIRONMENT)
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    _renounce_real_time()
-    features: dict[str, dict[str, Any]] = {
-        name: {"dtype": "float32", "shape": (len(labels),), "names": list(labels)}
-        for name, labels in episode.names.items()
-    }
-    outcome = {name: flags[:, None] for name, flags in episode.outcome().items()}
-    features |= {name: {"dtype": "bool", "shape": (1,), "names": None} for name in outcome}
-    pictures = {}
-    for camera, shown in episode.cameras.items():
-        features[video_key(camera)] = {"dtype": "video", "shape": shown.size, "names": ["height", "width", "channels"]}
-        pictures[video_key(camera)] = iter(shown)
-    dataset = LeRobotDataset.create(
-        _NAME, episode.fps, features, root=folder, robot_type=episode.cell, use_videos=bool(episode.cameras)
-    )
-    for frame in range(episode.frames):
-        values: dict[str, Any] = {name: rows[frame] for name, rows in (episode.vectors | outcome).items()}
-        values |= {name: next(shown) for name, shown in pictures.items()}
-        dataset.add_frame({**values, "task": episode.task})
-    dataset.save_episode(parallel_encoding=False)  # there are processes enough
-    dataset.finalize()
-    part = {"part": episode.part} if episode.part else {}
-    source = {"episode_index": 0, "recording": episode.recording, **part, "success": episode.success, **episode.notes}
-    (folder / SOURCES).write_text(json.dumps([source]), encoding="utf-8")
-
-
-def join_shards(shards: Sequence[Path], folder: Path) -> None:
-    """Join datasets, at least one, in a new ``folder``. Raises :class:`RecordingError` where their features differ."""
-    sources = [source for shard in shards for source in json.loads((shard / SOURCES).read_text())]
-    _check_alike([json.loads((shard / "meta/info.json").read_text()) for shard in shards], sources)
-    os.environ.update(_ENVIRONMENT)
-    import datasets
-    from lerobot.datasets.aggregate import aggregate_datasets
-
-    # The package datasets keeps copies of tables, which are not for the user's cache.
-    cache, datasets.config.HF_DATASETS_CACHE = datasets.config.HF_DATASETS_CACHE, folder.with_name("cache")
-    try:
-        aggregate_datasets([_NAME] * len(shards), _NAME, roots=list(shards), aggr_root=folder)
-    finally:
-        shutil.rmtree(datasets.config.HF_DATASETS_CACHE, ignore_errors=True)
-        datasets.config.HF_DATASETS_CACHE = cache
-    sources = [source | {"episode_index": number} for number, source in enumerate(sources)]
-    (folder / SOURCES).write_text(json.dumps(sources, indent=4, ensure_ascii=False), encoding="utf-8")
-
-
-def _check_alike(infos: Sequence[dict[str, Any]], sources: Sequence[dict[str, Any]]) -> None:
-    first, first_recording = infos[0], sources[0]["recording"]
-    for info, source in zip(infos, sources, strict=True):
-        cell, recording = info["robot_type"], source["recording"]
-        if cell != first["robot_type"]:
-            raise RecordingError(f"{recording}: of cell {cell}, but {first_recording} of {first['robot_type']}")
-        for name in sorted(first["features"].keys() | info["features"].keys()):
-            feature, wanted = info["features"].get(name), first["features"].get(name)
-            if feature == wanted:
-                continue
-            if "video" in ((feature or {}).get("dtype"), (wanted or {}).get("dtype")):
-                raise RecordingError(
-                    f"{recording}: has not the cameras that {first_recording} has; --no-pictures leaves them out"
-                )
-            raise RecordingError(f"{recording}: {name} has not the numbers that {first_recording} has")
-
-
-def _renounce_real_time() -> None:
-    """Keep threads of the AV1 encoder from SCHED_FIFO, also of root: a control loop must not wait for a video."""
-    if sys.platform != "linux":
-        return
-    import resource
-
-    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
-    libc = ctypes.CDLL(None)
-    header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION, 0)
-    sets = (ctypes.c_uint32 * 6)()  # effective, permitted and inheritable, of capabilities 0 to 31 and of the others
-    if libc.capget(header, sets) == 0:
-        sets[0] &= ~(1 << _CAP_SYS_NICE)
-        sets[1] &= ~(1 << _CAP_SYS_NICE)
-        libc.capset(header, sets)
+    with h5py.File(folder / ROBOMIMIC, "w") as joined:
+        demos = joined.create_group("data")
+        for number, file in enumerate(files):
+            moved = file.replace(folder / f"episode_{number}.hdf5")
+            demo = demos.create_group(f"demo_{number}")
+            with h5py.File(moved) as episode:
+                frames, cell = len(episode["action"]), episode.attrs["cell"]
+                pictures = {
+                    f"obs/{camera}": f"observations/images/{camera}" for camera in episode["observations/images"]
+                }
+            for name, target in (_LINKS | pictures).items():
+                demo[name] = h5py.ExternalLink(moved.name, target)
+            demo.attrs["num_samples"] = frames
+            total += frames
+        # Of an environment it wants to be told, also where it trains without one: type 2 is Gym's.
+        demos.attrs["env_args"] = json.dumps({"env_name": cell, "type": 2, "env_kwargs": {}})
+        demos.attrs["total"] = total
 
 
 @dataclass(frozen=True)
@@ -215,10 +137,12 @@ class Format:
     write: Write
     join: Callable[[Sequence[Path], Path], None]
     require: Callable[[], object] = lambda: None  # raises ConfigError where a package is not installed
+    advice: Callable[[Path], str] | None = None  # what a trainer wants to be told of the output
 
 
 FORMATS = {
     "lerobot": Format(write_shard, join_shards, require_lerobot),
+    "lerobot-v2.1": Format(write_v21, join_v21, require_v21, openpi_config),
     "hdf5": Format(write_hdf5, gather_hdf5, require_h5py),
     "csv": Format(write_table, gather_tables),
 }

@@ -132,8 +132,8 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
     check_tools(frames["reference"][0], frames["reference_tool"][0], robot)
     measured = _known(frames, "opening", arms)
     commanded = _known(frames, "gripper", arms)
-    tools = _continuous(tool_poses(frames["position"], robot))
-    targets = _continuous(frames["target"], tools[0])
+    tools = continuous(tool_poses(frames["position"], robot))
+    targets = continuous(frames["target"], tools[0])
     poses = action_names(robot, ActionSpace.TOOL)
     count = len(tools)
     made: dict[str, tuple[Array, tuple[str, ...]]] = {
@@ -173,7 +173,7 @@ def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> lis
     return [index for index in range(len(arms)) if not unknown[:, index].any()]
 
 
-def _continuous(poses: Array, first: Array | None = None) -> Array:
+def continuous(poses: Array, first: Array | None = None) -> Array:
     """Poses (n, arms, 7) whose quaternions do not change sign from frame to frame.
 
     The first has the sign of ``first`` (arms, 7), or else its largest number is positive.

@@ -143,19 +143,44 @@ class Pipeline:
             raise ConfigError("simulated time: allowed with a plant that is simulated only")
         self._prepare(realtime)
         try:
-            if isinstance(self.input, PolicySource):
-                self.input.prepare(self.robot, realtime)
-            self.input.start()
+            self._start_input(realtime)
             with stop_on_signals(self.stop), few_garbage_collections():
                 self._begin(realtime)
                 return self._run_until(math.inf if duration is None else duration)
         finally:
             self._stopping = False
-            self.requests.clear()
-            try:
-                self.input.close()
-            finally:
-                self.plant.close()
+            self.end()
+
+    def begin(self) -> None:
+        """Begin a run in simulated time whose ticks the caller takes: :meth:`tick`, :meth:`check`, at last :meth:`end`.
+
+        Its arms are not brought to rest, so real ones are refused: raises :class:`ConfigError`.
+        """
+        if isinstance(self.plant, SessionPlant):
+            raise ConfigError("ticks one by one: allowed with a plant that is simulated only")
+        self._prepare(realtime=False)
+        self._start_input(realtime=False)
+        self._begin(realtime=False)
+
+    def check(self) -> None:
+        """Raises :class:`PlantError` where supervision has stopped the arms."""
+        phase = self.supervisor.phase
+        if phase is Phase.STOPPED or (phase is not Phase.ACTIVE and self._sessions is None):
+            fault = self.supervisor.fault
+            raise PlantError("the arms were stopped" if fault is None else sentence(fault))
+
+    def end(self) -> None:
+        """Close input and plant; may be called twice, and before a run."""
+        self.requests.clear()
+        try:
+            self.input.close()
+        finally:
+            self.plant.close()
+
+    def _start_input(self, realtime: bool) -> None:
+        if isinstance(self.input, PolicySource):
+            self.input.prepare(self.robot, realtime)
+        self.input.start()
 
     def make_clock(self, realtime: bool) -> LoopClock:
         """The clock of a run, which begins now; a replay has one of its own."""
@@ -206,10 +231,7 @@ class Pipeline:
         try:
             while not (self._clock.after(duration) or self._stopping):
                 self.tick()
-                phase = self.supervisor.phase
-                if phase is Phase.STOPPED or (phase is not Phase.ACTIVE and self._sessions is None):
-                    fault = self.supervisor.fault
-                    raise PlantError("the arms were stopped" if fault is None else sentence(fault))
+                self.check()
         except BaseException:
             # The arms come first, whatever failed. A part that failed may fail again; the first fault tells more.
             with suppress(Exception):

@@ -36,6 +36,17 @@ def test_a_folder_of_recordings_is_a_folder_of_tables_with_or_without_the_time_b
     assert lengths[0] - lengths[1] >= 10  # the press comes 0.1 s after the beginning
 
 
+def test_the_config_that_trains_openpi_is_printed_behind_its_dataset(
+    recordings: Sequence[Path], tmp_path: Path
+) -> None:
+    pytest.importorskip("pyarrow", reason="the extra export is not installed")
+    result = q2r2("export", "lerobot-v2.1", *map(str, recordings), "--output", str(tmp_path / "circle"))
+    assert result.stdout.startswith(f"{tmp_path / 'circle'}: 2 of 2 recordings at 30 frames per second\n# openpi: 16 ")
+    assert "make_bool_mask(14, -2)" in result.stdout
+    assert 'repo_id="q2r2/circle"' in result.stdout
+    assert (tmp_path / "circle/data/chunk-000/episode_000001.parquet").exists()
+
+
 def test_a_bad_recording_ends_the_export_with_one_line_or_is_skipped(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:

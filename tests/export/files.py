@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +145,7 @@ class Waves:
     frames: int
     seed: int
     size: tuple[int, int, int] = (HEIGHT, WIDTH, 3)
+    config: CameraConfig = field(default_factory=lambda: CameraConfig(position=(1, 0, 1), rpy=(0, 0, 0)))
 
     def __iter__(self) -> Iterator[Pixels]:
         y, x = np.mgrid[:HEIGHT, :WIDTH]

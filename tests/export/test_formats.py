@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.export import formats
+from q2r2_control.export import lerobot
 from q2r2_control.export.episodes import EpisodeVectors
-from q2r2_control.export.formats import FORMATS, SOURCES, join_shards, video_key
+from q2r2_control.export.formats import FORMATS, ROBOMIMIC
+from q2r2_control.export.lerobot import SOURCES, join_shards, video_key
 from tests.cli.command import q2r2
 from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
 
@@ -59,17 +60,25 @@ def test_two_recordings_of_one_name_are_refused(tmp_path: Path) -> None:
         export("csv", EPISODES, tmp_path, ["run", "run"])
 
 
+POSITIONS = ("left_A1", "left_gripper")
+NAMES_FOR_ACT = {"observation.state": POSITIONS, "observation.velocity": POSITIONS[:1], "action": POSITIONS}
+EPISODES_FOR_ACT = [
+    replace(
+        with_pictures(plain, number),
+        names=NAMES_FOR_ACT,
+        vectors={
+            name: plain.vectors["action"][:, : len(labels)] * (1 + at)
+            for at, (name, labels) in enumerate(NAMES_FOR_ACT.items())
+        },
+    )
+    for number, plain in enumerate(EPISODES[:2])
+]
+
+
 def test_each_episode_is_an_hdf5_file_of_what_act_asks_for_with_the_next_action(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
-    positions = ("left_A1", "left_gripper")
-    names = {"observation.state": positions, "observation.velocity": positions[:1], "action": positions}
-    episodes = []
-    for number, plain in enumerate(EPISODES[:2]):
-        numbers = plain.vectors["action"]
-        vectors = {name: numbers[:, : len(labels)] * (1 + at) for at, (name, labels) in enumerate(names.items())}
-        episodes.append(replace(with_pictures(plain, number), names=names, vectors=vectors))
-    made = export("hdf5", episodes, tmp_path, ["a", "b"])
-    for number, episode in enumerate(episodes):
+    made = export("hdf5", EPISODES_FOR_ACT, tmp_path, ["a", "b"])
+    for number, episode in enumerate(EPISODES_FOR_ACT):
         with h5py.File(made / f"episode_{number}.hdf5") as file:
             state, pictures = file["observations/qpos"], file[f"observations/images/{CAMERA}"]
             np.testing.assert_array_equal(state, episode.vectors["observation.state"])
@@ -78,13 +87,30 @@ def test_each_episode_is_an_hdf5_file_of_what_act_asks_for_with_the_next_action(
             np.testing.assert_array_equal(file["action"], [*actions[1:], actions[-1]])
             np.testing.assert_array_equal(pictures, list(episode.cameras[CAMERA]))
             assert pictures.chunks == (1, HEIGHT, WIDTH, 3)
-            assert list(state.attrs["names"]) == list(positions)
+            assert list(state.attrs["names"]) == list(POSITIONS)
             assert list(state.attrs["units"]) == ["rad", "0 closed .. 1 open"]
             assert list(file["observations/qvel"].attrs["units"]) == ["rad/s"]
             about = dict(file.attrs)
             assert (about["fps"], about["task"], about["cell"]) == (30, episode.task, "two_arms")
             assert (about["recording"], about["note_operator"]) == (f"run-{number + 1}.mcap", "Ada")
             assert (about["sim"], about["action_ahead_frames"], about.get("success")) == (1, 1, episode.success)
+
+
+def test_robomimic_finds_the_same_numbers_in_one_file_of_links(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
+    made = export("hdf5", EPISODES_FOR_ACT, tmp_path, ["a", "b"])
+    moved = made.rename(tmp_path / "elsewhere")
+    with h5py.File(moved / ROBOMIMIC) as file:
+        assert json.loads(file["data"].attrs["env_args"])["env_name"] == "two_arms"
+        assert file["data"].attrs["total"] == 65
+        for number, episode in enumerate(EPISODES_FOR_ACT):
+            demo = file[f"data/demo_{number}"]
+            assert demo.attrs["num_samples"] == episode.frames
+            np.testing.assert_array_equal(demo["obs/qpos"], episode.vectors["observation.state"])
+            np.testing.assert_array_equal(demo["actions"][:-1], episode.vectors["action"][1:])
+            np.testing.assert_array_equal(demo[f"obs/{CAMERA}"], list(episode.cameras[CAMERA]))
+            assert np.flatnonzero(demo["dones"]).tolist() == [episode.frames - 1]
+            assert demo["rewards"][-1] == bool(episode.success)
 
 
 ACTION = {"dtype": "float32", "shape": [2], "names": ["left_A1", "left_A2"]}
@@ -120,7 +146,7 @@ def test_episodes_of_different_robots_are_not_one_dataset(
 
 
 def test_without_lerobot_one_line_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(formats, "find_spec", lambda name: None)
+    monkeypatch.setattr(lerobot, "find_spec", lambda name: None)
     (tmp_path / "a.mcap").touch()
     result = q2r2("export", "lerobot", str(tmp_path / "a.mcap"), "--output", str(tmp_path / "out"))
     assert result.exit_code == 2

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ContactPair
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput
@@ -218,3 +219,24 @@ def test_a_torque_that_is_not_renewed_in_time_does_not_throw_a_simulated_arm() -
     loop.listeners.append(lambda tick: loop.freeze(0.09 if len(watch.ticks) % 100 == 0 else 0.0))
     loop.run(3.0, realtime=False)
     assert max(np.abs(tick.state.q - tick.reference.q).max() for tick in watch.ticks) < 0.02
+
+
+@pytest.mark.slow
+def test_ticks_one_by_one_are_those_of_a_run() -> None:
+    watch, loop = Watch(whole := pipeline()), pipeline()
+    whole.run(1.8, realtime=False)
+    ran = [tick.reference.q for tick in watch.ticks][:900]
+    loop.begin()
+    stepped = []
+    for _ in ran:
+        stepped.append(loop.tick().reference.q)
+        loop.check()
+    loop.end()
+    assert np.ptp(stepped, axis=0).max() > 0.01
+    np.testing.assert_array_equal(stepped, ran)
+
+
+def test_ticks_one_by_one_are_refused_with_real_arms_which_nobody_would_bring_to_rest() -> None:
+    loop = Pipeline.from_config(load_config("config/dual_iiwa7_fri.yaml"))
+    with pytest.raises(ConfigError, match="ticks one by one: allowed with a plant that is simulated only"):
+        loop.begin()

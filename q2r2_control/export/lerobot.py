@@ -1,0 +1,127 @@
+"""LeRobotDataset in the format of the package https://github.com/huggingface/lerobot, which writes it itself.
+
+It makes a dataset of each episode, and joins them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.export.episodes import EpisodeVectors
+
+SOURCES = "meta/recordings.json"  # which recording an episode is of; lerobot itself does not read it
+_NAME = "q2r2/recordings"  # datasets have one on the hub, where these are never sent
+# The package asks no hub, and what it and the encoder of videos print are no results of a command.
+_ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1", "SVT_LOG": "1"}
+_CAP_SYS_NICE, _CAPABILITY_VERSION = 23, 0x20080522  # linux/capability.h
+
+
+def require_lerobot() -> None:
+    """Raises :class:`ConfigError` where lerobot is not installed; it is not imported, which takes seconds."""
+    if find_spec("lerobot") is None:
+        raise ConfigError("export lerobot needs lerobot: pip install 'q2r2_control[lerobot]'")
+
+
+def video_key(camera: str) -> str:
+    return f"observation.images.{camera}"
+
+
+def source_of(episode: EpisodeVectors) -> dict[str, Any]:
+    """The entry of an episode in :data:`SOURCES`, without its number."""
+    part = {"part": episode.part} if episode.part else {}
+    return {"recording": episode.recording, **part, "success": episode.success, **episode.notes}
+
+
+def write_sources(sources: Sequence[dict[str, Any]], folder: Path) -> None:
+    numbered = [{"episode_index": number} | source for number, source in enumerate(sources)]
+    (folder / SOURCES).write_text(json.dumps(numbered, indent=4, ensure_ascii=False), encoding="utf-8")
+
+
+def write_shard(episode: EpisodeVectors, folder: Path) -> None:
+    """Write a dataset of one episode into a new ``folder``; what is there is removed."""
+    shutil.rmtree(folder, ignore_errors=True)
+    os.environ.update(_ENVIRONMENT)
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    _renounce_real_time()
+    features: dict[str, dict[str, Any]] = {
+        name: {"dtype": "float32", "shape": (len(labels),), "names": list(labels)}
+        for name, labels in episode.names.items()
+    }
+    outcome = {name: flags[:, None] for name, flags in episode.outcome().items()}
+    features |= {name: {"dtype": "bool", "shape": (1,), "names": None} for name in outcome}
+    pictures = {}
+    for camera, shown in episode.cameras.items():
+        features[video_key(camera)] = {"dtype": "video", "shape": shown.size, "names": ["height", "width", "channels"]}
+        pictures[video_key(camera)] = iter(shown)
+    dataset = LeRobotDataset.create(
+        _NAME, episode.fps, features, root=folder, robot_type=episode.cell, use_videos=bool(episode.cameras)
+    )
+    for frame in range(episode.frames):
+        values: dict[str, Any] = {name: rows[frame] for name, rows in (episode.vectors | outcome).items()}
+        values |= {name: next(shown) for name, shown in pictures.items()}
+        dataset.add_frame({**values, "task": episode.task})
+    dataset.save_episode(parallel_encoding=False)  # there are processes enough
+    dataset.finalize()
+    (folder / SOURCES).write_text(json.dumps([source_of(episode)]), encoding="utf-8")
+
+
+def join_shards(shards: Sequence[Path], folder: Path) -> None:
+    """Join datasets, at least one, in a new ``folder``. Raises :class:`RecordingError` where their features differ."""
+    sources = [source for shard in shards for source in json.loads((shard / SOURCES).read_text())]
+    check_alike([json.loads((shard / "meta/info.json").read_text()) for shard in shards], sources)
+    os.environ.update(_ENVIRONMENT)
+    import datasets
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    # The package datasets keeps copies of tables, which are not for the user's cache.
+    cache, datasets.config.HF_DATASETS_CACHE = datasets.config.HF_DATASETS_CACHE, folder.with_name("cache")
+    try:
+        aggregate_datasets([_NAME] * len(shards), _NAME, roots=list(shards), aggr_root=folder)
+    finally:
+        shutil.rmtree(datasets.config.HF_DATASETS_CACHE, ignore_errors=True)
+        datasets.config.HF_DATASETS_CACHE = cache
+    write_sources(sources, folder)
+
+
+def check_alike(infos: Sequence[dict[str, Any]], sources: Sequence[dict[str, Any]]) -> None:
+    """Raises :class:`RecordingError` for episodes, as their ``info.json`` is, of different cells or features."""
+    first, first_recording = infos[0], sources[0]["recording"]
+    for info, source in zip(infos, sources, strict=True):
+        cell, recording = info["robot_type"], source["recording"]
+        if cell != first["robot_type"]:
+            raise RecordingError(f"{recording}: of cell {cell}, but {first_recording} of {first['robot_type']}")
+        for name in sorted(first["features"].keys() | info["features"].keys()):
+            feature, wanted = info["features"].get(name), first["features"].get(name)
+            if feature == wanted:
+                continue
+            if "video" in ((feature or {}).get("dtype"), (wanted or {}).get("dtype")):
+                raise RecordingError(
+                    f"{recording}: has not the cameras that {first_recording} has; --no-pictures leaves them out"
+                )
+            raise RecordingError(f"{recording}: {name} has not the numbers that {first_recording} has")
+
+
+def _renounce_real_time() -> None:
+    """Keep threads of the AV1 encoder from SCHED_FIFO, also of root: a control loop must not wait for a video."""
+    if sys.platform != "linux":
+        return
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+    libc = ctypes.CDLL(None)
+    header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION, 0)
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted and inheritable, of capabilities 0 to 31 and of the others
+    if libc.capget(header, sets) == 0:
+        sets[0] &= ~(1 << _CAP_SYS_NICE)
+        sets[1] &= ~(1 << _CAP_SYS_NICE)
+        libc.capset(header, sets)

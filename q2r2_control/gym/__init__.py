@@ -1,0 +1,35 @@
+"""Tasks of ``q2r2 demo`` as environments: ``gymnasium.make("q2r2_control.gym:q2r2/Stack-v0")``.
+
+Importing this package registers them. The simulation is imported when the first one is made.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+
+TASKS = ("grasp", "handover", "meet", "stack")
+_MOST_STEPS = 900  # half a minute at 30 Hz
+
+for _task in TASKS:
+    gymnasium.register(
+        f"q2r2/{_task.capitalize()}-v0",
+        "q2r2_control.gym.task_env:TaskEnv",
+        max_episode_steps=_MOST_STEPS,
+        kwargs={"task": _task},
+    )
+
+
+def make_env(
+    n_envs: int = 1, use_async_envs: bool = False, *, task: str = "stack", **options: Any
+) -> AsyncVectorEnv | SyncVectorEnv:
+    """``n_envs`` environments of a task, each in a process of its own where ``use_async_envs``.
+
+    ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`.
+    """
+    made = [partial(gymnasium.make, f"{__name__}:q2r2/{task.capitalize()}-v0", **options)] * n_envs
+    # Spawned: a copy of this process would share its graphics with it.
+    return AsyncVectorEnv(made, context="spawn") if use_async_envs else SyncVectorEnv(made)

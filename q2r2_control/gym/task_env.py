@@ -1,0 +1,190 @@
+"""One task of the demo in MuJoCo, stepped by actions that go through the door of policies and no other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+from gymnasium.spaces import Box, Dict
+
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.demo.assembly_tasks import TaskWatch, tasks_named
+from q2r2_control.errors import PlantError
+from q2r2_control.export.lerobot import video_key
+from q2r2_control.export.sampling import continuous
+from q2r2_control.gym.promises import StepPromises
+from q2r2_control.inputs.policy import ActionSpace, PolicyInput, action_names
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.mujoco_cameras import CellPictures
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+CELL = "config/dual_iiwa7.yaml"
+_FRONT = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=320, height=240)
+_ROUNDING = 1e-9  # [s]
+_REACH = 2.0  # from the world's origin, of any tool along any axis [m]
+
+Observed = dict[str, npt.NDArray[Any]]
+
+
+class TaskEnv(gymnasium.Env):
+    """A task of :data:`q2r2_control.demo.assembly_tasks.TASKS`, with 1 as reward when its judge says that it is done.
+
+    Observations and actions have the numbers of the datasets' features, in their order: ``action_names`` has those of
+    the ``space``, openings of grippers behind. An action is followed for 1 / ``rate`` [s], and the observation after n
+    steps is frame n of a dataset at this rate. ``spread`` [m]: how far the task's parts lie from their places at most,
+    along x and y, as the seed has it. ``pictures``: with those of the cell's cameras, or of one in front of it.
+
+    No action breaks a limit or a distance. ``info["promises"]`` has what a step came to: ``nearest_distance`` [m] of
+    any pair, ``nearest_pair``, ``margin`` [m] to the distance that a pair keeps, ``certified``, and in ``held_back``
+    why arms or grippers do less than was asked, and limits that were reached. ``info["measured"]`` has the figures of
+    the judge, ``info["reason"]`` what they lack. A fault that stops the arms ends the episode, with its reason.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        cell: Config | Path | str = CELL,
+        space: ActionSpace | str = ActionSpace.JOINTS,
+        rate: float = 30.0,
+        spread: float = 0.01,
+        pictures: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        """Raises :class:`ConfigError` for an unknown task or space, and a cell that lacks a part of the task."""
+        config = cell if isinstance(cell, Config) else load_config(cell)
+        if not config.cameras:
+            config = config.model_copy(update={"cameras": {"front": _FRONT}})
+        self.render_mode = render_mode
+        self._config, self._rate, self._spread, self._pictures = config, rate, spread, pictures
+        self.metadata = {**self.metadata, "render_fps": rate}
+        self.tasks = tasks_named([task])
+        self.task = self.tasks[0].about
+        self._robot = Robot.from_config(config)
+        self._plant = MujocoPlant(self._robot, config)
+        self._policy = PolicyInput(space=space, rate=rate)
+        self._pipeline = Pipeline(config, self._robot, self._policy, self._plant)
+        self._camera: CellPictures | None = None
+        self._tools: Array | None = (
+            None  # (arms, 7) of the last observation, whose quaternions the next ones go on from
+        )
+        grippers = tuple(f"{arm}_gripper" for arm in self._robot.arms if arm in self._plant.gripper_openings())
+        self.action_names = (*action_names(self._robot, self._policy.space), *grippers)
+        self.action_space = self._actions(len(grippers))
+        self.observation_space = self._observations(len(grippers))
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observed, dict[str, Any]]:
+        """Both arms at home, and the parts where the seed lays them."""
+        super().reset(seed=seed)
+        self._pipeline.end()
+        self._watch = TaskWatch(self.tasks, self._plant, self._robot, self._config)
+        self._promises = StepPromises()
+        self._pipeline.listeners[:] = [self._watch, self._promises]
+        self._pipeline.begin()
+        self._scatter()
+        self._start = self._now = self._pipeline.tick().now
+        self._steps, self._tools = 0, None
+        return self._observed(), self._info("")
+
+    def step(self, action: npt.ArrayLike) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
+        self._policy.send(action, names=self.action_names)
+        self._promises.begin()
+        self._steps += 1
+        # Up to the newest tick at or before the end of the step.
+        last = self._start + self._steps / self._rate - 1.0 / self._config.loop_rate_hz + _ROUNDING
+        fault = ""
+        try:
+            while self._now <= last:
+                self._now = self._pipeline.tick().now
+                self._pipeline.check()
+        except PlantError as error:
+            fault = str(error)
+        info = self._info(fault)
+        done = info["is_success"]
+        return self._observed(), float(done), done or bool(fault), False, info
+
+    def render(self) -> npt.NDArray[np.uint8] | None:
+        """The picture (height, width, 3) of the first camera; None without ``render_mode``."""
+        return None if self.render_mode is None else self._take([next(iter(self._config.cameras))])[0]
+
+    def close(self) -> None:
+        self._pipeline.end()
+
+    def _info(self, fault: str) -> dict[str, Any]:
+        (result,) = self._watch.results()
+        return {
+            "is_success": result.succeeded and not fault,
+            "reason": fault or result.reason,
+            "measured": result.measured,
+            "promises": self._promises.as_info(),
+        }
+
+    def _scatter(self) -> None:
+        model, data = self._plant.model, self._plant.data
+        for part in self.tasks[0].parts:
+            at = model.jnt_qposadr[model.body(part).jntadr[0]]
+            data.qpos[at : at + 2] += self.np_random.uniform(-self._spread, self._spread, 2)
+        mujoco.mj_forward(model, data)
+
+    def _observed(self) -> Observed:
+        observation = self._policy.observation
+        assert observation is not None
+        state = observation.state
+        poses = np.array([[pin.SE3ToXYZQUAT(tool) for tool in observation.tools.values()]])
+        self._tools = tools = continuous(poses, self._tools)[0]
+        seen = {
+            "observation.state": np.hstack((state.q, list(observation.openings.values()))),
+            "observation.velocity": state.v,
+            "observation.effort": state.tau,
+            "observation.tool": tools.ravel(),
+        }
+        made: Observed = {name: values.astype(np.float32) for name, values in seen.items()}
+        if self._pictures:
+            cameras = list(self._config.cameras)
+            made |= zip(map(video_key, cameras), self._take(cameras), strict=True)
+        return made
+
+    def _take(self, cameras: list[str]) -> list[npt.NDArray[np.uint8]]:
+        self._camera = self._camera or CellPictures(self._plant.model, self._config.cameras)
+        self._camera.place(self._plant.observed_qpos)
+        return [self._camera.take(camera) for camera in cameras]
+
+    def _actions(self, grippers: int) -> Box:
+        robot, gate = self._robot, self._config.teleop.gate
+        if self._policy.space is ActionSpace.JOINTS:
+            low, high = robot.position_lower, robot.position_upper
+        elif self._policy.space is ActionSpace.TOOL:
+            high = np.tile([_REACH] * 3 + [1.0] * 4, len(robot.arms))
+            low = -high
+        else:  # as far as one action may be from the next
+            most = min(gate.max_jump, gate.max_speed / self._rate) / math.sqrt(3.0)
+            most_angle = min(gate.max_rotation_jump, gate.max_angular_speed / self._rate) / math.sqrt(3.0)
+            high = np.tile([most] * 3 + [most_angle] * 3, len(robot.arms))
+            low = -high
+        return Box(
+            np.hstack((low, np.zeros(grippers))).astype(np.float32),
+            np.hstack((high, np.ones(grippers))).astype(np.float32),
+        )
+
+    def _observations(self, grippers: int) -> Dict:
+        joints = len(self._robot.joint_names)
+        sizes = {"state": joints + grippers, "velocity": joints, "effort": joints, "tool": 7 * len(self._robot.arms)}
+        spaces: dict[str, Box] = {f"observation.{name}": Box(-np.inf, np.inf, (size,)) for name, size in sizes.items()}
+        if self._pictures:
+            shapes = {name: (camera.height, camera.width, 3) for name, camera in self._config.cameras.items()}
+            spaces |= {video_key(name): Box(0, 255, shape, np.uint8) for name, shape in shapes.items()}
+        return Dict(spaces)

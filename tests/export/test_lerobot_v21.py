@@ -1,0 +1,145 @@
+"""A LeRobotDataset v2.1 has every number, picture and task where openpi and GR00T look for them.
+
+The loaders themselves read it in tests/lerobot.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.export import lerobot_v21
+from q2r2_control.export.lerobot_v21 import DESCRIPTION, openpi_config, openpi_names
+from tests.cli.command import q2r2
+from tests.export.files import EPISODES, HEIGHT, WIDTH, Waves
+from tests.export.test_formats import export
+
+parquet = pytest.importorskip("pyarrow.parquet", reason="the extra export is not installed")
+av = pytest.importorskip("av", reason="the extra export is not installed")
+
+JOINTS = ("left_A1", "left_A2", "right_A1", "right_A2")
+POSITIONS = (*JOINTS, "left_gripper", "right_gripper")
+NAMES = {"observation.state": POSITIONS, "action": POSITIONS, "intervention": ("left", "right")}
+LEFT_LINK = CameraConfig(position=(1, 0, 1), rpy=(0, 0, 0), link="left_hand_e_base")
+SEEN = [
+    replace(
+        plain,
+        names=NAMES,
+        vectors={
+            name: np.random.default_rng(seed).normal(size=(plain.frames, len(labels))).astype(np.float32)
+            for name, labels in NAMES.items()
+        },
+        cameras={"front": Waves(plain.frames, seed), "hand": Waves(plain.frames, seed + 9, config=LEFT_LINK)},  # type: ignore[dict-item]
+    )
+    for seed, plain in enumerate(EPISODES)
+]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export("lerobot-v2.1", SEEN, tmp_path_factory.mktemp("v21"), ["1", "2", "3"])
+
+
+def lines(file: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+def test_every_episode_has_a_table_of_its_numbers_and_tasks_are_numbered_over_all(dataset: Path) -> None:
+    tasks = {line["task_index"]: line["task"] for line in lines(dataset / "meta/tasks.jsonl")}
+    stats = lines(dataset / "meta/episodes_stats.jsonl")
+    before = 0
+    for number, episode in enumerate(SEEN):
+        table = parquet.read_table(dataset / f"data/chunk-000/episode_{number:06d}.parquet").to_pydict()
+        for name, values in episode.vectors.items():
+            np.testing.assert_array_equal(np.array(table[name], dtype=np.float32), values)
+            np.testing.assert_allclose(stats[number]["stats"][name]["std"], values.std(axis=0), rtol=1e-5)
+        assert table["index"] == [*range(before, before + episode.frames)]
+        assert {tasks[index] for index in table[DESCRIPTION]} == {episode.task}
+        assert table["task_index"] == table[DESCRIPTION]
+        assert table["timestamp"][-1] == pytest.approx((episode.frames - 1) / episode.fps)
+        before += episode.frames
+    assert lines(dataset / "meta/episodes.jsonl")[1] == {"episode_index": 1, "tasks": ["circle"], "length": 25}
+    info = json.loads((dataset / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["total_frames"], info["total_videos"]) == ("v2.1", 125, 6)
+    assert set(table) == {name for name, feature in info["features"].items() if feature["dtype"] != "video"}
+
+
+def test_every_frame_is_at_its_time_in_the_video_of_the_camera_under_openpis_name(dataset: Path) -> None:
+    for camera, name in (("front", "cam_high"), ("hand", "cam_left_wrist")):
+        file = dataset / f"videos/chunk-000/observation.images.{name}/episode_000001.mp4"
+        with av.open(str(file)) as video:
+            shown = [(frame.time, frame.to_ndarray(format="rgb24")) for frame in video.decode(video=0)]
+        assert [time for time, _ in shown] == pytest.approx([frame / 30 for frame in range(25)], abs=1e-4)
+        for (_, found), wanted in zip(shown, SEEN[1].cameras[camera], strict=True):
+            assert found.shape == (HEIGHT, WIDTH, 3)
+            assert np.abs(found.astype(float) - wanted).mean() < 6
+
+
+def test_parts_of_the_robot_are_the_numbers_that_gr00t_cuts_out(dataset: Path) -> None:
+    modality = json.loads((dataset / "meta/modality.json").read_text())
+    for what in ("state", "action"):
+        cut = {name: POSITIONS[part["start"] : part["end"]] for name, part in modality[what].items()}
+        assert cut == {
+            "left_arm": ("left_A1", "left_A2"),
+            "right_arm": ("right_A1", "right_A2"),
+            "left_gripper": ("left_gripper",),
+            "right_gripper": ("right_gripper",),
+        }
+    assert modality["video"]["cam_high"] == {"original_key": "observation.images.cam_high"}
+    assert modality["annotation"] == {"human.action.task_description": {}}
+
+
+def test_the_config_for_openpi_is_python_and_leaves_grippers_absolute(dataset: Path) -> None:
+    config = openpi_config(dataset)
+    ast.parse(config)
+    assert "make_bool_mask(4, -2)" in config
+    assert '"cam_left_wrist": "observation.images.cam_left_wrist"' in config
+    assert "cam_right_wrist" not in config
+
+
+def camera(**where: str) -> CameraConfig:
+    return CameraConfig.model_validate(
+        where if "topic" in where else {"position": (1, 0, 1), "rpy": (0, 0, 0), **where}
+    )
+
+
+@pytest.mark.parametrize(
+    ("cameras", "names"),
+    [
+        pytest.param(
+            {"a": camera(link="left_tool"), "b": camera(link="right_tool"), "c": camera()},
+            {"a": "cam_left_wrist", "b": "cam_right_wrist", "c": "cam_high"},
+            id="by link",
+        ),
+        pytest.param(
+            {"left_view": camera(topic="/a"), "front": camera(topic="/b"), "side": camera(topic="/c")},
+            {"left_view": "cam_left_wrist", "front": "cam_high", "side": "side"},
+            id="by name where a link is not known, and one of each",
+        ),
+        pytest.param(
+            {"front": camera(), "cam_high": camera()},
+            {"front": "front", "cam_high": "cam_high"},
+            id="a name of openpi's stays",
+        ),
+    ],
+)
+def test_a_camera_is_named_as_openpi_names_one_in_its_place(
+    cameras: Mapping[str, CameraConfig], names: dict[str, str]
+) -> None:
+    assert openpi_names({name: Waves(1, 0, config=config) for name, config in cameras.items()}) == names  # type: ignore[misc]
+
+
+def test_without_pyarrow_one_line_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lerobot_v21, "find_spec", lambda name: None)
+    (tmp_path / "a.mcap").touch()
+    result = q2r2("export", "lerobot-v2.1", str(tmp_path / "a.mcap"), "--output", str(tmp_path / "out"))
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert "pip install 'q2r2_control[export]'" in result.stderr

@@ -1,0 +1,169 @@
+"""Tasks as environments: repeatable by their seed, done by the work of the demo, and with every promise."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+import pytest
+
+pytest.importorskip("gymnasium", reason="the extra gym is not installed")
+
+import gymnasium
+from gymnasium.utils.env_checker import check_env
+
+from q2r2_control import gym
+from q2r2_control.demo.assembly_tasks import TASKS
+from q2r2_control.gym.task_env import TaskEnv
+from q2r2_control.inputs.assembly import HOME, WORKS, WayPoints
+from q2r2_control.inputs.policy import ActionSpace
+from q2r2_control.types import SIDES
+from tests.demo.test_assembly_tasks import coarse
+from tests.support.pictures import needs_opengl
+
+ROOT = Path(__file__).resolve().parents[2]
+RATE = 30.0
+
+
+def make(task: str = "grasp", **options: Any) -> TaskEnv:
+    return TaskEnv(task, cell=coarse(), rate=RATE, **options)
+
+
+@cache
+def shared() -> TaskEnv:
+    return make()
+
+
+def test_every_task_is_registered_and_lasts_as_long_as_its_work_takes() -> None:
+    assert set(gym.TASKS) == set(TASKS)
+    for task in gym.TASKS:
+        spec = gymnasium.spec(f"q2r2/{task.capitalize()}-v0")
+        assert spec.kwargs == {"task": task}
+        assert spec.max_episode_steps is not None
+        assert spec.max_episode_steps >= RATE * WORKS[task].duration
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("space", list(ActionSpace))
+def test_gymnasiums_own_checks_pass(space: ActionSpace) -> None:
+    check_env(make(space=space), skip_render_check=True)
+
+
+def script(task: str, env: TaskEnv, step: int) -> npt.NDArray[np.float32]:
+    """The work of the demo's hands as tool poses and openings."""
+    work, t, poses, openings = WORKS[task], step / RATE, [], []
+    for arm in SIDES:
+        points = work.tools.get(arm, ((1.0, *HOME[arm], 0.0, 0.0),))
+        place, turn = WayPoints(((0.0, *HOME[arm], 0.0, 0.0), *points)).at(t)
+        down = pin.exp3(np.pi * np.eye(3)[1])
+        poses.append(pin.SE3ToXYZQUAT(pin.SE3(pin.exp3(turn) @ down, place)))
+        openings.append(float(sum(press <= t for press in work.presses.get(arm, ())) % 2 == 0))
+    return np.hstack((*poses, openings)).astype(np.float32)
+
+
+@pytest.mark.slow
+def test_the_work_of_the_demo_earns_the_reward_and_keeps_every_promise() -> None:
+    env = make("grasp", space="action.tool", spread=0.0)
+    env.reset(seed=0)
+    rewards, held = [], set()
+    for step in range(int(RATE * WORKS["grasp"].duration) + 30):
+        _, reward, terminated, _, info = env.step(script("grasp", env, step))
+        rewards.append(reward)
+        held.add(info["promises"]["held_back"])
+        assert info["promises"]["certified"]
+        assert info["promises"]["margin"] >= 0.0
+        assert info["promises"]["nearest_distance"] > 0.0
+        if terminated:
+            break
+    assert rewards[-1] == 1.0
+    assert sum(rewards) == 1.0
+    assert info["is_success"]
+    assert info["measured"]["held_s"] >= 1.0
+
+
+def test_a_seed_lays_the_parts_and_the_same_actions_then_do_the_same() -> None:
+    env, seen = shared(), []
+    for seed in (3, 3, 4):
+        env.reset(seed=seed)
+        place = env._plant.data.body("flat_block").xpos.copy()
+        action = env.reset(seed=seed)[0]["observation.state"]
+        action[0] += 0.01
+        for _ in range(5):
+            observed, *_ = env.step(action)
+        seen.append((place, observed["observation.state"]))
+    np.testing.assert_array_equal(seen[0][0], seen[1][0])
+    np.testing.assert_array_equal(seen[0][1], seen[1][1])
+    assert 0.0 < np.abs(seen[0][0] - seen[2][0]).max() <= 0.02
+
+
+def test_the_arms_follow_small_actions_and_say_why_they_refuse_large_ones() -> None:
+    env = shared()
+    start = env.reset(seed=0)[0]["observation.state"]
+    action = start.copy()
+    action[0] += 0.02
+    for _ in range(30):
+        observed, *_, info = env.step(action)
+    assert observed["observation.state"][0] == pytest.approx(action[0], abs=2e-3)
+    assert info["promises"]["held_back"] == ""
+    rested = observed["observation.state"]
+    for _ in range(10):
+        observed, _, terminated, _, info = env.step(env.action_space.high)
+    assert not terminated
+    assert "allowed: 0.1 m and 0.5 rad" in info["promises"]["held_back"]
+    np.testing.assert_allclose(observed["observation.state"], rested, atol=0.02)
+    action[0] = np.nan
+    *_, info = env.step(action)
+    assert "nan" in info["promises"]["held_back"]
+
+
+def test_steps_end_at_frames_of_a_dataset_at_the_rate() -> None:
+    env = shared()
+    still = env.reset(seed=0)[0]["observation.state"]
+    start = env._now
+    for step in range(1, 40):
+        env.step(still)
+        assert 0.0 <= start + step / RATE - env._now + 1e-9 < 1.0 / coarse().loop_rate_hz
+
+
+@pytest.mark.slow
+def test_the_example_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture[str]) -> None:
+    found = re.search(r"```python\n(import gymnasium.*?)```", (ROOT / "docs/policies.md").read_text(), re.DOTALL)
+    assert found is not None
+    exec(found[1], {})
+    assert "yellow_block on blue_block on green_block for the last 0.0 s" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_two_environments_run_in_processes_of_their_own() -> None:
+    envs = gym.make_env(2, use_async_envs=True, task="handover", cell=coarse())
+    try:
+        observed, infos = envs.reset(seed=[1, 2])
+        assert observed["observation.state"].shape == (2, 16)
+        observed, rewards, *_, infos = envs.step(observed["observation.state"])
+        assert rewards.tolist() == [0.0, 0.0]
+        assert (infos["promises"]["nearest_distance"] > 0.02).all()
+    finally:
+        envs.close()
+
+
+@pytest.mark.slow
+def test_pictures_are_observed_and_rendered_without_a_window() -> None:
+    needs_opengl()
+    code = (
+        "import gymnasium\n"
+        "env = gymnasium.make('q2r2_control.gym:q2r2/Stack-v0', pictures=True, render_mode='rgb_array')\n"
+        "seen, _ = env.reset(seed=0)\n"
+        "assert env.observation_space.contains(seen)\n"
+        "print((seen['observation.images.front'] == env.render()).all(), env.render().std() > 10)\n"
+    )
+    environment = {"MUJOCO_GL": "egl", **os.environ}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert run.stdout.split() == ["True", "True"], run.stderr
