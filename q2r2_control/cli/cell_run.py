@@ -14,6 +14,7 @@ from rich.console import Console
 
 from q2r2_control.cli.output import (
     as_json_text,
+    late_line,
     notice_of_compiling,
     recording_line,
     say,
@@ -178,6 +179,8 @@ def print_summary(run: CellRun, json: bool) -> None:
     console = Console()
     print_table(summary_table(run.summary), console)
     _print_lines(console, map(task_line, run.tasks))
+    if (late := late_line(run.summary, run.tasks)) is not None:
+        _print_lines(console, [late])
     if run.recording is not None:
         _print_lines(console, _recording_lines(run.recording))
 

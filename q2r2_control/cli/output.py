@@ -26,6 +26,7 @@ from q2r2_control.teleop.arm_states import ArmState, is_fault
 from q2r2_control.viewer.tables import figure_table, print_table
 from q2r2_control.wording import sentence
 
+_LATE = 2e4  # a loop that was late by more may be why a task failed [us]
 _COMPILING = "compiling the controller for this machine, once for each version of its code; 1-2 minutes"
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
@@ -163,6 +164,14 @@ def task_line(task: TaskResult) -> str:
     )
     verdict = "[green]succeeded[/]" if task.succeeded else f"[red]failed[/]: {escape(task.reason)}"
     return f"{task.name} {verdict} ({figures})"
+
+
+def late_line(summary: RunSummary, tasks: Iterable[TaskResult]) -> str | None:
+    """One line of markup where a task failed in a run whose loop was late; else None."""
+    late = summary.lateness_us.max
+    if late is None or late < _LATE or all(task.succeeded for task in tasks):
+        return None
+    return f"[yellow]the loop was late by up to {1e-3 * late:.0f} ms[/]: this computer is too busy or slow to judge by"
 
 
 def recording_line(recording: RecordingSummary) -> str:

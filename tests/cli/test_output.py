@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from q2r2_control import Pipeline, RunSummary
-from q2r2_control.cli.output import recording_line, summary_table, task_line
+from q2r2_control.cli.output import late_line, recording_line, summary_table, task_line
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.recording.recorder import RecordingSummary
@@ -123,6 +123,17 @@ def test_a_task_is_told_in_one_line_with_what_was_measured_and_what_fell_short()
     assert task_line(TaskResult("grasp", True, measured, "")) == f"grasp [green]succeeded[/] {figures}"
     fallen = TaskResult("grasp", False, measured, "bar: fell 30 mm")
     assert task_line(fallen) == f"grasp [red]failed[/]: bar: fell 30 mm {figures}"
+
+
+def test_a_failed_task_is_told_with_how_late_the_loop_was(summary: RunSummary) -> None:
+    failed, done = TaskResult("grasp", False, {}, "bar: fell 30 mm"), TaskResult("stack", True, {}, "")
+    late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 239_400.0))
+    line = late_line(late, [done, failed])
+    assert line is not None
+    assert "late by up to 239 ms" in line
+    assert late_line(late, [done]) is None
+    assert late_line(replace(summary, lateness_us=Percentiles(60.0, 310.0, 900.0)), [failed]) is None
+    assert late_line(summary, [failed]) is None, "simulated time is never late"
 
 
 def test_lost_pictures_are_said_with_the_reason() -> None:

@@ -67,7 +67,7 @@ class AnsweringProcess:
     def receive(self) -> list[SessionState]:
         """The states that have come since the last call. Raises :class:`PlantError` where the process has ended."""
         states = []
-        with suppress(BlockingIOError):
+        with suppress(BlockingIOError, ConnectionError):
             while True:
                 said = pickle.loads(self._link.recv(_LARGEST))
                 if isinstance(said, RuntimeError):

@@ -117,7 +117,7 @@ class MessageClock:
         """``arrival`` of the first message."""
         self._taken, self.expected = 1, arrival  # messages so far, and the time of the newest
 
-    def take(self, arrival: float, passed: float) -> None:
+    def update(self, arrival: float, passed: float) -> None:
         """A newer message, ``passed`` [s] after the one before by the cabinet's clock."""
         self._taken += 1
         expected = self.expected + passed

@@ -101,7 +101,7 @@ class FriCell:
     def _counts(self) -> dict[str, tuple[int, int]]:
         return {arm: (state.ended, state.overtaken) for arm, state in self.states.items()}
 
-    def take(self, now: float, send: Callable[[], bool]) -> None:
+    def send_or_withdraw(self, now: float, send: Callable[[], bool]) -> None:
         """Send a tick's commands at ``now`` [s], or withdraw them where answers may be ahead of them already."""
         late = any(state.following and state.latest(now) > self._start for state in self.states.values())
         self._withdraws = late or not send()

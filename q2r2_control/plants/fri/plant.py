@@ -140,7 +140,7 @@ class FriPlant:
         assert self._answering is not None
         packed = pickle.dumps(self.cell.apply(command))
         self.states()
-        self.cell.take(time.monotonic(), partial(self._answering.send, packed))
+        self.cell.send_or_withdraw(time.monotonic(), partial(self._answering.send, packed))
         for arm, gripper in self.grippers.items():
             if arm in command.grippers:
                 gripper.command(float(command.grippers[arm]))

@@ -141,7 +141,7 @@ class ArmSession:
         elif passed == 0 and (before is None or message.counter != before.counter):
             self._clock = MessageClock(now)
         elif passed > 0:
-            self._clock.take(now, passed * message.period)
+            self._clock.update(now, passed * message.period)
         if passed > 0 and before is not None:
             state.lost += passed - 1
             speed = np.subtract(message.q, before.q) / (passed * message.period)

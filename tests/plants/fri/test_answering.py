@@ -105,3 +105,9 @@ def test_a_loop_whose_process_was_killed_is_told(between: Between) -> None:
 
     eventually(is_told)
     assert not between.process.send(pickle.dumps({}))
+
+
+def test_a_process_that_fails_says_why(between: Between) -> None:
+    between.process.send(pickle.dumps({"middle": None}))
+    with pytest.raises(PlantError, match="the cabinets are answered no more: 'middle'"):
+        eventually(between.hear)

@@ -31,7 +31,7 @@ def answered(period: float, drift: float, jitter: float, loss: float, seed: int,
             path.extend(ticks * TICK, *swing(ticks * TICK), np.array([ACCELERATION]))
         if random.random() < loss:
             continue  # the question
-        clock.take(arrival, (question + 1 - before) * period)
+        clock.update(arrival, (question + 1 - before) * period)
         before = question + 1
         time = times.at(question, clock.expected, question, heard)
         assert time <= path.end, "nothing is extrapolated while our loop is on time"

@@ -102,7 +102,7 @@ class VirtualCabinets:
                 self.cell.update(copy(self.lines[arm].state))
             return True
 
-        self.cell.take(self.now, send)
+        self.cell.send_or_withdraw(self.now, send)
 
     def advance(self, dt: float) -> None:
         """Time passes by itself, until the next tick."""
