@@ -146,7 +146,7 @@ def demo(
     ),
     period: Annotated[
         float, Option(min=1, max=10, help="With --plant fri: between two messages of a cabinet [ms].")
-    ] = 5.0,
+    ] = 10.0,
     duration: Annotated[float | None, Option(help="Ends earlier [s].")] = None,
     fast: Fast = False,
     viewer: Viewer = False,

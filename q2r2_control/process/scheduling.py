@@ -58,11 +58,6 @@ def thread_priority() -> int:
     return os.sched_getparam(0).sched_priority if sys.platform == "linux" else 0
 
 
-def schedule_thread_first(priority: int) -> None:
-    """Let the calling thread run under SCHED_FIFO at ``priority``, where that is permitted."""
-    _schedule_first([0], priority)
-
-
 def schedule_process_as_others() -> None:
     """Take back what :func:`schedule_process_first` did."""
     _schedule_as_others(_threads())
