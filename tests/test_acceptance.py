@@ -1,12 +1,14 @@
-"""An operator over TCP, in real time: tracking, re-anchoring, grippers, and connections that end in mid-motion.
+"""An operator over TCP: tracking, re-anchoring and grippers, and connections that end in mid-motion.
 
-Assertions about time allow for the machine's own delays, as measured; those about safety do not.
+The session's bytes are real and its time is simulated, so that no machine is too slow to follow a hand. Ends of
+connections are in real time: assertions about time allow for the machine's own delays, as measured; those about safety
+do not.
 """
 
 from __future__ import annotations
 
 import gc
-import json
+import random
 import signal
 import subprocess
 import sys
@@ -14,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,15 +28,53 @@ from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import SIDES, Array, HandSample
+from q2r2_control.types import SIDES, HandSample
+from tests.support.fake_headset import RATE_HZ, send_reading
+from tests.support.headset_server import eventually, registered
+from tests.support.operator_script import HANDS, Reading, Script, acceptance_script
 from tests.support.processes import Watch, cell, changes, speed
 
 pytestmark = pytest.mark.slow
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 SESSION = 15.0  # [s]
-# A tick that stretches the motion by more than this is no measure of tracking, nor is the time until it is made up [s].
-LATE, MADE_UP = 0.005, 0.5
+
+
+class PlayedSession(HeadsetServer):
+    """A server in simulated time, to which a headset sends by TCP, before each poll, the script's part until then."""
+
+    def __init__(self, script: Script) -> None:
+        super().__init__(port=0, clock=lambda: self.now)
+        self.now = 0.0
+        self.sent: dict[str, list[Reading]] = {hand: [] for hand in HANDS}
+        self.stamps: list[float] = []  # of each hand's readings [s]
+        self._script, self._noise = script, random.Random(0)
+
+    def start(self) -> None:
+        super().start()
+        self._headset = registered(self)
+
+    def close(self) -> None:
+        self._headset.close()
+        super().close()
+
+    def poll(self, now: float) -> list[HandSample]:
+        samples: list[HandSample] = []
+        while (due := len(self.stamps) / RATE_HZ) <= min(now, SESSION):
+            self.now = due
+            self.stamps.append(due)
+            self._headset.discard_received()
+            for reading in (self._script.reading(hand, due) for hand in HANDS):
+                send_reading(self._headset, reading, self._noise)
+                self.sent[reading.hand].append(reading)
+
+            def arrived(due: float = due) -> bool:
+                samples.extend(super(PlayedSession, self).poll(now))
+                return any(sample.hand == HANDS[-1] and sample.inputs_stamp == due for sample in samples[-1:])
+
+            eventually(arrived, "the last message of both hands")
+        self.now = now
+        return samples
 
 
 class ClockedServer(HeadsetServer):
@@ -58,8 +98,6 @@ class Live:
     watch: Watch
     summary: RunSummary | None = None
     failure: BaseException | None = None
-    delay: float = 0.0  # of teleoperation [s]
-    sent: list[dict] = field(default_factory=list)  # the fake headset's log
 
     def run(self) -> None:
         try:
@@ -86,13 +124,13 @@ class Live:
 
 
 @contextmanager
-def live(plant: str) -> Iterator[Live]:
+def live() -> Iterator[Live]:
     """A pipeline that listens, until the end of the block; then it is stopped, and a failure of the run raised."""
     server = ClockedServer()
     # Without the solver's time limit, so that a busy machine causes no fallback.
     config = cell().model_copy(update={"control": cell().control.model_copy(update={"solve_time_limit": None})})
-    loop = Pipeline.from_config(config, input=server, plant=plant)
-    run = Live(server, loop, Watch(loop), delay=loop.teleop.delay)
+    loop = Pipeline.from_config(config, input=server, plant="kinematic")
+    run = Live(server, loop, Watch(loop))
     thread = threading.Thread(target=run.run)
     gc.disable()  # it would go through all ticks that the watch keeps, for up to 0.2 s
     thread.start()
@@ -108,28 +146,28 @@ def live(plant: str) -> Iterator[Live]:
         raise run.failure
 
 
+@dataclass
+class Session:
+    """A session that was played, and the ticks of its run."""
+
+    headset: PlayedSession
+    watch: Watch
+    summary: RunSummary
+    delay: float  # of teleoperation [s]
+
+
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Live:
+def session() -> Session:
     """The whole session: both hands move, pause, the left one turns by 120 degrees, resume, close the grippers."""
-    log = tmp_path_factory.mktemp("session") / "sent.jsonl"
-    with live("mujoco") as run:
-        headset = run.headset("--dialect", "ros2", "--duration", str(SESSION), "--log", str(log))
-        assert headset.wait() == 0
-    run.sent = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
-    return run
-
-
-def hand_path(session: Live, hand: str) -> tuple[Array, Array, list[pin.SE3]]:
-    """Times (n,) [s], positions (n, 3) [m] and poses that ``hand`` sent."""
-    sent = [line for line in session.sent if line["hand"] == hand]
-    poses = [pin.XYZQUATToSE3((*line["position"], *line["quaternion"])) for line in sent]
-    return np.array([line["t"] for line in sent]), np.array([pose.translation for pose in poses]), poses
+    headset = PlayedSession(acceptance_script(SESSION))
+    pipeline = Pipeline.from_config(cell(), input=headset, plant="mujoco")
+    watch = Watch(pipeline)
+    return Session(headset, watch, pipeline.run(SESSION, realtime=False), pipeline.teleop.delay)
 
 
 @pytest.mark.parametrize("arm", SIDES)
 class TestSession:
-    def test_the_buttons_engage_pause_and_resume_and_nothing_else_does(self, session: Live, arm: str) -> None:
-        assert session.summary is not None
+    def test_the_buttons_engage_pause_and_resume_and_nothing_else_does(self, session: Session, arm: str) -> None:
         assert changes(session.summary.events, arm)[:4] == [
             ("idle", "engaged", "pressed"),
             ("engaged", "pausing", "pressed"),
@@ -138,7 +176,7 @@ class TestSession:
         ]
 
     def test_the_first_target_after_engaging_and_resuming_is_where_the_tool_was_measured(
-        self, session: Live, arm: str
+        self, session: Session, arm: str
     ) -> None:
         starts = session.watch.engagements(arm)
         assert len(starts) == 2
@@ -148,57 +186,49 @@ class TestSession:
             assert target is not None
             assert np.linalg.norm(target.translation - tick.tools[arm].translation) < 1e-6
             # Nothing jumps afterwards either: the hands still rest.
-            rested = np.searchsorted(session.server.times, session.server.times[index] + 0.1) - 1
-            before, after = tick.tools[arm], session.watch.ticks[rested].tools[arm]
+            rested = next(later for later in session.watch.ticks[index:] if later.t >= tick.t + 0.1)
+            before, after = tick.tools[arm], rested.tools[arm]
             assert np.linalg.norm(after.translation - before.translation) < 1e-3
             assert np.linalg.norm(pin.log3(before.rotation.T @ after.rotation)) < np.radians(0.5)
 
-    def test_the_tool_follows_the_hand_that_was_within_5_mm_and_1_degree(self, session: Live, arm: str) -> None:
-        times, positions, poses = hand_path(session, arm)
-        clock, ticks = session.server.times, session.ticks
+    def test_the_tool_follows_the_hand_that_was_within_5_mm_and_1_degree(self, session: Session, arm: str) -> None:
+        times = np.array(session.headset.stamps)
+        poses = [pin.XYZQUATToSE3((*sent.position, *sent.quaternion)) for sent in session.headset.sent[arm]]
+        positions = np.array([pose.translation for pose in poses])
+        ticks = session.watch.ticks
         shifts, turns, travelled = [], [], []
         for start in session.watch.engagements(arm):
-            anchor, index = poses[np.searchsorted(times, clock[start]) - 1], start
-            tool = ticks[start].tools[arm]
-            late_until = 0.0
-            while index < len(ticks) and ticks[index].engaged[arm] and clock[index] < times[-1]:
-                due = clock[index] - session.delay
-                if ticks[index].dt - ticks[index].step > LATE:
-                    late_until = clock[index] + MADE_UP
-                if due > times[0]:
-                    wanted = np.array([np.interp(due, times, column) for column in positions.T]) - anchor.translation
-                    nearest = poses[int(np.argmin(np.abs(times - due)))]
-                    turn = nearest.rotation @ anchor.rotation.T
-                    got = ticks[index].tools[arm]
-                    travelled.append(np.linalg.norm(wanted))
-                    if clock[index] >= late_until:
-                        shifts.append(np.linalg.norm(got.translation - tool.translation - wanted))
-                        turns.append(np.linalg.norm(pin.log3(got.rotation @ (turn @ tool.rotation).T)))
-                index += 1
-        left_out = f"{len(travelled) - len(shifts)} of {len(travelled)} ticks left out, since the machine was late"
-        print(f"{arm}: {left_out}")
+            anchor, tool = poses[np.searchsorted(times, ticks[start].now) - 1], ticks[start].tools[arm]
+            for tick in ticks[start:]:
+                if not tick.engaged[arm]:
+                    break
+                due = tick.now - session.delay
+                wanted = np.array([np.interp(due, times, column) for column in positions.T]) - anchor.translation
+                turn = poses[int(np.argmin(np.abs(times - due)))].rotation @ anchor.rotation.T
+                got = tick.tools[arm]
+                travelled.append(np.linalg.norm(wanted))
+                shifts.append(np.linalg.norm(got.translation - tool.translation - wanted))
+                turns.append(np.linalg.norm(pin.log3(got.rotation @ (turn @ tool.rotation).T)))
         assert max(travelled) > 0.19, "circles of 0.1 m radius"
-        assert np.sqrt(np.mean(np.square(shifts))) < 5e-3, left_out
-        assert np.degrees(np.sqrt(np.mean(np.square(turns)))) < 1.0, left_out
+        assert np.sqrt(np.mean(np.square(shifts))) < 5e-3
+        assert np.degrees(np.sqrt(np.mean(np.square(turns)))) < 1.0
 
-    def test_the_tool_stands_still_while_the_hand_turns_in_the_pause(self, session: Live, arm: str) -> None:
+    def test_the_tool_stands_still_while_the_hand_turns_in_the_pause(self, session: Session, arm: str) -> None:
         _, resumed = session.watch.engagements(arm)
-        middle = [tick for tick in session.ticks if -1.5 < tick.t - session.watch.ticks[resumed].t < -0.1]
+        middle = [tick for tick in session.watch.ticks if -1.5 < tick.t - session.watch.ticks[resumed].t < -0.1]
         assert len(middle) > 100
         assert max(map(speed, middle)) < 1e-3
         assert np.ptp([tick.tools[arm].translation for tick in middle], axis=0).max() < 1e-4
 
-    def test_the_gripper_closes(self, session: Live, arm: str) -> None:
+    def test_the_gripper_closes(self, session: Session, arm: str) -> None:
         _, second = session.watch.engagements(arm)
         assert session.watch.ticks[second].grippers[arm] > 0.95
         assert session.watch.ticks[-1].grippers[arm] < 0.05
-        assert session.summary is not None
         assert session.summary.arms[arm].gripper_changes == 1
 
 
-def test_the_session_needs_no_fallback_and_ends_at_rest(session: Live) -> None:
+def test_the_session_needs_no_fallback_and_ends_at_rest(session: Session) -> None:
     summary = session.summary
-    assert summary is not None
     assert summary.fallback_ticks == summary.uncertified_ticks == summary.rejected_targets == 0
     assert summary.at_rest
     assert summary.max_velocity_ratio <= 1.0 + 1e-9
@@ -208,7 +238,7 @@ def test_the_session_needs_no_fallback_and_ends_at_rest(session: Live) -> None:
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "silent"])
 def test_both_arms_come_to_rest_when_a_headset_ends_in_mid_motion_and_stay_whatever_the_hands_do(end: int) -> None:
-    with live("kinematic") as run:
+    with live() as run:
         headset = run.headset("--script", "circle", "--dialect", "ros1", "--duration", "20")
         try:
             run.wait_for(

@@ -2,7 +2,7 @@
 
 As a process it plays an operator's session against a running server:
 
-    python -m tests.support.fake_headset --port 10000 --dialect ros2 --script acceptance --duration 20 --log sent.jsonl
+    python -m tests.support.fake_headset --port 10000 --dialect ros2 --script acceptance --duration 20
 """
 
 from __future__ import annotations
@@ -15,10 +15,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 from q2r2_control.quaternions import Quaternion, Vector
@@ -181,19 +178,21 @@ def pack_inputs(
     return b"\0\1\0\0" + struct.pack("<??2x4f", upper, lower, *analog)
 
 
-def play(headset: FakeHeadset, script: Script, duration: float) -> Iterator[tuple[float, Reading]]:
-    """Send the script at RATE_HZ in real time; yields what was sent with its time on ``time.monotonic``."""
+def send_reading(headset: FakeHeadset, reading: Reading, noise: random.Random) -> None:
+    """Send the pose, with a little noise, and the inputs of one hand."""
+    position = tuple(value + noise.gauss(0.0, NOISE) for value in reading.position)
+    headset.send(headset.pose(reading.hand, position, reading.quaternion))
+    headset.send(headset.inputs(reading.hand, reading.upper, reading.lower))
+
+
+def play(headset: FakeHeadset, script: Script, duration: float) -> None:
+    """Send the script at RATE_HZ in real time."""
     start, noise = time.monotonic(), random.Random(0)
     for index in range(int(duration * RATE_HZ)):
-        due = start + index / RATE_HZ
-        time.sleep(max(due - time.monotonic(), 0.0))
+        time.sleep(max(start + index / RATE_HZ - time.monotonic(), 0.0))
         headset.discard_received()
-        for reading in (script.reading(hand, index / RATE_HZ) for hand in HANDS):
-            x, y, z = (value + noise.gauss(0.0, NOISE) for value in reading.position)
-            reading = replace(reading, position=(x, y, z))
-            headset.send(headset.pose(reading.hand, reading.position, reading.quaternion))
-            headset.send(headset.inputs(reading.hand, reading.upper, reading.lower))
-            yield time.monotonic(), reading
+        for hand in HANDS:
+            send_reading(headset, script.reading(hand, index / RATE_HZ), noise)
 
 
 def main() -> int:
@@ -203,24 +202,18 @@ def main() -> int:
     parser.add_argument("--dialect", choices=DIALECTS, default="ros2")
     parser.add_argument("--script", choices=sorted(SCRIPTS), default="acceptance")
     parser.add_argument("--duration", type=float, default=20.0, help="[s]")
-    parser.add_argument("--log", type=Path, help="writes what was sent, a JSON line each")
     arguments = parser.parse_args()
-    sent: list[tuple[float, Reading]] = []
     headset = FakeHeadset(("127.0.0.1", arguments.port), arguments.dialect, connect_timeout=30.0)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         headset.send(headset.registrations())
-        for time_and_reading in play(headset, SCRIPTS[arguments.script](arguments.duration), arguments.duration):
-            sent.append(time_and_reading)
+        play(headset, SCRIPTS[arguments.script](arguments.duration), arguments.duration)
     except KeyboardInterrupt:
         headset.send(headset.pose("left", START["left"], (0.0, 0.0, 0.0, -1.0))[:30])
     except ConnectionError:
         pass
     finally:
         headset.close()
-        if arguments.log is not None:
-            lines = [json.dumps({"t": t, **asdict(reading)}) + "\n" for t, reading in sent]
-            arguments.log.write_text("".join(lines), encoding="utf-8")
     return 0
 
 
