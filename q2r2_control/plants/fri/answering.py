@@ -1,7 +1,8 @@
 """The process that answers the cabinets: it does nothing else, so that no tick of the loop makes a cabinet wait.
 
-The loop sends commands, and gets the state of a session after each message of its cabinet. Where the loop has ended,
-in whatever way, cabinets are answered until the arms have come to rest on their certified stop.
+The loop sends commands, is told whether they came in time, and gets the state of a session after each message of its
+cabinet. Where the loop has ended, in whatever way, cabinets are answered until the arms have come to rest on their
+certified stop.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ import pickle
 import select
 import socket
 import struct
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
@@ -18,15 +18,17 @@ from dataclasses import dataclass
 from subprocess import TimeoutExpired
 
 from q2r2_control.errors import PlantError
-from q2r2_control.plants.fri.session import ArmSession
+from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import LONGEST, read_monitoring
 from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of, start_python
 from q2r2_control.process.scheduling import few_garbage_collections, how_it_ended, real_time, thread_priority
 
+_TAKEN, _TOO_LATE = b"1", b"0"  # a word about commands
 _LARGEST = 1 << 16  # of what is passed on [bytes]
 _POLL = 50  # of looking whether the arms of a loop that has ended stand still [ms]
 _PATIENCE = 5.0  # with a process that is to end [s]
+_LONGEST_WORD = 1.0  # until it says whether commands came in time; arms brake meanwhile [s]
 # Linux stamps datagrams as they arrive (SO_TIMESTAMPNS) by its real-time clock; longer waits are jumps of that [s].
 _TIMESTAMP, _TIMESPEC, _EXTRA, _LONGEST_WAIT = 35, struct.Struct("@qq"), 64, 0.1
 
@@ -46,78 +48,93 @@ class AnsweringProcess:
 
     def __init__(self, lines: Sequence[Line]) -> None:
         """With a line to each cabinet, of which this process may close its sockets then."""
-        self._link, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._link.setblocking(False)
-        files = [theirs.fileno(), *(line.file for line in lines)]
-        with theirs:
-            self._process = start_python(f"from {__name__} import main; main({theirs.fileno()})", {}, files=files)
+        # States that nobody reads may fill their link; a word about commands must not wait for that.
+        self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._states.setblocking(False)
+        self._commands.settimeout(_LONGEST_WORD)
+        links = commands.fileno(), states.fileno()
+        with commands, states:
+            code, files = f"from {__name__} import main; main{links}", [*links, *(line.file for line in lines)]
+            self._process = start_python(code, {}, files=files)
         self.pid = self._process.pid
         # An answer goes before the loop, where that has a priority.
         priority = thread_priority()
-        self._link.send(pickle.dumps((priority and priority + 1, list(lines))))
+        self._commands.send(pickle.dumps((priority and priority + 1, list(lines))))
 
-    def send(self, packed: bytes) -> bool:
-        """Whether pickled commands, by arm, will be taken before the next answer."""
+    def send(self, commands: dict[str, ArmCommand]) -> bool:
+        """Whether commands, by arm, came before every answer that they were for; else none of them is followed.
+
+        Raises :class:`PlantError` where the process has ended, or says nothing.
+        """
         try:
-            self._link.send(packed)
-        except OSError:  # it stands still, or has ended, which :meth:`receive` says
-            return False
-        return True
+            self._commands.send(pickle.dumps(commands))
+            word = self._commands.recv(_LARGEST)
+        except TimeoutError as error:
+            raise PlantError(f"the process that answers the cabinets says nothing for {_LONGEST_WORD:g} s") from error
+        except ConnectionError:
+            word = b""
+        if word not in (_TAKEN, _TOO_LATE):
+            raise self._end(word)
+        return word == _TAKEN
 
     def receive(self) -> list[SessionState]:
         """The states that have come since the last call. Raises :class:`PlantError` where the process has ended."""
         states = []
-        with suppress(BlockingIOError, ConnectionError):
-            while True:
-                said = pickle.loads(self._link.recv(_LARGEST))
-                if isinstance(said, RuntimeError):
-                    raise PlantError(f"the cabinets are answered no more: {said}")
-                values, newest = said
+        with suppress(BlockingIOError):
+            while said := self._states.recv(_LARGEST):
+                values, newest = pickle.loads(said)
                 states.append(SessionState(**values | {"newest": newest and read_monitoring(newest)}))
-        code = self._process.poll()
-        if code is not None:
-            raise PlantError(how_it_ended("the process that answers the cabinets", code))
+            raise self._end()
         return states
+
+    def _end(self, last_word: bytes = b"") -> PlantError:
+        """The way in which the process has ended."""
+        if not last_word:
+            with suppress(OSError):
+                last_word = self._commands.recv(_LARGEST)
+        if last_word:
+            return PlantError(f"the cabinets are answered no more: {last_word.decode()}")
+        return PlantError(how_it_ended("the process that answers the cabinets", self._process.wait(_PATIENCE)))
 
     def close(self) -> None:
         """Let it end as soon as the arms stand still."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
+        self._commands.close()
         try:
             self._process.wait(_PATIENCE)
         except TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._link.close()
+        self._states.close()
 
 
-def main(link: int) -> None:
+def main(commands: int, states: int) -> None:
     """In the process: answer until the loop has ended and the arms stand still."""
     leave_signals_to_the_run()
-    with socket.socket(fileno=link) as opened:
+    with socket.socket(fileno=commands) as from_loop, socket.socket(fileno=states) as to_loop:
         try:
-            priority, lines = pickle.loads(opened.recv(_LARGEST))
-            opened.setblocking(False)
+            priority, lines = pickle.loads(from_loop.recv(_LARGEST))
+            from_loop.setblocking(False)
+            to_loop.setblocking(False)
             with ExitStack() as stack:
                 if priority:
                     stack.enter_context(real_time(priority))
                 stack.enter_context(few_garbage_collections())
-                _Answering(opened, lines).run()
+                _Answering(from_loop, to_loop, lines).run()
         except Exception as error:
-            opened.send(pickle.dumps(RuntimeError(reason_of(error))))
+            from_loop.send(reason_of(error).encode())
 
 
 class _Answering:
-    def __init__(self, link: socket.socket, lines: list[Line]) -> None:
-        self._link = link
+    def __init__(self, commands: socket.socket, states: socket.socket, lines: list[Line]) -> None:
+        self._commands, self._states = commands, states
         self._sessions = {line.session.state.arm: line.session for line in lines}
         self._lines = {line.file: (line, socket.socket(fileno=line.file)) for line in lines}
 
     def run(self) -> None:
-        poll, loop = select.poll(), sys.stdin.fileno()
-        for file in (*self._lines, self._link.fileno()):
+        poll = select.poll()
+        for file in (*self._lines, self._commands.fileno()):
             poll.register(file, select.POLLIN)
-        poll.register(loop, select.POLLHUP)
         for _, opened in self._lines.values():
             with suppress(OSError):
                 while True:  # what came while this process began is too old to be answered
@@ -125,20 +142,22 @@ class _Answering:
         ended = False
         while not (ended and all(session.is_still(time.monotonic()) for session in self._sessions.values())):
             for file, _ in poll.poll(_POLL):
-                self._take_commands()
-                if file == loop:
+                if not (ended or self._take_commands()):
                     ended = True
-                    poll.unregister(loop)
-                elif file in self._lines:
+                    poll.unregister(self._commands)
+                if file in self._lines:
                     self._answer(*self._lines[file])
 
-    def _take_commands(self) -> None:
-        """An answer goes by all that was sent before it."""
-        with suppress(BlockingIOError):
-            while True:
-                commands: dict[str, ArmCommand] = pickle.loads(self._link.recv(_LARGEST))
-                for arm, command in commands.items():
-                    self._sessions[arm].follow(command)
+    def _take_commands(self) -> bool:
+        """Take all that was sent before an answer; returns whether the loop is there."""
+        try:
+            while said := self._commands.recv(_LARGEST):
+                self._commands.send(_TAKEN if follow(self._sessions, pickle.loads(said)) else _TOO_LATE)
+        except BlockingIOError:
+            return True
+        except ConnectionError:
+            pass
+        return False
 
     def _answer(self, line: Line, opened: socket.socket) -> None:
         session, state = line.session, line.session.state
@@ -157,7 +176,7 @@ class _Answering:
         except OSError:  # a cabinet that is gone refuses; its silence is noticed
             return
         with suppress(OSError):  # a loop that stands still gets a later state
-            self._link.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))
+            self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))
 
 
 def open_socket(address: str, port: int) -> socket.socket:

@@ -3,13 +3,13 @@
 **The loop's time and the cabinets'.** Each tick of the loop moves the reference to one period after the tick. The
 cabinets are answered from it a little later (``DELAY``). Where the loop is so late that an answer may pass its end, the
 certified stop is what the cabinets get. :meth:`FriCell.due` then lets the reference follow the same stop first. Where
-an answer may have passed it in the middle of a tick, the command of that tick is withdrawn.
+an answer has passed it in the middle of a tick, the sessions refuse the command of that tick, and it is withdrawn.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pinocchio as pin
@@ -47,7 +47,7 @@ class FriCell:
         self._data = robot.model.createData()
         self._now = self._start = self._end = -math.inf  # of the newest tick, and of its piece of the path [s]
         self._withdraws, self._in_time = False, -math.inf  # the newest command, and when one was not [s]
-        self._told = self._counts()  # of sessions' ends, and of commands that were refused
+        self._told = self._ends()
 
     def update(self, state: SessionState) -> None:
         """A newer state of an arm's session."""
@@ -88,27 +88,25 @@ class FriCell:
 
     def fault(self) -> Reason | None:
         """Why the arms cannot be commanded at the newest tick, or ceased to be since the last call; None: they can."""
-        told, self._told = self._told, self._counts()
+        told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
-            dropped = self._told[arm][0] > told[arm][0]
+            dropped = self._told[arm] > told[arm]
             fault = state.fault(self._now) or (Reason.of(ReasonKind.FRI_DROPPED, arm=arm) if dropped else None)
             if fault is not None:
                 return fault
-        refused = any(self._told[arm][1] > told[arm][1] for arm in told)
         late = self._withdraws and self._now - self._in_time > _NO_COMMANDS
-        return Reason(ReasonKind.FRI_OVERTAKEN) if refused or late else None
+        return Reason(ReasonKind.FRI_OVERTAKEN) if late else None
 
-    def _counts(self) -> dict[str, tuple[int, int]]:
-        return {arm: (state.ended, state.overtaken) for arm, state in self.states.items()}
+    def _ends(self) -> dict[str, int]:
+        return {arm: state.ended for arm, state in self.states.items()}
 
-    def send_or_withdraw(self, now: float, send: Callable[[], bool]) -> None:
-        """Send a tick's commands at ``now`` [s], or withdraw them where answers may be ahead of them already."""
-        late = any(state.following and state.latest(now) > self._start for state in self.states.values())
-        self._withdraws = late or not send()
-        if self._withdraws:
-            self._end = self._start
-        else:
+    def sent(self, taken: bool) -> None:
+        """The commands of a tick were ``taken`` by the sessions, or came too late for one of them."""
+        self._withdraws = not taken
+        if taken:
             self._in_time = self._now
+        else:
+            self._end = self._start
 
     def withdraws(self) -> bool:
         """Whether the newest command came after an answer that it was for: the arms go on along the stop before it."""

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
 import socket
 import time
 from collections import deque
-from functools import partial
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.fri import GripperIoConfig, ModbusGripperConfig
@@ -138,9 +136,7 @@ class FriPlant:
     def apply(self, command: Command) -> None:
         check_command(command, self._robot, self.modes)
         assert self._answering is not None
-        packed = pickle.dumps(self.cell.apply(command))
-        self.states()
-        self.cell.send_or_withdraw(time.monotonic(), partial(self._answering.send, packed))
+        self.cell.sent(self._answering.send(self.cell.apply(command)))
         for arm, gripper in self.grippers.items():
             if arm in command.grippers:
                 gripper.command(float(command.grippers[arm]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -66,13 +67,14 @@ class ArmSession:
             return now - self._tau_came > _TORQUE_GONE
         return bool(np.abs(self.path.at(self.state.answered) - self.path.rest).max() <= _AT_REST)
 
+    def has_passed(self, command: ArmCommand) -> bool:
+        """Whether an answer was for a time of the command's already, and followed the stop before it."""
+        return self.state.following and self.state.answered > command.start
+
     def follow(self, command: ArmCommand) -> None:
-        """Take a tick's command. One for a time that was answered already is refused: the stop goes on to its end."""
+        """Take a tick's command, which no answer has passed."""
         state = self.state
-        if state.following and state.answered > command.start:
-            state.following, state.rest = False, self.path.rest
-            state.overtaken += 1
-        elif not state.following and self._begins(command):
+        if not state.following and self._begins(command):
             state.following = state.fault(command.now) is None
             self.path = ReferencePath(command.start, self.path.rest)
         if state.following and command.end > self.path.end:  # a second command in a tick is no motion
@@ -195,6 +197,15 @@ class ArmSession:
         wanted = self._tau if self.state.following and age <= _TORQUE_LASTS else -self._damping * self.state.velocity
         tau = tuple(np.clip(wanted, -self._torque_limit, self._torque_limit).tolist())
         return Command(self._answers, message.counter, message.ipo_q or message.q, tau, self._outputs)
+
+
+def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:
+    """Let every arm take its command, or none where one of them came too late: both brake together."""
+    if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
+        return False
+    for arm, command in commands.items():
+        sessions[arm].follow(command)
+    return True
 
 
 def _ahead(message: Monitoring, before: Monitoring) -> int:

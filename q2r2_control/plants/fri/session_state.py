@@ -31,7 +31,6 @@ class SessionState:
     rest: Array = field(default_factory=lambda: np.zeros(JOINTS))  # where the arm's path ends [rad]
     following: bool = False
     ended: int = 0  # how often the arm ceased to follow, since the cabinet ended its session
-    overtaken: int = 0  # and since a command came after an answer that it was for
     answered: float = -math.inf  # the latest time that an answer was for
     expected: float = -math.inf  # when the message of that answer would have come, had nothing made it late
     lag: float = 0.0  # of the answers behind where they are to be

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import socket
 from collections.abc import Iterator
@@ -73,7 +72,7 @@ def test_the_loop_gets_the_state_after_each_message_and_an_answer_goes_by_what_w
     assert between.states[-1].took is not None
     still, q = np.zeros(7), np.array(Q)
     command = ArmCommand(0.0, 0.0, 0.001, q, still, 1.0 + still, {"Gripper.Opening": 0.5})
-    assert between.process.send(pickle.dumps({"left": command}))
+    assert between.process.send({"left": command})
     assert between.ask().io == {"Gripper.Opening": 0.5}
 
 
@@ -104,10 +103,11 @@ def test_a_loop_whose_process_was_killed_is_told(between: Between) -> None:
         return False
 
     eventually(is_told)
-    assert not between.process.send(pickle.dumps({}))
+    with pytest.raises(PlantError, match="the process that answers the cabinets"):
+        between.process.send({})
 
 
 def test_a_process_that_fails_says_why(between: Between) -> None:
-    between.process.send(pickle.dumps({"middle": None}))
+    still = np.zeros(7)
     with pytest.raises(PlantError, match="the cabinets are answered no more: 'middle'"):
-        eventually(between.hear)
+        between.process.send({"middle": ArmCommand(0.0, 0.0, 0.001, still, still, 1.0 + still)})

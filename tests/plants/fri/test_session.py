@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.events import ReasonKind
-from q2r2_control.plants.fri.session import ArmSession
+from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand
 from q2r2_control.plants.fri.wire import (
     Command,
@@ -144,7 +144,7 @@ def test_a_drop_is_told_and_the_arm_follows_no_more() -> None:
     assert fault.detail["session"] == "monitoring ready"
 
 
-def test_a_command_for_a_time_that_was_answered_is_refused_and_the_arm_stops_as_it_was_certified() -> None:
+def test_commands_for_a_time_that_was_answered_are_refused_for_both_arms_which_stop_as_was_certified() -> None:
     cabinet, ones = Cabinet(), np.ones(7)
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
@@ -156,16 +156,19 @@ def test_a_command_for_a_time_that_was_answered_is_refused_and_the_arm_stops_as_
         cabinet.ask(ACTIVE)
     state = cabinet.session.state
     assert state.following
-    cabinet.session.follow(ArmCommand(cabinet.now, state.answered - 1e-3, cabinet.now, np.array(IPO), 0.0 * ones, ones))
-    assert (state.following, state.overtaken) == (False, 1)
+    late = ArmCommand(cabinet.now, state.answered - 1e-3, cabinet.now, np.array(IPO), 0.0 * ones, ones)
+    other = ArmSession("right", "cabinet")
+    other.state.following = True
+    assert not follow({"right": other, "left": cabinet.session}, {"right": late, "left": late})
+    assert other.path.end == 0.0
     answers = [cabinet.ask(ACTIVE) for _ in range(40)]
     stop = np.array([answer.q for answer in answers if answer and answer.q])
     assert np.diff(stop, axis=0).min() >= 0.0, "it goes on, slower and slower"
     np.testing.assert_allclose(stop[-1], state.rest, atol=1e-9)
-    # From there a reference at rest is followed again.
+    # From there a reference is followed again.
     now = cabinet.now
-    cabinet.session.follow(ArmCommand(now, now, now + 0.002, state.rest, 0.0 * ones, ones))
-    assert state.following
+    assert follow({"left": cabinet.session}, {"left": ArmCommand(now, now, now + 0.002, state.rest, 0.0 * ones, ones)})
+    assert cabinet.session.path.end == now + 0.002
 
 
 def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> None:

@@ -13,7 +13,7 @@ from q2r2_control.plants.base import check_command
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
 from q2r2_control.plants.fri.cabinet_server import SimulatedArms
 from q2r2_control.plants.fri.cell import FriCell
-from q2r2_control.plants.fri.session import ArmSession
+from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
@@ -94,15 +94,9 @@ class VirtualCabinets:
     def apply(self, command: Command) -> None:
         check_command(command, self._robot, self.modes)
         self._pass(self.now + self.thinking)
-        commands = self.cell.apply(command)
-
-        def send() -> bool:
-            for arm, its in commands.items():
-                self.lines[arm].follow(its)
-                self.cell.update(copy(self.lines[arm].state))
-            return True
-
-        self.cell.send_or_withdraw(self.now, send)
+        self.cell.sent(follow(self.lines, self.cell.apply(command)))
+        for session in self.lines.values():
+            self.cell.update(copy(session.state))
 
     def advance(self, dt: float) -> None:
         """Time passes by itself, until the next tick."""
