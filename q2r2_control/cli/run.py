@@ -42,7 +42,7 @@ from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, trajectory_named
 from q2r2_control.inputs.web import web_cell
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
-from q2r2_control.robot.commissioned import not_commissioned
+from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
@@ -89,18 +89,23 @@ def run(
     operator: Operator = None,
     force: Annotated[bool, Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
     i_know: Annotated[bool, Option("--i-know", help="Run real cabinets without q2r2 commission.")] = False,
+    full_speed: Annotated[bool, Option("--full-speed", help="Run real cabinets faster than a tenth.")] = False,
     json: Json = False,
 ) -> None:
     """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
 
     A cell in which q2r2 check finds a fault is refused with the same line and exit code 2, unless --force is given.
-    One with real cabinets that is not commissioned is refused too, unless --i-know is given.
+    One with real cabinets that is not commissioned is refused too, unless --i-know is given. Its joints go at a tenth
+    of their speed until --full-speed is given.
     Exit 1 where a tool is more than 100 mm from its reference at the end.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
     cell = load_config(config)
     if (plant or cell.plant) == "fri" and not i_know and (why := not_commissioned(cell, find_resource(config))):
         raise ConfigError(f"{config}: {why}; q2r2 commission {config} commissions it; --i-know runs it all the same")
+    if (plant or cell.plant) == "fri" and not full_speed and has_real_cabinets(cell):
+        cell = slowed(cell)
+        say("real cabinets: joints at a tenth of their speed; --full-speed ends that", style="yellow")
     source = input or cell.input
     if source == "web":
         cell, web = web_cell(cell), True

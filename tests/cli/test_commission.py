@@ -92,6 +92,8 @@ def test_a_cell_that_shows_all_it_has_to_is_signed_off_and_may_run(cell: Path, v
     assert [len(kept["steps"][name]) for name in ("motion", "load", "stop")] == [14, 4, 2]
     after = q2r2("run", str(cell), "--input", "scripted", "--trajectory", "nowhere")
     assert "nowhere" in after.stderr  # it came as far as that
+    assert "joints at a tenth of their speed" in after.stderr
+    assert "a tenth" not in q2r2("run", str(cell), "--trajectory", "nowhere", "--full-speed").stderr
     cell.write_text(cell.read_text(encoding="utf-8").replace("192.0.2.1", "192.0.2.2"), encoding="utf-8")
     assert "were changed since" in q2r2("run", str(cell), "--input", "scripted").stderr
 
@@ -104,6 +106,7 @@ def test_a_user_who_knows_runs_a_cell_without_a_sign_off(cell: Path) -> None:
 def test_cabinets_that_stand_in_need_no_sign_off() -> None:
     done = q2r2("run", "config/dual_iiwa7_fri.yaml", "--input", "scripted", "--trajectory", "nowhere")
     assert "nowhere" in done.stderr
+    assert "a tenth" not in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.config.cell import Config, parse_config
-from q2r2_control.robot.commissioned import fingerprint, not_commissioned, sign_off_file
+from q2r2_control.robot.commissioned import fingerprint, not_commissioned, sign_off_file, slowed
 
 TEXT = Path("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
 REAL = TEXT.replace("127.0.0.1", "192.170.10.2")
@@ -50,6 +50,10 @@ def test_obstacles_gains_home_and_the_simulation_are_not(old: str, new: str) -> 
 
 def test_cabinets_on_this_computer_need_no_commissioning(tmp_path: Path) -> None:
     assert not_commissioned(cell(text=TEXT), tmp_path / "cell.yaml") is None
+
+
+def test_joints_of_a_slowed_cell_go_at_a_tenth_of_what_it_allows() -> None:
+    assert slowed(cell()).control.velocity_scale == pytest.approx(0.1 * cell().control.velocity_scale)
 
 
 def test_a_sign_off_counts_for_the_cell_it_was_made_of(tmp_path: Path) -> None:
