@@ -231,7 +231,10 @@ def test_with_hostile_targets_and_openings_no_finger_is_ever_too_near_wherever_i
         if random.random() < 0.2:
             low, high = np.sort(random.random(2)).tolist()
             interval = ((low, high), (low, 1.0), (0.0, high), ALL_OF_THE_WAY)[random.integers(4)]
+            stop = cell.controller.stop_deceleration
             refused += cell.set_opening(str(random.choice(["left", "right"])), *interval) is not None
+            # The arms may be braking along it already.
+            np.testing.assert_array_equal(cell.controller.stop_deceleration, stop)
         cell.drive(DT, goals)
         if tick % 8 == 0:
             for share in (0.0, 1.0, float(random.random())):

@@ -77,10 +77,9 @@ def certify_start(model: SafetyModel, data: SafetyData) -> bool:
 def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int:
     """The pair in the way of bodies that have ``grown`` (g,) since the reference was certified and measured; -1: none.
 
-    They may be as they are where each of their pairs keeps its distance at the reference, and a stop keeps all apart.
-    It is the stop at hand, or else one of some other shape, which becomes the one at hand. Then the invariant holds
-    with the grown bodies as if they had always been so. A pair that is too close already must not be made closer by
-    growing.
+    They may be as they are where each of their pairs keeps its distance at the reference, and the stop at hand keeps
+    all apart. Then the invariant holds with the grown bodies as if they had always been so. No other stop takes its
+    place: the arms may be braking along it already. A pair that is too close already must not be made closer.
     """
     pairs, any_grown = model.collision.pairs, False
     for p in range(pairs.first.shape[0]):
@@ -90,9 +89,6 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
-        return -1
-    if _some_stop_certified(model, data, 0.0, SHAPES):
-        _keep_stop(data)
         return -1
     return data.unproven[0]
 
