@@ -12,7 +12,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from subprocess import TimeoutExpired
@@ -26,7 +26,10 @@ from q2r2_control.process.scheduling import few_garbage_collections, how_it_ende
 
 _TAKEN, _TOO_LATE = b"1", b"0"  # a word about commands
 _LARGEST = 1 << 16  # of what is passed on [bytes]
-_POLL = 50  # of looking whether the arms of a loop that has ended stand still [ms]
+_POLL = 0.05  # of looking whether the arms of a loop that has ended stand still [s]
+# A processor that sleeps wakes up as slowly as an answer is made. With a priority it is kept awake around the time at
+# which a message is expected, for so long before and after [s].
+_AWAKE = 3e-4
 _PATIENCE = 5.0  # with a process that is to end [s]
 _LONGEST_WORD = 1.0  # until it says whether commands came in time; arms brake meanwhile [s]
 # Linux stamps datagrams as they arrive (SO_TIMESTAMPNS) by its real-time clock; longer waits are jumps of that [s].
@@ -120,33 +123,35 @@ def main(commands: int, states: int) -> None:
                 if priority:
                     stack.enter_context(real_time(priority))
                 stack.enter_context(few_garbage_collections())
-                _Answering(from_loop, to_loop, lines).run()
+                _Answering(from_loop, to_loop, lines, _AWAKE if priority else 0.0).run()
         except Exception as error:
             from_loop.send(reason_of(error).encode())
 
 
 class _Answering:
-    def __init__(self, commands: socket.socket, states: socket.socket, lines: list[Line]) -> None:
-        self._commands, self._states = commands, states
+    def __init__(self, commands: socket.socket, states: socket.socket, lines: list[Line], awake: float) -> None:
+        self._commands, self._states, self._awake = commands, states, awake
         self._sessions = {line.session.state.arm: line.session for line in lines}
         self._lines = {line.file: (line, socket.socket(fileno=line.file)) for line in lines}
 
     def run(self) -> None:
-        poll = select.poll()
-        for file in (*self._lines, self._commands.fileno()):
-            poll.register(file, select.POLLIN)
+        files = [*self._lines, self._commands.fileno()]
         for _, opened in self._lines.values():
             with suppress(OSError):
                 while True:  # what came while this process began is too old to be answered
                     opened.recv(LONGEST + 1)
         ended = False
         while not (ended and all(session.is_still(time.monotonic()) for session in self._sessions.values())):
-            for file, _ in poll.poll(_POLL):
+            for file in select.select(files, (), (), self._sleep())[0]:
                 if not (ended or self._take_commands()):
                     ended = True
-                    poll.unregister(self._commands)
+                    files.remove(self._commands.fileno())
                 if file in self._lines:
                     self._answer(*self._lines[file])
+
+    def _sleep(self) -> float:
+        waits = [session.next_message - time.monotonic() for session in self._sessions.values()]
+        return sleep_for(waits, self._awake)
 
     def _take_commands(self) -> bool:
         """Take all that was sent before an answer; returns whether the loop is there."""
@@ -177,6 +182,12 @@ class _Answering:
             return
         with suppress(OSError):  # a loop that stands still gets a later state
             self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))
+
+
+def sleep_for(waits: Iterable[float], awake: float) -> float:
+    """How long to sleep with messages that are expected after ``waits``: until ``awake`` before one, all in [s]."""
+    soon = [max(wait - awake, 0.0) for wait in waits if awake > 0.0 and wait > -awake]
+    return min([*soon, _POLL])
 
 
 def open_socket(address: str, port: int) -> socket.socket:
