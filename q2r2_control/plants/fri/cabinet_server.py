@@ -102,6 +102,13 @@ class SimulatedArms:
             self.plant.advance(passed)
             self.state = self.plant.state()
 
+    def work_gripper(self, arm: str, gripper: GripperIoConfig, cabinet: Cabinet) -> None:
+        """Let a cabinet's output command the arm's gripper, whose opening its input shows."""
+        if gripper.output in cabinet.outputs:
+            self.openings[arm] = min(max(float(cabinet.outputs[gripper.output]), 0.0), 1.0)
+        if gripper.input is not None:
+            cabinet.inputs[gripper.input] = self.plant.gripper_openings()[arm]
+
     def _command(self) -> Command:
         q, v = np.zeros((2, self.robot.model.nv))
         for name, arm in self.arms.items():
@@ -195,10 +202,7 @@ class CabinetServer:
             return
         self.cell.advance(due)
         if (gripper := self._grippers.get(arm)) is not None:
-            if gripper.output in cabinet.outputs:
-                self.cell.openings[arm] = min(max(float(cabinet.outputs[gripper.output]), 0.0), 1.0)
-            if gripper.input is not None:
-                cabinet.inputs[gripper.input] = self.cell.plant.gripper_openings()[arm]
+            self.cell.work_gripper(arm, gripper, cabinet)
         datagram = write_monitoring(cabinet.send(due))
         for late in self._ways(self._network.duplicate):
             self._after(late, due, lambda: _sent(opened, datagram, client))

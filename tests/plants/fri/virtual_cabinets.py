@@ -8,6 +8,7 @@ from copy import copy
 
 import numpy as np
 
+from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.events import Reason
 from q2r2_control.plants.base import check_command
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
@@ -40,6 +41,7 @@ class VirtualCabinets:
         loss: float = 0.0,
         seed: int = 0,
         arms: SimulatedArms | None = None,
+        grippers: dict[str, GripperIoConfig] | None = None,
     ) -> None:
         """``period`` of the loop, cabinets' clocks ``drift`` apart, up to ``jitter`` late [s].
 
@@ -47,7 +49,7 @@ class VirtualCabinets:
         """
         self._robot, self._period, self._random = robot, period, np.random.default_rng(seed)
         self._jitter, self._loss = jitter, loss
-        self._simulation = arms
+        self._simulation, self._grippers = arms, grippers or {}
         self.cabinets = {
             arm: Cabinet(its, arms.arms[arm] if arms else StillArm(tuple(start[robot.arms[arm].joints])))
             for arm, its in settings.items()
@@ -65,7 +67,9 @@ class VirtualCabinets:
     def reset(self, q: Array | None = None) -> None:
         limits = {arm: self._robot.torque_limit[self._robot.arms[arm].joints] for arm in self.cabinets}
         self.lines = {arm: ArmSession(arm, "cabinet", None, _KINDS[self._mode], limit) for arm, limit in limits.items()}
-        self.cell = FriCell(self._robot, [copy(session.state) for session in self.lines.values()], self._period)
+        self.cell = FriCell(
+            self._robot, [copy(session.state) for session in self.lines.values()], self._period, self._grippers
+        )
         self.now, self._serial = _BEGIN, 0  # the loop begins at 0
         self._events: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
         self.heard: dict[str, list[Array]] = {
@@ -105,7 +109,7 @@ class VirtualCabinets:
         return self.cell.state()
 
     def gripper_openings(self) -> dict[str, float]:
-        return {}
+        return self.cell.openings()
 
     def close(self) -> None:
         pass
@@ -128,6 +132,8 @@ class VirtualCabinets:
         cabinet = self.cabinets[arm]
         if self._simulation is not None:
             self._simulation.advance(self.now - _BEGIN)
+            if arm in self._grippers:
+                self._simulation.work_gripper(arm, self._grippers[arm], cabinet)
         self.on_message(arm, self.now)
         message = cabinet.send(self.now)
         if cabinet.session is Session.COMMANDING_ACTIVE:
