@@ -97,6 +97,7 @@ class RunOptions:
     real_time: bool  # ask the system for locked memory and SCHED_FIFO
     force: bool = False  # run although q2r2 check finds faults
     tasks: tuple[AssemblyTask, ...] = ()  # to be judged
+    steps: tuple[tuple[float, str], ...] = ()  # of scripted work, from when on [s], in words
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
     page: tuple[str, int] | None = None  # address of the page in the browser
@@ -220,7 +221,7 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
             robot = pipeline.robot
             joints = {arm: [robot.joint_names[joint] for joint in its.joints] for arm, its in robot.arms.items()}
             title = f"{options.name}: Ctrl-C brings the arms to rest and ends"
-            table = LiveTable(title, joints, pipeline.config.teleop.bindings)
+            table = LiveTable(title, joints, pipeline.config.teleop.bindings, options.steps, options.duration)
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         if options.real_time and (refused := stack.enter_context(real_time())):

@@ -187,12 +187,13 @@ def demo(
         _try_tasks(chosen, mode, seeds, json)
         return
     trajectory = "+".join(task.name for task in chosen)
+    work = trajectory_named(trajectory)
     options = RunOptions(
         name="demo",
         input="scripted",
         plant=plant,
         mode=mode.value,
-        duration=positive("--duration", duration) or trajectory_named(trajectory).duration,
+        duration=positive("--duration", duration) or work.duration,
         fast=fast,
         input_options={"trajectory": trajectory, "human": human, "seed": seed},
         table=_shows_table(headless, viewer),
@@ -200,6 +201,7 @@ def demo(
         page=(web_host, web_port) if web else None,
         real_time=rt,
         tasks=chosen,
+        steps=work.steps,
         record=record,
         notes={"task": "; ".join(task.about for task in chosen)},
     )

@@ -57,6 +57,7 @@ class HandWork:
 
     duration: float  # [s]
     tools: Mapping[str, tuple[WayPoint, ...]]  # after home, at rising times since the start; a hand without any rests
+    steps: tuple[tuple[float, str], ...]  # from when on [s], in words
     presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # of the upper buttons, by hand [s]
 
 
@@ -77,6 +78,14 @@ _MEET = (
 MEET = HandWork(
     duration=17.4,
     tools={"left": _MEET, "right": tuple((t, x, -y, z, -tilt, -turn) for t, x, y, z, tilt, turn in _MEET)},
+    steps=(
+        (0.0, "each hand reaches for its block"),
+        (3.2, "both grasp"),
+        (4.2, "both lift"),
+        (5.8, "both meet in the middle"),
+        (10.0, "each hand puts its block back"),
+        (14.6, "both let go"),
+    ),
     presses={"left": (3.5, 14.9), "right": (3.7, 15.1)},
 )
 
@@ -96,6 +105,13 @@ GRASP = HandWork(
             (10.6, *_RIGHT_HOME),
         )
     },
+    steps=(
+        (0.0, "the right hand reaches for the block"),
+        (2.8, "it grasps"),
+        (3.5, "it lifts the block"),
+        (6.1, "it puts the block back"),
+        (7.5, "it lets go"),
+    ),
     presses={"right": (2.9, 7.6)},
 )
 
@@ -127,6 +143,16 @@ STACK = HandWork(
             (14.8, *_RIGHT_HOME),
         ),
     },
+    steps=(
+        (0.0, "the left hand reaches for a block"),
+        (2.1, "it grasps"),
+        (2.8, "it carries the block to the middle"),
+        (5.6, "it puts the block on the first one"),
+        (7.3, "the right hand takes another block"),
+        (8.4, "it carries the block to the middle"),
+        (10.2, "it puts the block on both"),
+        (11.9, "both hands go home"),
+    ),
     presses={"left": (2.2, 6.7), "right": (6.3, 11.3)},
 )
 
@@ -164,6 +190,16 @@ HANDOVER = HandWork(
             (18.4, *_RIGHT_HOME),
         ),
     },
+    steps=(
+        (0.0, "the left hand reaches for the bar"),
+        (3.4, "it grasps"),
+        (4.1, "it lifts the bar to the middle"),
+        (6.8, "the right hand takes the bar's other end"),
+        (8.7, "the left hand lets go"),
+        (10.2, "the right hand carries the bar away"),
+        (13.0, "it puts the bar down"),
+        (15.3, "both hands go home"),
+    ),
     presses={"left": (3.5, 8.7), "right": (8.1, 14.7)},
 )
 

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.assembly import HOME, WORKS, HandWork, WayPoint, WayPoints, minimum_jerk
+from q2r2_control.inputs.assembly import HOME, WORKS, WayPoint, WayPoints, minimum_jerk
 from q2r2_control.inputs.played import EvenSampling, HeadsetSampling, PlayedInput, SampleTiming
 from q2r2_control.robot.compose import compose
 from q2r2_control.types import SIDES, Array, HandInputs
@@ -39,6 +39,7 @@ class HandTrajectory:
     upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # hand -> times [s]
     lower_presses: tuple[float, ...] = (FIRST_PRESS,)  # of both hands [s]
     duration: float | None = None  # None: without end [s]
+    steps: tuple[tuple[float, str], ...] = ()  # from when on [s], in words
 
     def displacement(self, hand: str, t: float, frequency: float) -> tuple[Array, Array]:
         """Displacement (3,) [m] and rotation vector (3,) [rad] of ``hand`` at ``t`` [s]."""
@@ -88,13 +89,15 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
     return np.array([0.0, 0.0, lift]), turn
 
 
-def in_sequence(works: Sequence[HandWork]) -> HandTrajectory:
-    """Hands that do one work after the other, and then pause."""
+def in_sequence(names: Sequence[str]) -> HandTrajectory:
+    """Hands that do one of :data:`WORKS` after the other, and then pause."""
     homes: dict[str, WayPoint] = {hand: (0.0, *HOME[hand], 0.0, 0.0) for hand in SIDES}
     points = {hand: [home] for hand, home in homes.items()}
     presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
-    begins = START
-    for work in works:
+    begins, steps = START, [(0.0, "the hands rest")]
+    for name in names:
+        work = WORKS[name]
+        steps += [(begins + t, f"{name}: {words}") for t, words in work.steps]
         for hand, home in homes.items():
             way = [(begins + point[0], *point[1:]) for point in (home, *work.tools.get(hand, ()))]
             points[hand] += [point for point in way if point[0] > points[hand][-1][0]]
@@ -106,6 +109,7 @@ def in_sequence(works: Sequence[HandWork]) -> HandTrajectory:
         upper_presses={hand: tuple(times) for hand, times in presses.items()},
         lower_presses=(FIRST_PRESS, begins + _LAST_PRESS),
         duration=begins + _LAST_PRESS + _REST,
+        steps=tuple(steps),
     )
 
 
@@ -123,7 +127,7 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
     "circle": HandTrajectory(_circle),
     "line": HandTrajectory(_line),
     "rotate": HandTrajectory(_rotate),
-    **{name: in_sequence([work]) for name, work in WORKS.items()},
+    **{name: in_sequence([name]) for name in WORKS},
 }
 
 
@@ -135,7 +139,7 @@ def trajectory_named(name: str) -> HandTrajectory:
     if not all(work in WORKS for work in works):
         allowed = f"{', '.join(TRAJECTORIES)}, and {', '.join(WORKS)} joined by +"
         raise ConfigError(f"scripted trajectory {name!r:.60}: allowed are {allowed}")
-    return in_sequence([WORKS[work] for work in works])
+    return in_sequence(works)
 
 
 # Where an operator holds the hands; only what follows from here on moves an arm.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 
 import numpy as np
@@ -26,7 +26,7 @@ _HELD_BY = {LimitKind.POSITION: "at its limit", LimitKind.VELOCITY: "as fast as 
 _REFRESH_RATE = 6.0  # [Hz]
 # The loop gets the interpreter back within this time from drawing, which takes milliseconds of Python at a time [s].
 _SWITCH_INTERVAL = 2e-5
-_LIMITS_SHOWN = 4
+_LIMITS_SHOWN, _BAR = 4, 20
 _FOLLOWS_WHAT = {str(ArmState.CARRIED): "goes with the other arm", str(ArmState.POLICY): "follows the policy"}
 _NEAR = 0.01  # a pair with less to spare is coloured [m]
 
@@ -91,9 +91,20 @@ def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[
 class LiveTable:
     """Shows the newest tick of a run."""
 
-    def __init__(self, title: str, joints: Mapping[str, Collection[str]], bindings: BindingSettings) -> None:
-        """``joints``: names of those that move each arm; ``bindings``: what the hands' controls do."""
+    def __init__(
+        self,
+        title: str,
+        joints: Mapping[str, Collection[str]],
+        bindings: BindingSettings,
+        steps: Sequence[tuple[float, str]] = (),
+        duration: float | None = None,
+    ) -> None:
+        """``joints``: names of those that move each arm; ``bindings``: what the hands' controls do.
+
+        ``steps`` of the work, from when on and in words, of a run that takes ``duration``, both in [s].
+        """
         self._title, self._joints, self._bindings = title, joints, bindings
+        self._steps, self._duration = steps, duration
         self._last: dict[str, Event] = {}  # of each arm
         self._newest: Tick | None = None
         self._count = 0
@@ -157,6 +168,11 @@ class LiveTable:
         arms = list(tick.tools)
         for arm in arms:
             table.add_column(arm, justify="right", min_width=14)
+        if self._duration is not None:
+            done = min(tick.t / self._duration, 1.0)
+            bar = "━" * round(_BAR * done) + "·" * (_BAR - round(_BAR * done))
+            step = next((words for begins, words in reversed(self._steps) if begins <= tick.t), "")
+            table.add_row("progress", step, f"{bar} {done:.0%}")
         binding, self._binding = list(self._binding), {}
         repelled, self._repelled = list(self._repelled), {}
         for name, values in _arm_rows(tick, arms):

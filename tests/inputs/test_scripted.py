@@ -155,6 +155,16 @@ def test_every_work_has_rising_times_and_ends_at_home_with_open_grippers(work: H
         assert len(work.presses[hand]) % 2 == 0
 
 
+@pytest.mark.parametrize("name", ["meet+grasp", "handover+stack"])
+def test_the_steps_of_works_are_told_in_order_and_by_the_name_of_the_work(name: str) -> None:
+    trajectory = trajectory_named(name)
+    begins, words = zip(*trajectory.steps, strict=True)
+    assert begins == tuple(sorted(begins))
+    assert trajectory.duration is not None
+    assert begins[-1] < trajectory.duration
+    assert list(dict.fromkeys(said.partition(":")[0] for said in words[1:])) == name.split("+")
+
+
 def test_works_in_sequence_do_what_each_of_them_does_one_after_the_other() -> None:
     both, first, second = (trajectory_named(name) for name in ("handover+stack", "handover", "stack"))
     assert second.duration is not None

@@ -47,6 +47,15 @@ def test_it_shows_each_arm_s_session_with_its_cabinet(robot: Robot) -> None:
     assert sessions["left"] in text
 
 
+def test_it_shows_the_step_of_the_work_and_how_much_of_it_is_done(robot: Robot) -> None:
+    steps = ((0.0, "stack: the left hand reaches for a block"), (2.0, "stack: it grasps"), (3.0, "stack: it lifts"))
+    table = LiveTable("demo", JOINTS, BindingSettings(), steps, 10.0)
+    table(tick_at(robot, 2.5))
+    text = printed(table.render(), 120)
+    assert "stack: it grasps" in text
+    assert "━" * 5 + "·" * 15 + " 25%" in text
+
+
 def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
     table = LiveTable("demo", JOINTS, BindingSettings())
     tick = tick_at(robot, 0.0)
