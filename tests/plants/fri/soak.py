@@ -124,7 +124,7 @@ class Soak:
         if now > self._rest_by:
             self._rest_by = math.inf
             for arm, heard in self.plant.heard.items() if not any(tick.engaged.values()) else ():
-                way = np.diff(heard[-3:], axis=0)
+                way = np.diff(heard[-2:], axis=0)  # of the newest period only: before that it may still brake
                 fastest = np.abs(way[np.isfinite(way)]).max(initial=0.0) / cabinets[arm].settings.period
                 if fastest > _REST[self.pipeline.drive.mode]:
                     moves = f"{arm} moves at {fastest:.4f} rad/s after the time to brake"
