@@ -1,6 +1,6 @@
-"""The suite to trust a robot by: named ways to hurt it, each at several tick lengths, the contract at every tick.
+"""The suite to trust a robot by: named ways to hurt it, and the contract at every tick.
 
-Another robot joins by a line in ``ROBOTS``.
+Another robot joins by a line in ``ROBOTS`` and in the parameters of the test.
 """
 
 from __future__ import annotations
