@@ -7,8 +7,8 @@ import json
 import pytest
 
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.types import ActiveLimit, HandFault, LimitKind
-from q2r2_control.wording import limit_name, sentence
+from q2r2_control.types import HandFault
+from q2r2_control.wording import sentence
 
 JUMPED = Reason.of(ReasonKind.HAND_JUMPED, distance=0.3)
 
@@ -37,8 +37,3 @@ def test_a_sentence_shows_its_numbers_and_what_it_follows_from() -> None:
     assert sentence(Reason.of(ReasonKind.LINKED, cause=JUMPED, arm="left")) == "linked to left: the hand jumped 0.300 m"
     changes = Reason.of(ReasonKind.SETTINGS_REQUESTED, changes={"position_scale": 0.5})
     assert sentence(changes) == 'a program changes settings: {"position_scale": 0.5}'
-
-
-def test_a_limit_is_named_by_its_joint_or_its_pair() -> None:
-    assert limit_name(ActiveLimit(LimitKind.VELOCITY, ("left_A2",))) == "left_A2 velocity"
-    assert limit_name(ActiveLimit(LimitKind.SEPARATION, ("left_link_5", "table"))) == "left_link_5|table"

@@ -40,10 +40,6 @@ def test_an_example_runs_and_prints_what_came_of_it(script: Path, tmp_path: Path
     assert all(picture.stat().st_size > 10_000 for picture in pictures)
 
 
-def test_an_example_is_short() -> None:
-    assert {script.name: lines for script in SCRIPTS if (lines := len(script.read_text().splitlines())) > 40} == {}
-
-
 def test_the_code_of_the_readme_runs() -> None:
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert run("-c", code).strip().endswith("True")

@@ -16,7 +16,6 @@ from q2r2_control.benchmark.motion_run import (
     play_motion,
     run_bench,
     run_motion,
-    without_pairs,
 )
 from q2r2_control.benchmark.peers.base import INSTALL, PEERS, Leading
 from q2r2_control.benchmark.work_motions import WORK_MOTIONS, motions_named
@@ -116,16 +115,6 @@ def test_a_controller_that_is_too_slow_to_wait_for_says_how_far_it_got(robot: Ro
     figures = run_motion(Standing(), robot, SHORT, patience=0.0)
     assert figures.done < 0.01
     assert figures == MotionFigures("short", "standing", figures.done)
-
-
-def test_free_air_follows_what_the_pairs_forbid() -> None:
-    free = without_pairs(CONFIG)
-    figures = run_motion(OwnController(free, CONFIG), Robot.from_config(CONFIG), WORK_MOTIONS["slide"])
-    assert figures.rms_error_mm is not None
-    assert figures.rms_error_mm < 2.0
-    # The slide asks for 10 mm less than the millimetre that fingers keep.
-    assert figures.min_distance_mm == pytest.approx(-9.0, abs=0.6)
-    assert figures.closest_pair == ("left_hand_e_finger_1_envelope_3", "table_0")
 
 
 @pytest.mark.slow

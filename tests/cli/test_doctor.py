@@ -58,11 +58,3 @@ def test_what_the_kernel_refuses_stands_with_the_last_part_of_the_note_as_its_cu
     lines = q2r2("doctor", free_cell).stdout.splitlines()
     at = lines.index("warning     real time: no SCHED_FIFO; the run goes on")
     assert lines[at + 1].strip() == "cure: give rtprio 40"
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_shell_gets_a_script_that_completes_q2r2(shell: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shellingham.detect_shell", lambda *_: (shell, shell))
-    result = q2r2("--show-completion")
-    assert result.exit_code == 0
-    assert "_COMPLETE" in result.stdout

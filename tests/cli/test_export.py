@@ -80,12 +80,3 @@ def test_an_interrupted_export_leaves_nothing_half_and_the_next_one_ends_it(
         assert q2r2(*arguments, str(tmp_path / name)).exit_code == 0
     assert contents(tmp_path / "out") == contents(tmp_path / "at_once")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["at_once", "out"]
-
-
-def test_an_output_that_exists_is_left_alone(recordings: Sequence[Path], tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("mine")
-    result = q2r2("export", "csv", str(recordings[0]), "--output", str(tmp_path / "out"))
-    assert result.exit_code == 2
-    assert "out: exists; allowed: a name that does not exist yet" in result.stderr
-    assert (tmp_path / "out").read_text() == "mine"
-    assert not (tmp_path / "out.partial").exists()

@@ -33,10 +33,3 @@ def test_arms_that_were_not_moved_between_the_points_tell_nothing(fri_cell: str)
     assert done.exit_code == 2
     assert "point 3 of 3: guide the right tip there" in done.stderr
     assert "the points are 0 mm about a line" in done.stderr.splitlines()[-1]
-
-
-@pytest.mark.usefixtures("cabinets")
-def test_an_operator_who_ends_the_input_is_told_what_is_missing(fri_cell: str) -> None:
-    done = q2r2("fri-mounts", fri_cell, typed="\n")
-    assert done.exit_code == 2
-    assert done.stderr.splitlines()[-1] == "q2r2: no more input; allowed: Enter for each point"

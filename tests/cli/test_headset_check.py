@@ -99,5 +99,5 @@ def test_ctrl_c_brings_the_arms_to_rest_and_ends_a_headset_run_with_its_summary(
     assert running.returncode == 0, stderr
     summary = one_object(stdout)
     assert summary["at_rest"]
-    assert summary["arms"]["left"]["engaged_s"] > 0.5
+    assert summary["arms"]["left"]["engaged_s"] > 0.0
     assert "connection_lost" in [event["kind"] for event in summary["events"]]

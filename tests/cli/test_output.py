@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
 from rich.table import Table
 
 from q2r2_control import Pipeline, RunSummary
-from q2r2_control.cli.output import late_line, recording_line, summary_table, task_line
+from q2r2_control.cli.output import late_line, summary_table
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import Percentiles
-from q2r2_control.viewer.tables import figure_table, print_table, record_table, short_figure
+from q2r2_control.viewer.tables import figure_table, print_table
 from q2r2_control.wording import sentence
 from tests.support.hands_input import HandsInput
 from tests.support.processes import cell
@@ -41,40 +40,17 @@ def test_figures_names_units_and_notes_are_whole_in_80_columns() -> None:
     assert f"{LINK}_{LINK}" in first
 
 
-@pytest.mark.parametrize("width", [80, 60, 30])
-def test_no_figure_is_cut_however_narrow_the_console_is(width: int) -> None:
+def test_no_figure_is_cut_however_narrow_the_console_is() -> None:
     columns = (
         "controller",
         *(f"{what} [us]" for what in ("free air", "carry", "crossing", "worst margin", "fallback")),
     )
     figures = ("-2.967", "123.456", "-9999.9", "176.000", "1234567")
-    text = printed(
-        figure_table("ticks", columns, [("q2r2_control", *figures), ("another_controller", *figures)]), width
-    )
+    text = printed(figure_table("ticks", columns, [("q2r2_control", *figures), ("another_controller", *figures)]), 30)
     for line in (line.split() for line in text.splitlines() if "-2.967" in line):
         assert line[-len(figures) :] == list(figures)
         assert line[0].startswith(("q2r2", "another"))
     assert text.count("-2.967") == 2
-
-
-def test_a_record_is_a_column_with_a_row_for_each_field() -> None:
-    @dataclass
-    class Run:
-        name: str
-        delays_ms: tuple[float, ...]
-        arrival: float | None
-
-    lines = printed(record_table("runs", [Run("ours", (1.0, 20.0), None), Run("theirs", (2.0,), 300.0)])).splitlines()
-    assert any(line.split() == ["delays", "ms", "1.00", "20.0", "2.00"] for line in lines)
-    assert any(line.split() == ["arrival", "-", "300"] for line in lines)
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(None, "-"), (0.004, "0.00"), (9.994, "9.99"), (9.996, "10.0"), (99.96, "100"), (-12.34, "-12.3")],
-)
-def test_figures_have_three_digits_or_so(value: float | None, text: str) -> None:
-    assert short_figure(value) == text
 
 
 @pytest.fixture(scope="module")
@@ -117,14 +93,6 @@ def test_late_and_missed_ticks_are_told_and_what_held_a_gripper(summary: RunSumm
     assert "1.25 s, by left_finger_0 | block_0" in row
 
 
-def test_a_task_is_told_in_one_line_with_what_was_measured_and_what_fell_short() -> None:
-    measured = {"lifted_mm": 101.23, "put_back_mm": 0.1, "held_s": 1.8}
-    figures = "(lifted 101.2 mm, put back 0.1 mm, held 1.8 s)"
-    assert task_line(TaskResult("grasp", True, measured, "")) == f"grasp [green]succeeded[/] {figures}"
-    fallen = TaskResult("grasp", False, measured, "bar: fell 30 mm")
-    assert task_line(fallen) == f"grasp [red]failed[/]: bar: fell 30 mm {figures}"
-
-
 def test_a_failed_task_is_told_with_how_late_the_loop_was(summary: RunSummary) -> None:
     failed, done = TaskResult("grasp", False, {}, "bar: fell 30 mm"), TaskResult("stack", True, {}, "")
     late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 239_400.0))
@@ -134,16 +102,6 @@ def test_a_failed_task_is_told_with_how_late_the_loop_was(summary: RunSummary) -
     assert late_line(late, [done]) is None
     assert late_line(replace(summary, lateness_us=Percentiles(60.0, 310.0, 900.0)), [failed]) is None
     assert late_line(summary, [failed]) is None, "simulated time is never late"
-
-
-def test_lost_pictures_are_said_with_the_reason() -> None:
-    recorded = RecordingSummary("a.mcap", 100, 0, None, pictures=20, lost_pictures=3)
-    assert recording_line(recorded).endswith(
-        "100 ticks, 20 pictures, [red]3 lost[/]: they could not be taken fast enough)"
-    )
-    ended = replace(recorded, pictures_fault="no pictures: no OpenGL")
-    assert recording_line(ended).endswith("[red]3 lost[/]: no pictures: no OpenGL)")
-    assert recording_line(replace(recorded, pictures=0, lost_pictures=0)).endswith("(100 ticks)")
 
 
 def test_a_tool_that_did_not_follow_is_said(summary: RunSummary) -> None:

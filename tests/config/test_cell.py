@@ -67,7 +67,6 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
     [
         # degrees, millimetres, milliseconds, percent
         ("arms.left.mount.rpy", [0, 0, 90], "less than or equal to 6.28"),
-        ("arms.left.mount.position", [0, 400, 0], "less than or equal to 20"),
         ("obstacles.table.size", [0.8, 1.6], "a box takes 3 size value(s)"),
         ("teleop.stance", "behind", "'side_by_side', 'mirror' or 'mirror_reflected'"),
         ("teleop.axes", ["+x", "+x", "+z"], "once each"),
@@ -91,8 +90,6 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("arms.left.acceleration_limit", {"A1": -8}, "greater than 0"),
         ("arms.left.gripper.object", {"box": [0.04, 0.04, 0.06], "sphere": 0.03}, "two shapes: give one"),
         ("control.pairs", [{"pair": ["a", ""], "distance": 0.01}], "at least 1 character"),
-        ("impedance.translational_stiffness", -1, "greater than 0"),
-        ("admittance.enabled", 1, "valid boolean"),
         ("cameras.front", {"position": [1, 0, 1]}, "allowed: either look_at or rpy"),
         ("cameras.front", {"width": 640}, "allowed: position, or topic of a real camera"),
         ("cameras.front", {"topic": "/front", "position": [1, 0, 1]}, "position: allowed: without topic"),
@@ -100,20 +97,14 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("cameras", {"front/left": {"position": [1, 0, 1], "rpy": [0, 0, 0]}}, "should match pattern"),
         ("cameras.front", {"position": [1, 0, 1], "rpy": [0, 0, 0], "width": 641}, "a multiple of 2"),
         ("loop_rate_hz", 10**400, "finite number"),
-        ("headset.port", 10.5, "valid integer"),
         ("headset.allow", ["192.168.1.7/24"], "write 192.168.1.0/24, or 192.168.1.7 alone"),
         ("headset.allow", ["10.0.0.7", "the lab"], "'the lab' is neither an address nor a network such as"),
-        ("headset.allow", [], "at least 1"),
         ("arms.left.gripper.closed_position", 0.025, "have to differ"),
         # not numbers, or not the ones meant
         ("control.acceleration_limit", math.nan, "finite number"),
         ("control.position_margin", "0.01 rad", "valid number"),
-        ("floor", False, "valid number"),
         ("control.priority", "middle", "allowed here: equal, left, right"),
-        ("arms.left.mount.position", [0, 0], "missing"),
         ("arms.middle", {"model": "iiwa7", "home": [0] * 7}, "'left' or 'right'"),
-        ("arms", {}, "at least 1"),
-        ("name", "", "at least 1 character"),
     ],
     ids=lambda value: value if isinstance(value, str) else f"{value!r:.24}",
 )

@@ -24,7 +24,7 @@ from q2r2_control.control.safety.speed_bound import update_body_velocities
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-NAMES = ("dual_iiwa7", "dual_iiwa14", "dual_panda")
+NAMES = ("dual_iiwa7", "dual_panda")
 
 
 class CellArrays(NamedTuple):

@@ -54,12 +54,6 @@ def test_a_finger_that_may_touch_gets_in_by_the_depth_and_no_faster_than_it_may(
     assert speeds[heights > 0.05].max() > 2.0 * SPEED, "nothing is slowed that is far from contact"
 
 
-def test_without_contact_the_same_finger_stays_above_the_table() -> None:
-    allowed = settings({"pair": ["left_*finger*", "table"], "depth": DEPTH})
-    heights, _ = towards_the_table(CartesianController(ROBOT, allowed.without_contact()), 0.5)
-    assert 0.001 <= heights.min() < 0.0015
-
-
 def test_what_is_not_named_keeps_its_distance_to_the_same_table() -> None:
     """The right fingers are asked down as the left ones are: the contract knows the distance of every pair."""
     controller = CartesianController(ROBOT, settings({"pair": ["left_*finger*", "table"], "depth": DEPTH}))

@@ -90,7 +90,7 @@ def test_a_dt_above_a_tenth_of_a_second_moves_no_further_than_that(controller: C
     assert [result.report.status for result in results] == [StepStatus.OK, StepStatus.DT_REJECTED]
 
 
-@pytest.mark.parametrize("joint", [1, 3, 6])
+@pytest.mark.parametrize("joint", [1, 6])
 @pytest.mark.parametrize("side", [-1.0, 1.0], ids=["lower", "upper"])
 def test_started_outside_a_position_limit_it_returns_without_a_jump(
     controller: CartesianController, joint: int, side: float
@@ -154,12 +154,6 @@ def test_a_solver_that_never_answers_brings_the_arms_to_rest_along_the_certified
         driven.contract.check(reference, 0.002, failed=True)
         assert reference.report.certified
     assert not reference.v.any()
-
-
-def test_the_same_start_and_targets_give_the_same_motion_to_the_bit(controller: CartesianController) -> None:
-    first, second = (Driven(controller, dt=0.005).drive(0.5, crossing) for _ in range(2))
-    np.testing.assert_array_equal(first.q, second.q)
-    np.testing.assert_array_equal(first.v, second.v)
 
 
 def test_the_report_names_what_holds_the_arms_back(controller: CartesianController) -> None:

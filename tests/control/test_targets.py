@@ -78,7 +78,7 @@ def test_a_target_of_an_arm_that_is_not_there_is_named(tracker: TargetTracker) -
     assert _update(tracker, {"left": _pose(), "third": _pose()}, 0.001, STILL, STILL) == ("third",)
 
 
-@pytest.mark.parametrize("far", [150.0, 1e10, 1e150, 1e307], ids="{:g} m".format)
+@pytest.mark.parametrize("far", [150.0, 1e307], ids="{:g} m".format)
 def test_a_target_beyond_any_cell_keeps_its_direction_but_not_its_distance(tracker: TargetTracker, far: float) -> None:
     assert _update(tracker, {"left": _pose(None, far * np.array([1.0, -0.5, 0.25]))}, 0.001, STILL, STILL) == ()
     np.testing.assert_allclose(_taken(tracker).translation[0], [100.0, -50.0, 25.0])
@@ -98,7 +98,7 @@ def _moved(start: pin.SE3, twist: Array, t: float) -> pin.SE3:
     return pin.SE3(pin.exp3(twist[3:] * t) @ start.rotation, start.translation + twist[:3] * t)
 
 
-@pytest.mark.parametrize("dt", [0.0005, 0.001, 0.002, 0.005, 0.01, 0.1], ids="dt {} s".format)
+@pytest.mark.parametrize("dt", [0.0005, 0.005, 0.1], ids="dt {} s".format)
 def test_the_feed_forward_of_a_moving_target_becomes_its_twist(tracker: TargetTracker, dt: float) -> None:
     twist = np.array([0.2, -0.1, 0.05, 0.5, -0.3, 0.8])
     start = _pose(pin.exp3(np.array([1.0, -0.5, 0.2])))

@@ -37,7 +37,11 @@ def rms(name: str, free: bool = False) -> float:
     return error
 
 
-@pytest.mark.parametrize("motion", WORK_MOTIONS.values(), ids=WORK_MOTIONS.keys())
+# Of the carries the nearest at the highest speed.
+CHECKED = [name for name in WORK_MOTIONS if not name.startswith("carry")] + ["carry-0.16-0.50"]
+
+
+@pytest.mark.parametrize("motion", [WORK_MOTIONS[name] for name in CHECKED], ids=CHECKED)
 def test_the_contract_holds_at_every_tick_of_work_without_fallback_and_it_ends_in_rest(motion: WorkMotion) -> None:
     run = Driven(CartesianController(robot_of(free=False), SETTINGS))
     run.drive(motion.ends + STILL, lambda t, start: motion.targets(min(t, motion.ends), start))
@@ -47,7 +51,7 @@ def test_the_contract_holds_at_every_tick_of_work_without_fallback_and_it_ends_i
     assert contract.tail_acceleration() < 0.1
 
 
-@pytest.mark.parametrize("speed", ["0.15", "0.30", "0.50"])
+@pytest.mark.parametrize("speed", ["0.15", "0.50"])
 def test_arms_that_carry_something_close_together_follow_as_they_do_in_free_air(speed: str) -> None:
     name = f"carry-0.20-{speed}"
     assert rms(name) <= 1.5 * rms(name, free=True)

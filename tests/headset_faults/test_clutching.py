@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 ANEW = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(120.0)])), np.array([0.4, 0.0, 0.0]))
 STILL = 5e-4  # [m]
-again_and_again = pytest.mark.parametrize("times", [20, pytest.param(100, marks=pytest.mark.soak)])
+again_and_again = pytest.mark.parametrize("times", [10, pytest.param(100, marks=pytest.mark.soak)])
 
 
 def aligned(op: Operator, shift: float, samples: int) -> Iterator[float]:
@@ -159,20 +159,15 @@ def test_an_arm_that_was_pushed_away_is_engaged_there_and_does_not_spring_back()
     assert math.dist(run.tool("left")[-1], first) < 0.005
 
 
-@pytest.mark.parametrize(
-    ("stance", "arm", "sideways"),
-    [("side_by_side", "left", 1.0), ("mirror", "right", 1.0), ("mirror_reflected", "right", -1.0)],
-)
-def test_a_hand_drives_its_arm_along_the_axes_of_its_stance(stance: str, arm: str, sideways: float) -> None:
+def test_a_hand_drives_its_arm_along_the_axes_of_its_stance() -> None:
     def script(op: Operator) -> Iterator[float]:
         yield 0.1
         yield from op.press("left")
         yield from op.move((0.05, 0.04, 0.03), (0.0, 0.0, 0.3), seconds=0.5)
         yield 0.4
 
-    run = InStepRun(script, stance=stance)
-    first, last = run.ticks[0].tools[arm], run.ticks[-1].tools[arm]
-    np.testing.assert_allclose(last.translation - first.translation, [0.05, sideways * 0.04, 0.03], atol=1e-3)
-    np.testing.assert_allclose(pin.log3(last.rotation @ first.rotation.T), [0.0, 0.0, sideways * 0.3], atol=5e-3)
-    other = "left" if arm == "right" else "right"
-    assert np.linalg.norm(run.tool(other) - run.tool(other)[0], axis=1).max() < 1e-6
+    run = InStepRun(script, stance="mirror_reflected")
+    first, last = run.ticks[0].tools["right"], run.ticks[-1].tools["right"]
+    np.testing.assert_allclose(last.translation - first.translation, [0.05, -0.04, 0.03], atol=1e-3)
+    np.testing.assert_allclose(pin.log3(last.rotation @ first.rotation.T), [0.0, 0.0, -0.3], atol=5e-3)
+    assert np.linalg.norm(run.tool("left") - run.tool("left")[0], axis=1).max() < 1e-6

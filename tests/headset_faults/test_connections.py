@@ -40,7 +40,7 @@ def break_the_protocol(headset: FakeHeadset) -> None:
     headset.send(b"\xff" * 64)
 
 
-@pytest.mark.parametrize("end", [FakeHeadset.reset, FakeHeadset.close, break_the_protocol])
+@pytest.mark.parametrize("end", [FakeHeadset.reset, break_the_protocol])
 def test_a_connection_that_ends_in_mid_motion_pauses_both_arms(end: Callable[[FakeHeadset], None]) -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pinocchio as pin
@@ -39,8 +39,8 @@ def jumping(op: Operator, hands: tuple[str, ...], count: float) -> Sender:
 
 @pytest.mark.parametrize(
     ("hands", "count"),
-    [(("left",), 1), (("right",), math.inf), (SIDES, 1), (SIDES, math.inf)],
-    ids=["left, for one sample", "right, for good", "both, for one sample", "both, as a frame does"],
+    [(("left",), 1), (("right",), math.inf), (SIDES, math.inf)],
+    ids=["left, for one sample", "right, for good", "both, as a frame does"],
 )
 def test_a_jump_moves_no_arm_and_pauses_both(hands: tuple[str, ...], count: float) -> None:
     def script(op: Operator) -> Iterator[float]:
@@ -59,12 +59,11 @@ def test_a_jump_moves_no_arm_and_pauses_both(hands: tuple[str, ...], count: floa
     assert run.states == {"engaged"}
 
 
-@pytest.mark.parametrize("shift", [0.02, 0.1])
-def test_a_frame_that_steps_by_less_than_any_gate_moves_no_arm(shift: float) -> None:
+def test_a_frame_that_steps_by_less_than_any_gate_moves_no_arm() -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield 0.2
-        op.frame = pin.SE3(np.eye(3), np.array([0.0, 0.6 * shift, 0.8 * shift]))
+        op.frame = pin.SE3(np.eye(3), np.array([0.0, 0.012, 0.016]))
         yield 0.5
 
     run = InStepRun(script)
@@ -88,25 +87,3 @@ def test_poses_that_freeze_while_buttons_go_on_pause_both_arms_and_engage_none()
     assert run.reasons("lost")[:2] == ["hand_frozen"] * 2
     assert run.reasons("lost")[2:] == ["not_engaged: hand_frozen"] * 2
     assert run.states == {"engaged"}
-
-
-def test_an_arm_goes_by_when_poses_are_received_whatever_the_headsets_clock_says() -> None:
-    def stamped(stamp: Callable[[int], tuple[int, int]]) -> InStepRun:
-        def script(op: Operator) -> Iterator[float]:
-            counts = dict.fromkeys(SIDES, 0)
-
-            def sent(hand: str, position: Array, quaternion: Array) -> bytes:
-                counts[hand] += 1
-                return op.pose(hand, position, quaternion, stamp=stamp(counts[hand]))
-
-            op.send_pose = sent
-            yield from op.engage()
-            yield from op.move((0.05, 0.05, 0.0), (0.0, 0.2, 0.0), seconds=0.5)
-
-        return InStepRun(script)
-
-    # Repeated, before 1970, and an hour early, then an hour late.
-    in_order = stamped(lambda index: (100 + index // 72, 13_000_000 * (index % 72)))
-    astray = stamped(lambda index: ((12, 500), (-1, 0), (36000 + (3600 if index < 60 else -3600), 0))[index // 2 % 3])
-    assert in_order.states == {"engaged"}
-    np.testing.assert_array_equal(astray.tool("left"), in_order.tool("left"))

@@ -101,21 +101,6 @@ def test_a_peer_that_comes_back_after_a_silently_lost_link_takes_its_place_at_on
     assert not any("refused" in line for line in warnings(caplog))
 
 
-def test_a_peer_that_only_keeps_alive_gives_way_to_one_that_sends_poses(
-    server: HeadsetServer, clock: HandClock
-) -> None:
-    with driving(server) as idle:
-        for _ in range(6):
-            clock.advance(1.0)
-            keep_alive(idle, server, clock)
-        with registered(server, source=ELSEWHERE) as second:
-            assert drives(server, idle), "nothing is taken by who sends no poses either"
-            second.send(second.pose("left", (5.0, 0.0, 0.0), IDENTITY))
-            eventually(lambda: drives(server, second))
-            second.send(second.pose("left", (6.0, 0.0, 0.0), IDENTITY))
-            assert collect(server, 1)[-1].position[0] == 6.0
-
-
 def keep_alive(headset: FakeHeadset, server: HeadsetServer, clock: HandClock) -> None:
     headset.send(KEEPALIVE)
     eventually(lambda: server._client is not None and server._client.last_frame == clock.now)

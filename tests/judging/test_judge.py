@@ -54,7 +54,7 @@ def clean(folder: Path) -> Path:
     return record_episode(folder / "clean", hands(SEED))
 
 
-@pytest.mark.parametrize("seed", range(1, 6))
+@pytest.mark.parametrize("seed", [1, 2])
 def test_clean_work_is_kept(seed: int, folder: Path) -> None:
     found = judged(record_episode(folder / str(seed), hands(seed)))
     assert found.verdict.line == "keep"

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import PlantError
-from q2r2_control.pipeline.commissioning import JointMotion, LoadSurvey, measure_joint, measure_stop, stop_report
+from q2r2_control.pipeline.commissioning import JointMotion, measure_joint, measure_stop, stop_report
 from q2r2_control.pipeline.slow_run import Moment
-from q2r2_control.robot.load import MODEL, PENDANT
 from q2r2_control.robot.robot import Robot
 from tests.pipeline.slow_cell import StuckArm, slow_run
 
@@ -57,20 +55,6 @@ def test_a_joint_has_to_follow_and_to_move_alone(motion: JointMotion) -> None:
     JointMotion("A1", 1.0, 0.9, 0.5, 0.1).check()
     with pytest.raises(PlantError, match="A1: commanded 1"):
         motion.check()
-
-
-def test_the_load_of_each_arm_is_found_and_a_heavier_tool_is_told_from_the_model(config: Config) -> None:
-    truth = Robot.from_config(config)
-    truth.model.appendBodyToJoint(14, pin.Inertia(0.8, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
-    with slow_run(config, truth=truth) as run:
-        start = run.reference
-        reports = LoadSurvey(run).measure()
-        assert np.abs(run.reference - start).max() < 0.01
-    assert reports is not None
-    assert [report.against for report in reports] == [MODEL, PENDANT] * 2
-    left, right = reports[::2]
-    assert left.identified_kg == pytest.approx(left.expected_kg, abs=0.01)
-    assert right.identified_kg == pytest.approx(right.expected_kg + 0.8, abs=0.01)
 
 
 def test_an_arm_that_a_hand_leads_stops_within_its_certified_stop_and_the_latency(config: Config) -> None:

@@ -18,13 +18,13 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.types import Command, HandSample
+from tests.pipeline.loops import pipeline
 from tests.support.object_cell import cell as object_cell
 from tests.support.processes import Watch, cell
 
 
-@pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
-def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick(plant: str) -> None:
-    loop = Pipeline.from_config(cell(), input=ScriptedInput("meet"), plant=plant)
+def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick() -> None:
+    loop = pipeline(ScriptedInput("meet"), "mujoco")
     watch, widest = Watch(loop), list[float]()
 
     def listener(tick: Tick) -> None:
@@ -34,7 +34,7 @@ def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick(plant: str) -> 
 
     loop.listeners.append(listener)
     summary = loop.run(5.6, realtime=False)
-    # In MuJoCo the gripper has closed on a block.
+    # The gripper has closed on a block.
     assert widest[0] == 1.0
     assert widest[-1] < 0.9
     assert widest[-1] == pytest.approx(watch.ticks[-1].grippers["left"] + 0.04, abs=0.02)
@@ -89,7 +89,7 @@ def test_fingers_count_as_wide_as_they_are_also_where_the_gripper_is_seldom_aske
 def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
     """The flat block of the demo; the contract, objects included, is checked at every tick."""
     flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
-    config = object_cell(None, flat)
+    config = object_cell(None, flat).model_copy(update={"loop_rate_hz": 500.0})
     loop = Pipeline.from_config(config, input=ScriptedInput("grasp"), plant="mujoco")
     watch = Watch(loop)
     summary = loop.run(10.0, realtime=False)
@@ -101,7 +101,7 @@ def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
     assert summary.fallback_ticks == summary.uncertified_ticks == 0
     jumps = [np.abs(second.reference.v - first.reference.v).max() for first, second in pairwise(watch.ticks)]
     gripped = next(i for i, tick in enumerate(watch.ticks) if tick.holding["right"])
-    assert max(jumps[gripped - 1 : gripped + 20]) < 2e-4  # [rad/s]; a hand that rests is averaged meanwhile
+    assert max(jumps[gripped - 1 : gripped + 20]) < 4e-4  # [rad/s]; a hand that rests is averaged meanwhile
 
 
 def test_a_run_after_one_that_ended_while_something_was_held_bears_no_weight_that_is_not_there() -> None:

@@ -104,5 +104,5 @@ def test_a_gripper_that_closes_on_a_block_is_felt_once_and_an_empty_one_is_not()
                 self.grasps[feedback.hand] = self.grasps.get(feedback.hand, 0) + 1
 
     script = FeltScript("grasp")
-    pipeline(script, "mujoco").run(14.0, realtime=False)
+    pipeline(script, "mujoco").run(7.0, realtime=False)
     assert script.grasps == {"right": 1}

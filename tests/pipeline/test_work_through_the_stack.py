@@ -23,7 +23,6 @@ from work_hands import MOVES, WorkHands
 pytestmark = pytest.mark.slow
 
 RATE = 500.0  # the lowest one with one substep a tick, since most of a test's time goes by ticks [Hz]
-BOTH_MODES = pytest.mark.parametrize("mode", ["position", "torque"])
 CARRY = replace(carry(0.20, 0.30, shortest=1.0), rest=0.6)
 PASS = replace(WORK_MOTIONS["pass"], rest=0.6)
 SLIDE = replace(WORK_MOTIONS["slide"], rest=1.5)
@@ -90,7 +89,7 @@ def assert_safe(done: Work) -> None:
     assert max(float((np.abs(tick.state.tau) / robot().torque_limit).max()) for tick in done.ticks) < 0.9
 
 
-@BOTH_MODES
+@pytest.mark.parametrize("mode", ["position", "torque"])
 def test_arms_that_carry_something_follow_the_hands_closely(mode: str) -> None:
     done = work(CARRY, mode)
     assert_safe(done)
@@ -99,16 +98,14 @@ def test_arms_that_carry_something_follow_the_hands_closely(mode: str) -> None:
     assert done.rms_error(late=0.0) < 20.0e-3
 
 
-@BOTH_MODES
-def test_arms_get_past_each_other_where_the_hands_lead_them(mode: str) -> None:
-    done = work(PASS, mode)
+def test_arms_get_past_each_other_where_the_hands_lead_them() -> None:
+    done = work(PASS, "torque")
     assert_safe(done)
     assert max(done.error(done.ticks[-1])) < 3.0e-3
 
 
-@BOTH_MODES
-def test_a_hand_that_presses_down_slides_the_tool_over_the_table_and_rests_there(mode: str) -> None:
-    done = work(SLIDE, mode, seed=None)
+def test_a_hand_that_presses_down_slides_the_tool_over_the_table_and_rests_there() -> None:
+    done = work(SLIDE, "torque", seed=None)
     assert_safe(done)
     assert 10.0e-3 < max(done.error(done.ticks[-1])) < 11.0e-3, "10 mm lower than it may"
     assert rest_acceleration(np.array([tick.reference.v for tick in done.ticks]), 1.0 / RATE) < 0.1

@@ -63,9 +63,3 @@ def test_a_torque_that_is_not_finite_is_refused(plant: MujocoPlant, robot: Robot
 def test_reset_to_a_bad_posture_is_refused(any_plant: Plant, q: Array) -> None:
     with pytest.raises(PlantError, match="reset q"):
         any_plant.reset(q)
-
-
-def test_both_plants_offer_what_a_plant_has(any_plant: Plant) -> None:
-    assert isinstance(any_plant, Plant)
-    any_plant.close()
-    any_plant.close()

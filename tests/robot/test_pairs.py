@@ -60,9 +60,10 @@ def test_the_floor_is_watched_against_the_links_that_can_come_near_it(dual_iiwa:
     assert with_floor == reach_it
 
 
-@pytest.mark.parametrize("height", [0.0, -0.3, 0.1])
 @pytest.mark.parametrize(
-    "rpy", [(0.0, 0.0, 0.7), (0.0, 0.5, 0.0), (3.1416, 0.0, 0.0)], ids=["upright", "tilted", "hung"]
+    ("rpy", "height"),
+    [((0.0, 0.0, 0.7), 0.0), ((0.0, 0.5, 0.0), -0.3), ((0.0, 0.5, 0.0), 0.1), ((3.1416, 0.0, 0.0), -0.3)],
+    ids=["upright", "tilted", "tilted, a floor that is high", "hung"],
 )
 def test_links_that_are_not_watched_against_the_floor_stay_away(rpy: tuple[float, ...], height: float) -> None:
     mount = {"position": (0.0, 0.0, 0.0), "rpy": rpy}
@@ -88,13 +89,6 @@ def test_a_link_named_floor_that_is_no_level_surface_is_a_link_like_any_other() 
     urdf = compose(one_arm().model_copy(update={"floor": None})).urdf.replace("left_link_5", "floor")
     robot = Robot.from_urdf(urdf, arms={"left": "left_link_ee"})
     assert frozenset(("left_link_1", "floor")) in _links(robot)
-
-
-@pytest.mark.parametrize("cell", ["dual_iiwa7", "dual_panda"])
-def test_nothing_overlaps_at_home_and_nothing_had_to_be_ignored(cell: str, request: pytest.FixtureRequest) -> None:
-    robot: Robot = request.getfixturevalue(cell)
-    assert robot.ignored_pairs == ()
-    assert min(pair.distance for pair in robot.distances(robot.home)) > 0.02
 
 
 SAMPLES = 2000

@@ -137,7 +137,7 @@ def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], trave
 
 @pytest.mark.slow
 @given(st.lists(joints(), min_size=1, max_size=4), _VECTORS, _VECTORS, st.tuples(st.floats(0, 1), st.floats(0, 1)))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_any_chain_of_fingers_is_in_its_body(
     chain: list[FingerJoint], first: Array, second: Array, between: tuple[float, float]
 ) -> None:

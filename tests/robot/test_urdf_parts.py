@@ -9,8 +9,6 @@ from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
 from tests.robot.conftest import one_arm
 
-IIWA7 = [8.65, 5.44, 5.69, 11.01, 11.78, 13.76, 13.17]
-
 
 def rod(limit: str) -> str:
     """A URDF of one joint with ``limit`` among its limits."""

@@ -93,7 +93,7 @@ def test_from_nearly_all_random_postures_all_joints_come_home(
 
 
 def test_the_contract_holds_at_every_tick_of_the_way(robot: Robot, controller: CartesianController) -> None:
-    for q in postures(robot, controller, 4, seed=3):
+    for q in postures(robot, controller, 2, seed=3):
         World(robot, controller, q, checked=True).go_home()
 
 
@@ -177,14 +177,6 @@ def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) 
 
 
 SETTINGS = ControllerSettings()
-
-
-def test_a_home_outside_a_limit_is_named_with_what_is_allowed(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    home = robot.home.copy()
-    home[1] = 2.09
-    monkeypatch.setattr(robot, "home", home)
-    (fault,) = [line for line in preflight_faults(robot, SETTINGS, None) if "left_A2" in line]
-    assert fault == "home: left_A2 = 2.09; allowed: -2.0844 .. 2.0844 rad, position_margin included"
 
 
 def test_a_home_that_a_joint_cannot_hold_against_gravity_is_a_fault(

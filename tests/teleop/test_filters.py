@@ -66,17 +66,6 @@ def test_a_hand_that_stops_dead_is_overshot_by_less_than_the_lead_can_be() -> No
     assert outputs[-1].translation[0] == pytest.approx(0.3, abs=1e-5)
 
 
-def test_the_output_moves_in_every_tick_although_samples_come_every_thirteenth() -> None:
-    """The controller follows the target's velocity, so steps at the sampling rate would be felt."""
-
-    def path(t: float) -> pin.SE3:
-        return pose(0.2 * t)
-
-    _, outputs = follow(path, dt=0.001)
-    speeds = np.diff([output.translation[0] for output in outputs[2000:]]) / 0.001
-    np.testing.assert_allclose(speeds, 0.2, rtol=0.02)
-
-
 def largest_step(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> float:
     """Largest step of the output in 1 ms, for samples (stamp, x) that arrive at given times."""
     pose_filter = PoseFilter(FilterSettings())

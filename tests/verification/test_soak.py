@@ -79,7 +79,6 @@ GRASPING = {"grasps": 40, "held objects: kept distance falls by": 1000}
     ("config", "seed", "least"),
     [
         pytest.param(CONFIG, 2, HOSTILE, id="free"),
-        pytest.param(CONFIG, 7, HOSTILE, id="free, another seed"),
         pytest.param(with_contact(CONFIG, FINGERS), 3, {}, id="where fingers may touch"),
         pytest.param(WITH_OBJECTS, 1, GRASPING, id="objects gripped and let go at any moment"),
     ],

@@ -65,7 +65,7 @@ CHOICES: dict[str, Choice] = {
 }
 
 
-@pytest.mark.parametrize("longest", [0.0005, 0.002, 0.02], ids="longest step {} s".format)
+@pytest.mark.parametrize("longest", [0.0005, 0.02], ids="longest step {} s".format)
 @pytest.mark.parametrize("choose", CHOICES.values(), ids=CHOICES.keys())
 def test_whatever_is_chosen_from_the_box_every_limit_holds_also_between_steps(choose: Choice, longest: float) -> None:
     random = np.random.default_rng(6)

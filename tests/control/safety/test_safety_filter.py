@@ -50,7 +50,7 @@ def test_a_wish_beyond_the_box_is_cut_to_it_joint_by_joint_and_the_joint_is_name
     assert (data.active.kind[0], data.active.subject[0]) == (ACCELERATION, 3)
 
 
-@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("number", [np.nan, np.inf])
 @pytest.mark.parametrize("joint", [0, 13])
 def test_a_single_number_that_is_not_finite_makes_the_certified_stop_go_on(number: float, joint: int) -> None:
     data, wish = started(), V.copy()
