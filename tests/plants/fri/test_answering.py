@@ -115,7 +115,7 @@ def test_a_process_that_fails_says_why(between: Between) -> None:
 
 def test_a_process_with_priority_is_awake_around_the_time_of_a_message_only() -> None:
     awake = 3e-4
-    assert sleep_for([0.004, 0.0025], awake) == pytest.approx(0.0022), "until shortly before the next message"
-    assert sleep_for([0.004, 1e-4], awake) == sleep_for([0.004, -2e-4], awake) == 0.0
-    assert sleep_for([-4e-4, -4e-4], awake) > 0.01, "a cabinet that is silent keeps nobody awake"
-    assert sleep_for([0.004, 1e-4], 0.0) > 0.01, "nor does one keep a process without priority awake"
+    left = (0.004, awake)
+    assert sleep_for([left, (0.0025, awake)]) == pytest.approx(0.0022), "until shortly before the next message"
+    assert sleep_for([left, (1e-4, awake)]) == sleep_for([left, (-2e-4, awake)]) == 0.0
+    assert sleep_for([(-4e-4, awake), (-4e-4, awake)]) > 0.01, "a cabinet that is silent keeps nobody awake"
