@@ -59,6 +59,7 @@ class CellScene:
         self._data, self._pair_data = self._model.createData(), self._pairs.createData()
         self._tree = JointTree(setup)
         scene.set_up_direction("+z")
+        scene.configure_default_lights(cast_shadow=False)  # a browser without a graphics card is ten times as fast
         scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, dtype=np.uint8))
         scene.add_grid(
             "/floor",

@@ -16,7 +16,7 @@ from q2r2_control.viewer.web.exchange import Frame, PageSetup, Ready
 from q2r2_control.viewer.web.panel import Panel
 from q2r2_control.viewer.web.scene import CellScene
 
-_NICENESS = 19  # the loop goes first
+_NICENESS = 10  # the loop goes first
 
 
 class _Newest:
