@@ -30,6 +30,7 @@ ARGUMENTS = [
     *("--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"),
 ]
+HIDDEN = "[class*=mantine-Notification] {display: none !important}"  # a warning of slow drawing, which covers an arm
 VIEW = {"width": 680, "height": 360}
 _PATIENCE = 120.0  # far longer than a page takes that a processor draws [s]
 

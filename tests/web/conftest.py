@@ -11,9 +11,8 @@ pytest.importorskip("playwright")
 
 from playwright.sync_api import BrowserContext, Page, sync_playwright
 
-from tests.web.browser import ARGUMENTS, CHROMIUM, VIEW, WebRun, one_processor
+from tests.web.browser import ARGUMENTS, CHROMIUM, HIDDEN, VIEW, WebRun, one_processor
 
-HIDDEN = "[class*=mantine-Notification] {display: none !important}"  # a warning of slow drawing, which covers an arm
 _COARSE = 0.5  # of a pixel's width, since a processor draws them
 Open = Callable[[str], Page]
 Start = Callable[..., WebRun]

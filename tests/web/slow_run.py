@@ -13,7 +13,7 @@ from q2r2_control.inputs.base import make_input
 from q2r2_control.inputs.web import WebInput, web_cell
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.tick import Tick
-from q2r2_control.viewer.web.view import PageView
+from q2r2_control.viewer.web import view
 from tests.support.processes import cell
 
 
@@ -38,7 +38,8 @@ def main(source: str, port: int, pause: float) -> None:
     hands = WebInput(slow) if is_web else make_input("scripted", config, trajectory=source)
     pipeline = Pipeline.from_config(config, input=hands, plant="kinematic")
     pipeline.listeners.append(slow.pass_by)
-    with PageView("127.0.0.1", port) as page:
+    view._PERIOD = 0.2  # a processor draws the page, which takes long
+    with view.PageView("127.0.0.1", port) as page:
         print(f"page: {page.begin(pipeline, 'slow', False)}", file=sys.stderr, flush=True)
         print(json.dumps(pipeline.run(realtime=False).as_json()))
 

@@ -45,6 +45,7 @@ class Frame:
     events: tuple[Event, ...]
     binding: tuple[ActiveLimit, ...]  # limits that held a step back
     ticks: int
+    slowest: float  # tick among them [s]
     moved: Array | None  # MuJoCo's positions of all that moves
 
 
@@ -66,6 +67,20 @@ class PageHand(NamedTuple):
 
 class PageLost(NamedTuple):
     """The page that drove is gone."""
+
+
+class PageSetting(StrEnum):
+    """The settings that a page's sliders change."""
+
+    SPEED = "speed"  # part of the cell's speeds of a tool
+    SCALE = "scale"  # teleop.position_scale
+
+
+class PageChange(NamedTuple):
+    """A slider was moved; the number is a browser's."""
+
+    setting: PageSetting
+    value: float
 
 
 class PageRequest(StrEnum):
