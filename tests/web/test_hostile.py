@@ -20,6 +20,7 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array
+from q2r2_control.viewer.web import view as view_module
 from q2r2_control.viewer.web.exchange import PageChange, PageRequest, PageSetting
 from q2r2_control.viewer.web.server import LimitedAnswers
 from q2r2_control.viewer.web.view import PageView
@@ -61,7 +62,10 @@ def circling() -> Pipeline:
     return pipeline(ScriptedInput("circle"))
 
 
-def test_watchers_garbage_and_a_page_that_stands_still_change_nothing(view: PageView) -> None:
+def test_watchers_garbage_and_a_page_that_stands_still_change_nothing(
+    view: PageView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_module, "_PERIOD", 0.0)  # more frames than a pipe has room for
     loop = circling()
     url = view.begin(loop, "hostile", False)
     page = view._process.pid
