@@ -32,7 +32,7 @@ ARGUMENTS = [
 ]
 HIDDEN = "[class*=mantine-Notification] {display: none !important}"  # a warning of slow drawing, which covers an arm
 VIEW = {"width": 680, "height": 360}
-_PATIENCE = 120.0  # far longer than a page takes that a processor draws [s]
+PATIENCE = 120.0  # far longer than a page takes that a processor draws [s]
 
 
 class WebRun:
@@ -55,7 +55,7 @@ class WebRun:
 
     def end(self) -> dict[str, Any]:
         """The summary of a run that ends by itself."""
-        output, _ = self._process.communicate(timeout=_PATIENCE)
+        output, _ = self._process.communicate(timeout=PATIENCE)
         assert self._process.returncode == 0, self.errors
         summary: dict[str, Any] = json.loads(output)
         return summary
@@ -68,7 +68,7 @@ class WebRun:
 
 @contextmanager
 def one_processor() -> Iterator[None]:
-    """For browsers, which draw by the processor here and take all that there are. What is started later gets all."""
+    """For browsers, which draw by the processor here and take all that there are. Programs that are started later get all."""
     processors = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(processors)})
     yield
@@ -83,7 +83,7 @@ def table(page: Page) -> dict[str, list[str]]:
 
 def wait_until(condition: Callable[[], object]) -> None:
     """Wait until ``condition`` of a page holds."""
-    deadline = time.monotonic() + _PATIENCE
+    deadline = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.1)
@@ -105,7 +105,7 @@ def wait_for_row(page: Page, name: str, arm: int, text: str) -> None:
 
 
 def wait_for(page: Page, text: str) -> None:
-    page.get_by_text(text).first.wait_for(timeout=1e3 * _PATIENCE)
+    page.get_by_text(text).first.wait_for(timeout=1e3 * PATIENCE)
 
 
 def tool(page: Page, arm: int = 0) -> Array:

@@ -11,7 +11,7 @@ pytest.importorskip("playwright")
 
 from playwright.sync_api import BrowserContext, Page, sync_playwright
 
-from tests.web.browser import ARGUMENTS, CHROMIUM, HIDDEN, VIEW, WebRun, one_processor
+from tests.web.browser import ARGUMENTS, CHROMIUM, HIDDEN, PATIENCE, VIEW, WebRun, one_processor
 
 _COARSE = 0.5  # of a pixel's width, since a processor draws them
 Open = Callable[[str], Page]
@@ -38,6 +38,7 @@ def open_page(browser: BrowserContext) -> Iterator[Open]:
 
     def open_one(url: str) -> Page:
         pages.append(browser.new_page())
+        pages[-1].set_default_timeout(1e3 * PATIENCE)
         pages[-1].goto(f"{url}{'&' if '?' in url else '?'}fixedDpr={_COARSE}")
         pages[-1].add_style_tag(content=HIDDEN)
         return pages[-1]

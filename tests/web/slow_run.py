@@ -35,6 +35,8 @@ def main(source: str, port: int, pause: float) -> None:
     slow = SlowTime(pause)
     is_web = source == "web"
     config = web_cell(cell()) if is_web else cell()
+    gate = config.teleop.gate.model_copy(update={"timeout": 2.0})
+    config = config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": gate})})
     hands = WebInput(slow) if is_web else make_input("scripted", config, trajectory=source)
     pipeline = Pipeline.from_config(config, input=hands, plant="kinematic")
     pipeline.listeners.append(slow.pass_by)

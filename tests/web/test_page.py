@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 
+from q2r2_control.recording.about import About
+from q2r2_control.recording.recorder import Recorder
+from tests.pipeline.loops import pipeline
 from tests.support.processes import CELL
 from tests.web.browser import count, drag, grab, on_arrow, pixels, table, tool, wait_for, wait_for_row, wait_until
 from tests.web.conftest import Open, Start
@@ -64,3 +68,29 @@ def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open
     assert "connection lost" in table(other)["why"][0]
     run.interrupt()
     assert run.end()["at_rest"]
+
+
+def test_a_replay_has_a_time_line(open_page: Open, start: Start, tmp_path: Path) -> None:
+    loop = pipeline()
+    with Recorder(tmp_path, "circle", waits=True) as recorder:
+        recorder.begin(About.of(loop, False, {}), loop.robot)
+        loop.listeners.append(recorder)
+        loop.run(3.0, realtime=False)
+    assert recorder.file is not None
+    run = start("q2r2_control", "replay", str(recorder.file), "--json", "--web", "--web-port", "0")
+    page = open_page(run.url)
+    wait_for(page, "3.0 s")  # the end, where it stands still
+    number = page.locator("input:visible").first
+
+    def stands_at(seconds: str) -> bool:
+        number.fill(seconds)
+        number.press("Enter")
+        return bool(page.get_by_text(f"{seconds} s").count())
+
+    wait_until(lambda: stands_at("1.5"))
+    before = tool(page)
+    page.get_by_text("Play, or stand still").click()
+    wait_for(page, "3.0 s")
+    assert np.linalg.norm(tool(page) - before) > 0.01
+    page.get_by_text("End the replay").click()
+    assert run.end()["ended_by"] is None

@@ -35,6 +35,7 @@ class PageSetup:
     parts: Mapping[str, int]  # loose objects by name -> where their pose begins in ``Frame.moved``
     recorded: bool  # whether a recorder runs
     driven: bool  # whether the page is the run's input
+    replayed: bool  # whether the run is a recorded one
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,7 @@ class Frame:
     ticks: int
     slowest: float  # tick among them [s]
     moved: Array | None  # MuJoCo's positions of all that moves
+    end: float = 0.0  # of what can be shown of a replay, by its time [s]
 
 
 class Ready(NamedTuple):
@@ -81,6 +83,16 @@ class PageChange(NamedTuple):
 
     setting: PageSetting
     value: float
+
+
+class PageSeek(NamedTuple):
+    """The time line was moved; the number is a browser's."""
+
+    time: float  # [s]
+
+
+class PagePlay(NamedTuple):
+    """A replay is to play, or to stand still where it plays."""
 
 
 class PageRequest(StrEnum):

@@ -15,7 +15,15 @@ from q2r2_control.events import Event
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.live import next_press, why
 from q2r2_control.viewer.web.driving import Driving
-from q2r2_control.viewer.web.exchange import Frame, PageChange, PageRequest, PageSetting, PageSetup
+from q2r2_control.viewer.web.exchange import (
+    Frame,
+    PageChange,
+    PagePlay,
+    PageRequest,
+    PageSeek,
+    PageSetting,
+    PageSetup,
+)
 from q2r2_control.viewer.web.scene import AMBER, GREEN, RED, state_colour
 
 _PERIOD = 0.2  # of the table [s]
@@ -43,15 +51,23 @@ class Panel:
         gui.set_panel_label(setup.title)
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(60, 120, 216))
         gui.main_panel.dock_right()
-        self._add_buttons(gui)
+        self._time_line: viser.GuiSliderHandle[float] | None = None
+        if setup.replayed:
+            self._add_time_line(gui)
+        else:
+            self._add_buttons(gui)
         self._table = gui.add_html("")
         if driving is not None:
             with gui.add_folder("Grippers", expand_by_default=False):
                 driving.add_buttons(gui)
+        if not setup.replayed:
+            self._add_settings(gui)
+
+    def _add_settings(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Settings", expand_by_default=False):
             self._add_slider(gui, "speed [%]", PageSetting.SPEED, (5.0, 100.0, 5.0, 100.0), 0.01)
-            if driving is None:
-                scale = setup.config.teleop.position_scale
+            if self._driving is None:
+                scale = self._setup.config.teleop.position_scale
                 self._add_slider(gui, "hand scale", PageSetting.SCALE, (0.1, max(2.0, scale), 0.05, scale))
 
     def _add_buttons(self, gui: viser.GuiApi) -> None:
@@ -71,6 +87,17 @@ class Panel:
                 self._answer(request)
 
             gui.add_button(label, color=colour).on_click(ask)
+
+    def _add_time_line(self, gui: viser.GuiApi) -> None:
+        gui.add_button("Play, or stand still", color="blue").on_click(lambda _: self._answer(PagePlay()))
+        self._time_line = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
+
+        def seek(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+            if event.client_id is not None:  # no page has moved it otherwise
+                self._answer(PageSeek(float(event.target.value)))
+
+        self._time_line.on_update(seek)
+        gui.add_button("End the replay", color="red").on_click(lambda _: self._answer(PageRequest.STOP))
 
     def _add_slider(
         self,
@@ -106,6 +133,9 @@ class Panel:
             self._times.append(1e6 * slowest)
             binding, self._binding = list(self._binding), {}
             self._table.content = self._drawn(frame, binding)
+            if (line := self._time_line) is not None and frame.tick.t != line.value:
+                line.max = max(frame.end, line.max)
+                line.value = frame.tick.t
             moved, self._moved = self._moved, {}
             for setting, value in moved.items():
                 self._answer(PageChange(setting, value))
@@ -131,10 +161,11 @@ class Panel:
             f"tightest pair: {escape(' | '.join(report.tightest_pair))}",
             f"a stop is {certified}; status {escape(str(report.status))}",
         ]
-        plots = [
-            _plot(f"loop, {self._rates[-1]:.0f} Hz", self._rates, 1.2 * self._setup.config.loop_rate_hz),
-            _plot(f"slowest tick, {self._times[-1]:.0f} us", self._times, 1e6 / self._setup.config.loop_rate_hz),
-        ]
+        plots: list[str] = []
+        if not self._setup.replayed:
+            rate, top = self._rates[-1], self._setup.config.loop_rate_hz
+            plots.append(_plot(f"loop, {rate:.0f} Hz", self._rates, 1.2 * top))
+            plots.append(_plot(f"slowest tick, {self._times[-1]:.0f} us", self._times, 1e6 / top))
         if self._driving is not None:
             lines.insert(0, escape(self._driving.words))
         cells = "".join(

@@ -28,6 +28,7 @@ _COLOURS: dict[str, Colour] = {
 _TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (150, 80, 190))
 _TRAIL = 90  # points
 _TRAIL_PERIOD = 0.05  # between them, by the run's time [s]
+_BREAK = 1.0  # a trail begins anew after a longer time [s]
 _AWAY = 0.01  # the ghost shows where a joint is farther from its reference than this [rad]
 _NEAR = 0.1  # a pair with more to spare is calm [m]
 _CAMERA = np.array([2.0, 1.0, 1.1])  # from the middle of the arms [m]
@@ -152,8 +153,10 @@ class CellScene:
 
     def _show_trails(self, frame: Frame) -> None:
         tick = frame.tick
-        if tick.t < self._trail_time + _TRAIL_PERIOD:
+        if 0.0 <= tick.t - self._trail_time < _TRAIL_PERIOD:
             return
+        if not 0.0 <= tick.t - self._trail_time < _BREAK:
+            self._trail_points.clear()  # a replay's time line was moved
         self._trail_time = tick.t
         for arm, trail in self._trails.items():
             here = tick.tools[arm].translation.astype(np.float32)

@@ -62,6 +62,7 @@ class PageView(AbstractContextManager["PageView"]):
         self._plant: MujocoPlant | None = None  # whose loose objects are shown
         self._input: WebInput | None = None  # that the page drives
         self._requests: dict[PageRequest, Callable[[], None]] = {}
+        self._on_request: Callable[[Any], None] | None = None  # instead of the run
         self._changes: dict[PageSetting, Callable[[float], None]] = {}
         try:
             # Room for one frame: a newer one is better than a queue.
@@ -71,6 +72,21 @@ class PageView(AbstractContextManager["PageView"]):
 
     def begin(self, pipeline: Pipeline, title: str, recorded: bool) -> str:
         """Serve the page of a run that is about to begin; returns its URL. Raises :class:`ConfigError`."""
+        url = self.serve(pipeline, title, recorded=recorded)
+        pipeline.listeners.append(self)
+        return url
+
+    def serve(
+        self,
+        pipeline: Pipeline,
+        title: str,
+        *,
+        recorded: bool = False,
+        replayed: bool = False,
+        on_request: Callable[[Any], None] | None = None,
+    ) -> str:
+        """Serve a page; returns its URL. ``on_request`` gets what its buttons ask for, instead of the run."""
+        self._on_request = on_request
         robot, plant = pipeline.robot, pipeline.plant
         self._input = pipeline.input if isinstance(pipeline.input, WebInput) else None
         parts = {}
@@ -103,6 +119,7 @@ class PageView(AbstractContextManager["PageView"]):
             parts=parts,
             recorded=recorded,
             driven=self._input is not None,
+            replayed=replayed,
         )
         self._process.send(setup)
         waited = 0.0
@@ -110,8 +127,15 @@ class PageView(AbstractContextManager["PageView"]):
             waited += 0.1
         if self.url is None:
             raise ConfigError(self._process.fault or f"--web: the page was not ready within {_READY:g} s")
-        pipeline.listeners.append(self)
         return self.url
+
+    @property
+    def alive(self) -> bool:
+        return self._process.alive
+
+    def send(self, frame: Frame) -> bool:
+        """Show a frame, unless the page is not done with the last one."""
+        return self._process.send(frame, 1)
 
     def __call__(self, tick: Tick) -> None:
         """Store one tick, and send it where a frame is due."""
@@ -130,7 +154,7 @@ class PageView(AbstractContextManager["PageView"]):
             return
         moved = None if self._plant is None else self._plant.observed_qpos
         frame = Frame(tick, tuple(self._events), tuple(self._binding), self._ticks, self._slowest, moved)
-        if self._process.send(frame, 1):
+        if self.send(frame):
             self._due = now + _PERIOD
             self._events, self._binding, self._ticks, self._slowest = [], {}, 0, 0.0
 
@@ -139,6 +163,8 @@ class PageView(AbstractContextManager["PageView"]):
         if isinstance(answer, Ready):
             self.url = answer.url
             self._ready.set()
+        elif self._on_request is not None:
+            self._on_request(answer)
         elif isinstance(answer, PageRequest):
             self._requests[answer]()
         elif isinstance(answer, PageChange):
