@@ -68,7 +68,7 @@ class WebRun:
 
 @contextmanager
 def one_processor() -> Iterator[None]:
-    """For browsers, which draw by the processor here and take all that there are. Programs that are started later get all."""
+    """For browsers, which draw by the processor here and take all that there are; what starts later gets all."""
     processors = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(processors)})
     yield

@@ -72,13 +72,12 @@ class Playback:
             self._position = request.time
 
     def _play(self) -> None:
-        then, shown = time.monotonic(), -1.0
-        while not self._ended.wait(_PERIOD if self._position != shown else _STILL):
+        then = time.monotonic()
+        while not self._ended.wait(_PERIOD if self._playing else _STILL):
             passed, then = time.monotonic() - then, time.monotonic()
             if self._times:
                 end = self._times[-1]
                 self._position = min(max(self._position + passed * self._playing, 0.0), end)
                 self._playing &= not (self._complete and self._position == end)
-                shown = self._position
                 frame = self._frames[max(bisect_right(self._times, self._position) - 1, 0)]
                 self._view.send(replace(frame, end=end))
