@@ -44,8 +44,8 @@ class WebRun:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", *command], stdout=subprocess.PIPE, stderr=file, text=True
             )
-        wait_until(lambda: "page: " in self.errors or self._process.poll() is not None)
-        found = re.search(r"page: (\S+)", self.errors)
+        wait_until(lambda: "page: http" in self.errors or self._process.poll() is not None)
+        found = re.search(r"page: (http\S+)", self.errors)
         assert found is not None, self.errors
         self.url = found[1]
 

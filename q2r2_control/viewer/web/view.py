@@ -35,7 +35,7 @@ from q2r2_control.viewer.web.exchange import (
 )
 
 _PERIOD = 1.0 / 30.0  # between frames [s]
-_READY = 30.0  # for the process to be ready, before the run [s]
+_READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
 _PATIENCE = 2.0  # for it to end [s]
 
 _logger = logging.getLogger(__name__)
