@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak test-lerobot test-web lint bench docs picture soak wheel release-check clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak test-lerobot test-web chromium lint bench docs picture page-picture soak wheel release-check clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -46,10 +46,12 @@ test-soak: setup
 	$(BIN)/python -m pytest --ignore tests/lerobot --ignore tests/web -m soak
 
 # The page of a run in a real browser. Debian's Chromium, since the browsers of playwright are downloads of its own.
-test-web: $(VENV)/.installed-web
-	@command -v /usr/bin/chromium > /dev/null || { apt-get update -qq && apt-get install -y -qq chromium; } > /dev/null \
-		|| { echo 'make test-web needs /usr/bin/chromium: apt-get install chromium'; exit 1; }
+test-web: chromium $(VENV)/.installed-web
 	$(BIN)/python -m pytest tests/web
+
+chromium:
+	@command -v /usr/bin/chromium > /dev/null || { apt-get update -qq && apt-get install -y -qq chromium; } > /dev/null \
+		|| { echo 'the page needs /usr/bin/chromium: apt-get install chromium'; exit 1; }
 
 $(VENV)/.installed-web: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[web]' 'playwright>=1.49'
@@ -93,6 +95,10 @@ docs: setup
 # The README's moving picture, docs/demo.webp.
 picture: setup
 	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python docs/moving_picture.py
+
+# The picture of the page in a browser, docs/page.webp.
+page-picture: chromium $(VENV)/.installed-web
+	$(BIN)/python -m docs.page_picture
 
 # What is published, under dist/.
 wheel: setup

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +14,8 @@ from typer import Argument, Exit, Option
 from q2r2_control.cli.cell_run import check_window, show_window
 from q2r2_control.cli.output import (
     Json,
+    WebHost,
+    WebPort,
     as_json_text,
     counting,
     notice_of_compiling,
@@ -30,6 +33,8 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.reader import recordings_in
 from q2r2_control.recording.replay import replay as replay_recording
 from q2r2_control.viewer.tables import figure_table
+from q2r2_control.viewer.web.playback import Playback
+from q2r2_control.viewer.web.view import PageView
 
 _SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
 
@@ -43,6 +48,9 @@ def replay(
     config: Annotated[str | None, Option(metavar="CONFIG", help="Another cell than the recorded one.")] = None,
     plant: Annotated[str | None, Option(metavar="NAME", help="Let it move, and measure it.")] = None,
     viewer: Annotated[bool, Option("--viewer", help="With --plant mujoco: its window, in real time.")] = False,
+    web: Annotated[bool, Option("--web", help="Show it in a browser with a time line; the extra `web`.")] = False,
+    web_host: WebHost = "127.0.0.1",
+    web_port: WebPort = 8080,
     json: Json = False,
 ) -> None:
     """Give a recorded run's hand samples and measured states to the same loop again, tick by tick.
@@ -53,13 +61,20 @@ def replay(
     if viewer:
         check_window(plant)
 
-    def prepare(pipeline: Pipeline) -> None:
-        if viewer:
-            show_window(pipeline, paced=True)
-
     cell = None if config is None else load_config(config)
-    with notice_of_compiling():
-        result = replay_recording(Path(file), cell, plant, compare=compare, prepare=prepare)
+    with ExitStack() as stack:
+        playback = Playback(stack.enter_context(PageView(web_host, web_port))) if web else None
+
+        def prepare(pipeline: Pipeline) -> None:
+            if viewer:
+                show_window(pipeline, paced=True)
+            if playback is not None:
+                say(f"page: {playback.begin(pipeline, Path(file).stem)}")
+
+        with notice_of_compiling():
+            result = replay_recording(Path(file), cell, plant, compare=compare, prepare=prepare)
+        if playback is not None:
+            playback.wait()
     for note in result.notes:
         say(note, style="yellow")
     if result.ended_by is not None:

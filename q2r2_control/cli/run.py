@@ -23,6 +23,8 @@ from q2r2_control.cli.output import (
     Operator,
     RealTime,
     Task,
+    WebHost,
+    WebPort,
     as_json_text,
     notes_of,
     notice_of_compiling,
@@ -57,8 +59,6 @@ Human = Annotated[bool, Option("--human", help="Scripted hands tremble, and samp
 Seed = Annotated[int, Option(min=0, help="Of what --human adds.")]
 Record = Annotated[Path | None, Option(metavar="DIR", help="Record the run to a new folder in DIR.")]
 Web = Annotated[bool, Option("--web", help="Show the run in a browser, at http://127.0.0.1:8080; the extra `web`.")]
-WebHost = Annotated[str, Option(metavar="HOST", help="Address of the page; beyond 127.0.0.1 its URL has a token.")]
-WebPort = Annotated[int, Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0: any free one.")]
 
 Host = Annotated[str | None, Option(help="Address to bind, not the config's; 0.0.0.0: all, :: IPv6 too.")]
 Port = Annotated[int | None, Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]

@@ -11,48 +11,41 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from PIL import Image
 from playwright.sync_api import Page
 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.viewer.web.scene import FIELD_OF_VIEW, first_view
-from tests.support.processes import CELL, cell
+from tests.support.processes import cell
 
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = [
     *("--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"),
 ]
-VIEW = {"width": 720, "height": 400}
-_PATIENCE = 40.0  # with a page drawn by the processor [s]
-# A processor that is busy drawing stops no arm.
-_PATIENT = (("    timeout: 0.15 ", "    timeout: 2.0 "), ("loop_rate_hz: 1000.0 ", "loop_rate_hz: 500.0 "))
+HIDDEN = "[class*=mantine-Notification] {display: none !important}"  # a warning of slow drawing, which covers an arm
+VIEW = {"width": 680, "height": 360}
+PATIENCE = 120.0  # far longer than a page takes that a processor draws [s]
 
 
 class WebRun:
-    """``q2r2 run`` with its page, driven by it."""
+    """A run with its page, by :mod:`tests.web.slow_run` or another command."""
 
-    def __init__(self, folder: Path, *options: str, port: int = 0) -> None:
-        file = folder / "cell.yaml"
-        text = Path(CELL).read_text(encoding="utf-8")
-        for usual, patient in _PATIENT:
-            assert usual in text
-            text = text.replace(usual, patient)
-        file.write_text(text, encoding="utf-8")
-        self._errors = folder / "stderr"
-        command = [sys.executable, "-m", "q2r2_control", "run", str(file), "--plant", "kinematic", "--headless"]
-        command += ["--json", "--web", "--web-port", str(port), *options]
-        with open(self._errors, "w") as errors:
-            self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
-        wait_until(lambda: "page: " in self.errors or self._process.poll() is not None)
-        found = re.search(r"page: (\S+)", self.errors)
+    def __init__(self, errors: Path, *command: str) -> None:
+        self._errors = errors
+        with open(errors, "w") as file:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", *command], stdout=subprocess.PIPE, stderr=file, text=True
+            )
+        wait_until(lambda: "page: http" in self.errors or self._process.poll() is not None)
+        found = re.search(r"page: (http\S+)", self.errors)
         assert found is not None, self.errors
         self.url = found[1]
 
@@ -62,7 +55,7 @@ class WebRun:
 
     def end(self) -> dict[str, Any]:
         """The summary of a run that ends by itself."""
-        output, _ = self._process.communicate(timeout=_PATIENCE)
+        output, _ = self._process.communicate(timeout=PATIENCE)
         assert self._process.returncode == 0, self.errors
         summary: dict[str, Any] = json.loads(output)
         return summary
@@ -73,10 +66,13 @@ class WebRun:
             self._process.send_signal(signal.SIGINT)
 
 
-def leave_a_processor_to_the_loop() -> None:
-    """Browsers draw by the processor here, and take all that there are."""
-    if len(processors := sorted(os.sched_getaffinity(0))) > 1:
-        os.sched_setaffinity(0, processors[1:])
+@contextmanager
+def one_processor() -> Iterator[None]:
+    """For browsers, which draw by the processor here and take all that there are; what starts later gets all."""
+    processors = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(processors)})
+    yield
+    os.sched_setaffinity(0, processors)
 
 
 def table(page: Page) -> dict[str, list[str]]:
@@ -86,15 +82,30 @@ def table(page: Page) -> dict[str, list[str]]:
 
 
 def wait_until(condition: Callable[[], object]) -> None:
-    """Wait until ``condition`` of a page holds; the last value is in the failure."""
-    deadline = time.monotonic() + _PATIENCE
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"waited in vain: {found}"
+    """Wait until ``condition`` of a page holds."""
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.1)
 
 
+def wait_for_row(page: Page, name: str, arm: int, text: str) -> None:
+    """Wait until a row of the table has ``text`` for an arm; otherwise the table is in the failure."""
+    seen: dict[str, list[str]] = {}
+
+    def says() -> bool:
+        nonlocal seen
+        seen = table(page)
+        return text in seen.get(name, ["", ""])[arm]
+
+    try:
+        wait_until(says)
+    except AssertionError as error:
+        raise AssertionError(f"no {text!r} in {name!r} of {seen}") from error
+
+
 def wait_for(page: Page, text: str) -> None:
-    page.get_by_text(text).first.wait_for(timeout=1e3 * _PATIENCE)
+    page.get_by_text(text).first.wait_for(timeout=1e3 * PATIENCE)
 
 
 def tool(page: Page, arm: int = 0) -> Array:
@@ -125,6 +136,33 @@ def on_screen(page: Page, point: Array) -> tuple[float, float]:
     return box["x"] + box["width"] / 2.0 + scale * x, box["y"] + box["height"] / 2.0 - scale * y
 
 
-def tool_at_home(arm: str) -> pin.SE3:
+def count(picture: Array, colour: tuple[float, float, float]) -> int:
+    """Pixels of about this colour."""
+    return int((np.abs(picture - colour).max(axis=2) < 70.0).sum())
+
+
+_TOUCHED = (255.0, 255.0, 64.0)  # of a gizmo under the mouse
+_HANDLE, _PULLED = 0.13, 0.07  # of a gizmo's arrow, along the tool's z axis [m]
+
+
+def grab(page: Page, arm: str) -> None:
+    """Press the mouse on the arrow of a tool at home, and pull it."""
+
+    def lights_up() -> bool:
+        page.mouse.move(*on_arrow(page, arm, _HANDLE))
+        return count(pixels(page), _TOUCHED) > 0
+
+    wait_until(lights_up)
+    page.mouse.down()
+    drag(page, arm, _PULLED)
+
+
+def drag(page: Page, arm: str, to: float) -> None:
+    """Move the mouse to where the arrow of a tool at home is at ``to`` [m]."""
+    page.mouse.move(*on_arrow(page, arm, to), steps=6)
+
+
+def on_arrow(page: Page, arm: str, along: float) -> tuple[float, float]:
+    """Pixel of a point on the arrow of a tool at home, ``along`` its z axis [m]."""
     robot = Robot.from_config(cell())
-    return robot.tool_pose(robot.home, arm)
+    return on_screen(page, robot.tool_pose(robot.home, arm).act(np.array([0.0, 0.0, along])))

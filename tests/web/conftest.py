@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,9 @@ pytest.importorskip("playwright")
 
 from playwright.sync_api import BrowserContext, Page, sync_playwright
 
-from tests.web.browser import ARGUMENTS, CHROMIUM, VIEW, WebRun, leave_a_processor_to_the_loop
+from tests.web.browser import ARGUMENTS, CHROMIUM, HIDDEN, PATIENCE, VIEW, WebRun, one_processor
 
-HIDDEN = "[class*=mantine-Notification] {display: none !important}"  # a warning of slow drawing, which covers an arm
+_COARSE = 0.5  # of a pixel's width, since a processor draws them
 Open = Callable[[str], Page]
 Start = Callable[..., WebRun]
 
@@ -20,9 +21,10 @@ Start = Callable[..., WebRun]
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserContext]:
     """One browser for all tests. Its own requests, to update itself, are off."""
-    leave_a_processor_to_the_loop()
     folder = tmp_path_factory.mktemp("profile")
-    with sync_playwright() as playwright:
+    with ExitStack() as stack:
+        with one_processor():
+            playwright = stack.enter_context(sync_playwright())
         context = playwright.chromium.launch_persistent_context(
             str(folder), executable_path=CHROMIUM, headless=True, args=ARGUMENTS, viewport=VIEW
         )
@@ -36,7 +38,8 @@ def open_page(browser: BrowserContext) -> Iterator[Open]:
 
     def open_one(url: str) -> Page:
         pages.append(browser.new_page())
-        pages[-1].goto(url)
+        pages[-1].set_default_timeout(1e3 * PATIENCE)
+        pages[-1].goto(f"{url}{'&' if '?' in url else '?'}fixedDpr={_COARSE}")
         pages[-1].add_style_tag(content=HIDDEN)
         return pages[-1]
 
@@ -50,8 +53,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
     """Start runs with a page, each of which ends with the test."""
     runs: list[WebRun] = []
 
-    def start_one(*options: str, port: int = 0) -> WebRun:
-        runs.append(WebRun(tmp_path, *options, port=port))
+    def start_one(*command: str) -> WebRun:
+        runs.append(WebRun(tmp_path / f"errors_{len(runs)}", *command))
         return runs[-1]
 
     yield start_one

@@ -2,70 +2,95 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 
-from tests.web.browser import on_screen, pixels, table, tool, tool_at_home, wait_for, wait_until
+from q2r2_control.recording.about import About
+from q2r2_control.recording.recorder import Recorder
+from tests.pipeline.loops import pipeline
+from tests.support.processes import CELL
+from tests.web.browser import count, drag, grab, on_arrow, pixels, table, tool, wait_for, wait_for_row, wait_until
 from tests.web.conftest import Open, Start
 
 ORANGE = (255.0, 107.0, 13.0)  # of the arms' rings
+SLOW = "tests.web.slow_run"
 
 
 def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page: Open, start: Start) -> None:
-    run = start("--input", "scripted", "--trajectory", "circle")
+    run = start(SLOW, "circle", "0", "0.002")
     page = open_page(run.url)
     wait_for(page, "certified")
-    wait_until(lambda: table(page)["state"] == ["engaged", "engaged"])
+    for arm in (0, 1):
+        wait_for_row(page, "state", arm, "engaged")
     # Rings of both arms, left and right of the middle, which no empty scene has.
-    wait_until(lambda: all(half > 20 for half in _orange(pixels(page))))
+    wait_until(lambda: all(count(half, ORANGE) > 5 for half in np.array_split(pixels(page), 2, axis=1)))
     page.get_by_text("Pause both arms").click()
-    wait_until(lambda: "a program asks for a pause" in table(page)["why"][1])
+    wait_for_row(page, "why", 1, "a program asks for a pause")
     page.get_by_text("Bring both arms home").click()
-    wait_until(lambda: "at home" in table(page)["why"][0])
+    wait_for_row(page, "why", 0, "at home")
     page.get_by_text("Stop: rest, and end the run").click()
     summary = run.end()
     assert summary["at_rest"]
     # The same page shows the next run at this address.
-    again = start("--input", "scripted", port=urlsplit(run.url).port or 0)
+    command = ("q2r2_control", "run", CELL, "--plant", "kinematic", "--headless", "--json", "--web", "--web-port")
+    again = start(*command, str(urlsplit(run.url).port))
     wait_until(lambda: table(page).get("why", ["the run ends"])[0] != "the run ends")
     again.interrupt()
     assert again.end()["at_rest"]
 
 
-def _orange(picture: np.ndarray) -> tuple[int, int]:
-    near = np.abs(picture - ORANGE).max(axis=2) < 70.0
-    middle = near.shape[1] // 2
-    return int(near[:, :middle].sum()), int(near[:, middle:].sum())
-
-
 def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open_page: Open, start: Start) -> None:
-    run = start("--input", "web")
-    page = open_page(run.url)
-    wait_for(page, "certified")
+    run = start(SLOW, "web", "0", "0.01")
+    page, other = open_page(run.url), open_page(run.url)
+    for one in (page, other):
+        wait_for(one, "certified")
     before = tool(page)
-    home = tool_at_home("left")
-    handle, end = home.act(np.array([0.0, 0.0, 0.13])), home.act(np.array([0.0, 0.0, 0.07]))
-    page.mouse.move(*on_screen(page, handle))
-    page.wait_for_timeout(500)
-    page.mouse.down()
-    page.mouse.move(*on_screen(page, end), steps=6)
-    wait_until(lambda: table(page)["state"][0] == "engaged")
+    grab(page, "left")
+    wait_for_row(page, "state", 0, "engaged")
     wait_until(lambda: np.linalg.norm(tool(page) - before) > 0.02)
-    # Another page cannot take over, and a driver that is gone stops the arm.
-    other = open_page(run.url)
+    # Another page cannot take over.
     wait_for(other, "drives")
-    where = tool(other, 1)
-    right = tool_at_home("right")
-    other.mouse.move(*on_screen(other, right.act(np.array([0.0, 0.0, 0.13]))))
+    right = tool(other, 1)
+    other.mouse.move(*on_arrow(other, "right", 0.13))
     other.mouse.down()
-    other.mouse.move(*on_screen(other, right.act(np.array([0.0, 0.0, 0.07]))), steps=4)
-    other.wait_for_timeout(500)
+    drag(other, "right", 0.02)
     other.mouse.up()
+    # The first goes on meanwhile, and a driver that is gone stops the arm.
+    moved = tool(page)
+    drag(page, "left", 0.02)
+    wait_until(lambda: np.linalg.norm(tool(other) - moved) > 0.02)
     assert table(other)["state"] == ["engaged", "idle"]
-    assert np.allclose(tool(other, 1), where)
+    assert np.allclose(tool(other, 1), right)
     page.close()
-    wait_until(lambda: table(other)["state"][0] == "lost")
+    wait_for_row(other, "state", 0, "lost")
     assert "connection lost" in table(other)["why"][0]
     run.interrupt()
     assert run.end()["at_rest"]
+
+
+def test_a_replay_has_a_time_line(open_page: Open, start: Start, tmp_path: Path) -> None:
+    loop = pipeline()
+    with Recorder(tmp_path, "circle", waits=True) as recorder:
+        recorder.begin(About.of(loop, False, {}), loop.robot)
+        loop.listeners.append(recorder)
+        loop.run(3.0, realtime=False)
+    assert recorder.file is not None
+    run = start("q2r2_control", "replay", str(recorder.file), "--json", "--web", "--web-port", "0")
+    page = open_page(run.url)
+    wait_for(page, "3.0 s")  # the end, where it stands still
+    number = page.locator("input:visible").first
+
+    def stands_at(seconds: str) -> bool:
+        number.fill(seconds)
+        number.press("Enter")
+        return bool(page.get_by_text(f"{seconds} s").count())
+
+    wait_until(lambda: stands_at("1.5"))
+    before = tool(page)
+    page.get_by_text("Play, or stand still").click()
+    wait_for(page, "3.0 s")
+    assert np.linalg.norm(tool(page) - before) > 0.01
+    page.get_by_text("End the replay").click()
+    assert run.end()["ended_by"] is None

@@ -15,7 +15,7 @@ from q2r2_control.viewer.web.figure import place
 
 _SIZE = 0.22  # of a gizmo [m]
 _PERIOD = 0.02  # between samples [s]
-_ANSWER = 2.0  # a page that does not answer for longer drives no more [s]
+_ANSWER = 10.0  # a page that does not answer for longer drives no more; the gate stops the arms long before [s]
 _Gizmos = dict[str, viser.TransformControlsHandle]  # by arm
 
 
@@ -27,7 +27,7 @@ class Driving:
     """
 
     def __init__(self, server: viser.ViserServer, setup: PageSetup, answer: Callable[[Any], None]) -> None:
-        self._arms, self._answer = tuple(setup.joints), answer
+        self._server, self._arms, self._answer = server, tuple(setup.joints), answer
         self._lock = RLock()
         self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # of each page
         self._driver: int | None = None
@@ -92,6 +92,8 @@ class Driving:
                     self._send(arm, drag=held)
                 if begins:
                     Thread(target=self._ask, args=(page,), daemon=True).start()
+            elif self._driver == page and event.phase == "end" and page not in self._server.get_clients():
+                self._lose()  # viser ends the drag of a page that is gone
             elif self._driver == page and arm in self._dragged:
                 self._dragged[arm] = _pose_of(event.target)
                 self._send(arm, drag=event.phase != "end")

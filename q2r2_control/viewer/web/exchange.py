@@ -35,6 +35,7 @@ class PageSetup:
     parts: Mapping[str, int]  # loose objects by name -> where their pose begins in ``Frame.moved``
     recorded: bool  # whether a recorder runs
     driven: bool  # whether the page is the run's input
+    replayed: bool  # whether the run is a recorded one
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,9 @@ class Frame:
     events: tuple[Event, ...]
     binding: tuple[ActiveLimit, ...]  # limits that held a step back
     ticks: int
+    slowest: float  # tick among them [s]
     moved: Array | None  # MuJoCo's positions of all that moves
+    end: float = 0.0  # of what can be shown of a replay, by its time [s]
 
 
 class Ready(NamedTuple):
@@ -66,6 +69,30 @@ class PageHand(NamedTuple):
 
 class PageLost(NamedTuple):
     """The page that drove is gone."""
+
+
+class PageSetting(StrEnum):
+    """The settings that a page's sliders change."""
+
+    SPEED = "speed"  # part of the cell's speeds of a tool
+    SCALE = "scale"  # teleop.position_scale
+
+
+class PageChange(NamedTuple):
+    """A slider was moved; the number is a browser's."""
+
+    setting: PageSetting
+    value: float
+
+
+class PageSeek(NamedTuple):
+    """The time line was moved; the number is a browser's."""
+
+    time: float  # [s]
+
+
+class PagePlay(NamedTuple):
+    """A replay is to play, or to stand still where it plays."""
 
 
 class PageRequest(StrEnum):

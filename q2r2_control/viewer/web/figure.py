@@ -18,6 +18,7 @@ from q2r2_control.viewer.web.exchange import PageSetup
 Colour = tuple[int, int, int]
 _SHARP = 0.6  # an edge, which is not shaded as round [rad]
 _GHOST: Colour = (120, 160, 230)
+_CAPSULE: Colour = (200, 110, 40)
 _GHOST_OPACITY = 0.35
 
 
@@ -121,6 +122,24 @@ class RobotFigure:
         pin.forwardKinematics(self._tree.model, self._data, posture)
         for frame, placement in zip(self._frames, list(self._data.liMi)[1:], strict=True):
             place(frame, placement)
+
+
+class CapsuleFigure:
+    """The shapes that the controller keeps apart, of a collision model, where ``visible`` lets them be seen."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, model: pin.GeometryModel) -> None:
+        self.root = scene.add_frame(name, show_axes=False, visible=False)
+        self._shapes: list[tuple[int, viser.SceneNodeHandle]] = []
+        for index, shape in enumerate(model.geometryObjects):
+            if (mesh := _mesh_of(shape.geometry)) is not None:
+                vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+                node = scene.add_mesh_simple(f"{name}/{index}", vertices, faces, color=_CAPSULE, wireframe=True)
+                self._shapes.append((index, node))
+
+    def show(self, placed: pin.GeometryData) -> None:
+        """Draw all shapes where ``placed`` has them."""
+        for index, node in self._shapes:
+            place(node, placed.oMg[index])
 
 
 def place(node: viser.SceneNodeHandle, pose: pin.SE3) -> None:

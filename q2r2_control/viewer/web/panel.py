@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
 
@@ -14,33 +15,62 @@ from q2r2_control.events import Event
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.live import next_press, why
 from q2r2_control.viewer.web.driving import Driving
-from q2r2_control.viewer.web.exchange import Frame, PageRequest, PageSetup
+from q2r2_control.viewer.web.exchange import (
+    Frame,
+    PageChange,
+    PagePlay,
+    PageRequest,
+    PageSeek,
+    PageSetting,
+    PageSetup,
+)
 from q2r2_control.viewer.web.scene import AMBER, GREEN, RED, state_colour
 
 _PERIOD = 0.2  # of the table [s]
+_HISTORY = 150  # values of the plots
 _NEAR_LIMIT = 0.05  # of a joint's range
 _STYLE = "font-size:12px;line-height:1.35;padding:0 0.6em 0.4em"
 
 
 class Panel:
-    """Shows frames, and answers with what the buttons ask for."""
+    """Shows frames, and answers with what the buttons and sliders ask for."""
 
     def __init__(
         self, server: viser.ViserServer, setup: PageSetup, driving: Driving | None, answer: Callable[[Any], None]
     ) -> None:
         self._setup, self._driving, self._bindings = setup, driving, setup.config.teleop.bindings
+        self._answer = answer
         self._names = {arm: [setup.joint_names[index] for index in joints] for arm, joints in setup.joints.items()}
         self._last: dict[str, Event] = {}  # of each arm
         self._binding: dict[ActiveLimit, None] = {}
-        self._ticks = 0
+        self._ticks, self._slowest = 0, 0.0
+        self._rates, self._times = deque[float](maxlen=_HISTORY), deque[float](maxlen=_HISTORY)  # [Hz], [us]
+        self._moved: dict[PageSetting, float] = {}  # sliders
         self._shown = time.monotonic()
-        server.gui.set_panel_label(setup.title)
-        server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(60, 120, 216))
-        server.gui.main_panel.dock_right()
-        self._add_buttons(server.gui, answer)
-        self._table = server.gui.add_html("")
+        gui = server.gui
+        gui.set_panel_label(setup.title)
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(60, 120, 216))
+        gui.main_panel.dock_right()
+        self._time_line: viser.GuiSliderHandle[float] | None = None
+        if setup.replayed:
+            self._add_time_line(gui)
+        else:
+            self._add_buttons(gui)
+        self._table = gui.add_html("")
+        if driving is not None:
+            with gui.add_folder("Grippers", expand_by_default=False):
+                driving.add_buttons(gui)
+        if not setup.replayed:
+            self._add_settings(gui)
 
-    def _add_buttons(self, gui: viser.GuiApi, answer: Callable[[Any], None]) -> None:
+    def _add_settings(self, gui: viser.GuiApi) -> None:
+        with gui.add_folder("Settings", expand_by_default=False):
+            self._add_slider(gui, "speed [%]", PageSetting.SPEED, (5.0, 100.0, 5.0, 100.0), 0.01)
+            if self._driving is None:
+                scale = self._setup.config.teleop.position_scale
+                self._add_slider(gui, "hand scale", PageSetting.SCALE, (0.1, max(2.0, scale), 0.05, scale))
+
+    def _add_buttons(self, gui: viser.GuiApi) -> None:
         buttons = [
             ("Stop: rest, and end the run", PageRequest.STOP, "red"),
             ("Pause both arms", PageRequest.PAUSE, "orange"),
@@ -51,31 +81,66 @@ class Panel:
                 ("Begin or end an episode", PageRequest.RECORD, "gray"),
                 ("Mark this moment", PageRequest.MARK, "gray"),
             ]
-        if self._driving is not None:
-            self._driving.add_buttons(gui)
         for label, request, colour in buttons:
 
             def ask(_: object, request: PageRequest = request) -> None:
-                answer(request)
+                self._answer(request)
 
             gui.add_button(label, color=colour).on_click(ask)
+
+    def _add_time_line(self, gui: viser.GuiApi) -> None:
+        gui.add_button("Play, or stand still", color="blue").on_click(lambda _: self._answer(PagePlay()))
+        self._time_line = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
+
+        def seek(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+            if event.client_id is not None:  # no page has moved it otherwise
+                self._answer(PageSeek(float(event.target.value)))
+
+        self._time_line.on_update(seek)
+        gui.add_button("End the replay", color="red").on_click(lambda _: self._answer(PageRequest.STOP))
+
+    def _add_slider(
+        self,
+        gui: viser.GuiApi,
+        label: str,
+        setting: PageSetting,
+        numbers: tuple[float, float, float, float],
+        unit: float = 1.0,
+    ) -> None:
+        """``numbers``: least, greatest, step and first value, in ``unit`` of the setting."""
+        slider = gui.add_slider(label, *numbers)
+
+        def move(_: object) -> None:
+            self._moved[setting] = unit * min(max(float(slider.value), numbers[0]), numbers[1])
+
+        slider.on_update(move)
 
     def follow(self, frame: Frame) -> None:
         """Keep what a frame says that may be shown later."""
         self._last |= {event.arm: event for event in frame.events}
         self._binding |= dict.fromkeys(frame.binding)
         self._ticks += frame.ticks
+        self._slowest = max(self._slowest, frame.slowest)
 
     def show(self, frame: Frame) -> None:
-        """Draw the table, some times a second."""
+        """Draw the table, and pass on where sliders are, some times a second."""
         passed = time.monotonic() - self._shown
         if passed >= _PERIOD:
             self._shown += passed
             ticks, self._ticks = self._ticks, 0
+            slowest, self._slowest = self._slowest, 0.0
+            self._rates.append(ticks / passed)
+            self._times.append(1e6 * slowest)
             binding, self._binding = list(self._binding), {}
-            self._table.content = self._drawn(frame, ticks / passed, binding)
+            self._table.content = self._drawn(frame, binding)
+            if (line := self._time_line) is not None and frame.tick.t != line.value:
+                line.max = max(frame.end, line.max)
+                line.value = frame.tick.t
+            moved, self._moved = self._moved, {}
+            for setting, value in moved.items():
+                self._answer(PageChange(setting, value))
 
-    def _drawn(self, frame: Frame, rate: float, binding: list[ActiveLimit]) -> str:
+    def _drawn(self, frame: Frame, binding: list[ActiveLimit]) -> str:
         tick, arms = frame.tick, list(frame.tick.tools)
         rows = [
             ("", [f"<b>{escape(arm)}</b>" for arm in arms]),
@@ -92,10 +157,15 @@ class Panel:
         report = tick.reference.report
         certified = _coloured("certified", GREEN) if report.certified else _coloured("not certified", RED)
         lines = [
-            f"{tick.t:.1f} s, {rate:.0f} Hz, {1e6 * tick.compute_time:.0f} us a tick",
+            f"{tick.t:.1f} s",
             f"tightest pair: {escape(' | '.join(report.tightest_pair))}",
             f"a stop is {certified}; status {escape(str(report.status))}",
         ]
+        plots: list[str] = []
+        if not self._setup.replayed:
+            rate, top = self._rates[-1], self._setup.config.loop_rate_hz
+            plots.append(_plot(f"loop, {rate:.0f} Hz", self._rates, 1.2 * top))
+            plots.append(_plot(f"slowest tick, {self._times[-1]:.0f} us", self._times, 1e6 / top))
         if self._driving is not None:
             lines.insert(0, escape(self._driving.words))
         cells = "".join(
@@ -104,7 +174,8 @@ class Panel:
             + "</tr>"
             for name, values in rows
         )
-        return f"<div style='{_STYLE}'><table style='width:100%'>{cells}</table>{'<br>'.join(lines)}</div>"
+        below = "<br>".join(lines) + "".join(plots)
+        return f"<div style='{_STYLE}'><table style='width:100%'>{cells}</table>{below}</div>"
 
     def _bars(self, frame: Frame, arm: str) -> str:
         joints, setup = self._setup.joints[arm], self._setup
@@ -128,3 +199,15 @@ def _distance(metres: float) -> str:
 
 def _share(opening: float | None) -> str:
     return "-" if opening is None else f"{100.0 * opening:.0f} % open"
+
+
+def _plot(label: str, values: Sequence[float], top: float) -> str:
+    """A line of the last values, from 0 up to ``top``."""
+    points = " ".join(
+        f"{100.0 * i / _HISTORY:.0f},{20.0 * (1.0 - min(y / top, 1.0)):.1f}" for i, y in enumerate(values)
+    )
+    return (
+        f"<div style='color:#777'>{label}</div><svg viewBox='0 0 100 21' preserveAspectRatio='none'"
+        " style='display:block;width:100%;height:24px;background:#8881'><polyline fill='none' stroke='#3c78d8'"
+        f" vector-effect='non-scaling-stroke' points='{points}'/></svg>"
+    )

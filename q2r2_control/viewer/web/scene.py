@@ -12,7 +12,7 @@ from q2r2_control.robot.pairs import pair_names
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.types import Array
 from q2r2_control.viewer.web.exchange import Frame, PageSetup
-from q2r2_control.viewer.web.figure import Colour, JointTree, RobotFigure, colour_of, place
+from q2r2_control.viewer.web.figure import CapsuleFigure, Colour, JointTree, RobotFigure, colour_of, place
 
 GREEN, AMBER, RED, BLUE, GREY = (46, 160, 90), (230, 160, 30), (214, 57, 57), (60, 120, 216), (140, 146, 152)
 _COLOURS: dict[str, Colour] = {
@@ -28,9 +28,10 @@ _COLOURS: dict[str, Colour] = {
 _TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (150, 80, 190))
 _TRAIL = 90  # points
 _TRAIL_PERIOD = 0.05  # between them, by the run's time [s]
+_BREAK = 1.0  # a trail begins anew after a longer time [s]
 _AWAY = 0.01  # the ghost shows where a joint is farther from its reference than this [rad]
 _NEAR = 0.1  # a pair with more to spare is calm [m]
-_CAMERA = np.array([2.3, 0.9, 0.9])  # from the middle of the arms [m]
+_CAMERA = np.array([2.0, 1.0, 1.1])  # from the middle of the arms [m]
 FIELD_OF_VIEW = math.radians(40.0)  # of the camera, upwards
 _BACKGROUND: Colour = (238, 241, 244)
 
@@ -59,6 +60,7 @@ class CellScene:
         self._data, self._pair_data = self._model.createData(), self._pairs.createData()
         self._tree = JointTree(setup)
         scene.set_up_direction("+z")
+        scene.configure_default_lights(cast_shadow=False)  # a browser without a graphics card is ten times as fast
         scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, dtype=np.uint8))
         scene.add_grid(
             "/floor",
@@ -76,13 +78,16 @@ class CellScene:
             RobotFigure(scene, "/robot", self._tree),
             RobotFigure(scene, "/ghost", self._tree, True),
         )
-        self.ghost_always = False
+        self._capsules = CapsuleFigure(scene, "/capsules", self._pairs)
+        self._ghost_always = self._add_choices(server)
         arms = list(setup.joints)
         look = {"axes_length": 0.08, "axes_radius": 0.003, "origin_radius": 0.012, "visible": False}
         self._targets = {arm: scene.add_frame(f"/targets/{arm}", **look) for arm in arms}
         self._tools = {arm: scene.add_frame(f"/tools/{arm}", show_axes=False) for arm in arms}
-        for arm in arms:
-            scene.add_label(f"/tools/{arm}/name", arm, position=(0.0, 0.0, 0.1), anchor="bottom-center")
+        pin.forwardKinematics(self._model, self._data, setup.home)
+        for arm, joints in setup.joints.items():
+            first = self._data.oMi[self._model.getJointId(setup.joint_names[joints[0]])].translation
+            scene.add_label(f"/names/{arm}", arm, position=first, anchor="top-center")
         nothing = np.zeros((_TRAIL - 1, 2, 3), dtype=np.float32)
         self._trails = {
             arm: scene.add_line_segments(f"/trails/{arm}", nothing, _faded(colour), line_width=2.5)
@@ -106,11 +111,28 @@ class CellScene:
         camera.position, camera.look_at = first_view(self._model, setup.home)
         camera.fov = FIELD_OF_VIEW
 
+    def _add_choices(self, server: viser.ViserServer) -> viser.GuiInputHandle[bool]:
+        """Things that are drawn on request; returns whether the ghost always is."""
+        with server.gui.add_folder("View", order=1e9, expand_by_default=False):
+            shadows = server.gui.add_checkbox("shadows", False, hint="slow without a graphics card")
+            capsules = server.gui.add_checkbox("shapes that are kept apart", False)
+            ghost = server.gui.add_checkbox("reference always", False)
+
+        @shadows.on_update
+        def _(_: object) -> None:
+            server.scene.configure_default_lights(cast_shadow=bool(shadows.value))
+
+        @capsules.on_update
+        def _(_: object) -> None:
+            self._capsules.root.visible = bool(capsules.value)
+
+        return ghost
+
     def show(self, frame: Frame) -> None:
         """Draw one frame."""
         tick = frame.tick
         self._robot.show(self._tree.posture(tick.state.q, tick.grippers))
-        away = bool(np.abs(tick.state.q - tick.reference.q).max() > _AWAY) or self.ghost_always
+        away = bool(np.abs(tick.state.q - tick.reference.q).max() > _AWAY) or self._ghost_always.value
         self._ghost.root.visible = away
         if away:
             self._ghost.show(self._tree.posture(tick.reference.q, tick.grippers))
@@ -131,8 +153,10 @@ class CellScene:
 
     def _show_trails(self, frame: Frame) -> None:
         tick = frame.tick
-        if tick.t < self._trail_time + _TRAIL_PERIOD:
+        if 0.0 <= tick.t - self._trail_time < _TRAIL_PERIOD:
             return
+        if not 0.0 <= tick.t - self._trail_time < _BREAK:
+            self._trail_points.clear()  # a replay's time line was moved
         self._trail_time = tick.t
         for arm, trail in self._trails.items():
             here = tick.tools[arm].translation.astype(np.float32)
@@ -143,13 +167,15 @@ class CellScene:
 
     def _show_pair(self, frame: Frame) -> None:
         report = frame.tick.reference.report
+        q = frame.tick.reference.q
+        pin.updateGeometryPlacements(self._model, self._data, self._pairs, self._pair_data, q)
+        if self._capsules.root.visible:
+            self._capsules.show(self._pair_data)
         known = report.tightest_pair in self._names and math.isfinite(report.margin)
         self._pair.visible = self._pair_label.visible = known
         if not known:
             return
-        index, q = self._names.index(report.tightest_pair), frame.tick.reference.q
-        pin.updateGeometryPlacements(self._model, self._data, self._pairs, self._pair_data, q)
-        result = pin.computeDistance(self._pairs, self._pair_data, index)
+        result = pin.computeDistance(self._pairs, self._pair_data, self._names.index(report.tightest_pair))
         ends = np.array([result.getNearestPoint1(), result.getNearestPoint2()])
         calm = min(max(report.margin / _NEAR, 0.0), 1.0)
         colour = tuple(round(calm * one + (1.0 - calm) * other) for one, other in zip(GREEN, RED, strict=True))

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from threading import Condition, Thread
+from threading import Condition, Lock, Thread
 from typing import Any
 
 import viser
 
 from q2r2_control.viewer.web.door import Door
 from q2r2_control.viewer.web.driving import Driving
-from q2r2_control.viewer.web.exchange import Frame, PageSetup, Ready
+from q2r2_control.viewer.web.exchange import Frame, PageLost, PageRequest, PageSetup, Ready
 from q2r2_control.viewer.web.panel import Panel
 from q2r2_control.viewer.web.scene import CellScene
 
-_NICENESS = 19  # the loop goes first
+_NICENESS = 10  # the loop goes first
+_RATE, _BURST = 500.0, 50.0  # answers a second, and at once; two hands that a page moves need 220 a second
 
 
 class _Newest:
@@ -43,6 +45,26 @@ class _Newest:
             yield frame
 
 
+class LimitedAnswers:
+    """Passes answers of browsers on, but no flood of them, which would take the interpreter from the loop.
+
+    A stop always passes, and so does the loss of a page that drove.
+    """
+
+    def __init__(self, answer: Callable[[Any], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._answer, self._clock, self._lock = answer, clock, Lock()
+        self._room, self._then = _BURST, clock()
+
+    def __call__(self, answer: Any) -> None:
+        with self._lock:
+            now = self._clock()
+            self._room, self._then = min(self._room + _RATE * (now - self._then), _BURST), now
+            if self._room < 1.0 and answer is not PageRequest.STOP and not isinstance(answer, PageLost):
+                return
+            self._room = max(self._room - 1.0, 0.0)
+        self._answer(answer)
+
+
 def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
     """Answer :class:`Ready`, then what browsers ask for. Raises :class:`ConfigError` for an address that is taken."""
     setup: PageSetup | None = next(requests, None)
@@ -54,8 +76,9 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
     with door.guards():
         server = viser.ViserServer(host=setup.host, port=door.port, verbose=False)
     scene = CellScene(server, setup)
-    driving = Driving(server, setup, answer) if setup.driven else None
-    panel = Panel(server, setup, driving, answer)
+    limited = LimitedAnswers(answer)
+    driving = Driving(server, setup, limited) if setup.driven else None
+    panel = Panel(server, setup, driving, limited)
     answer(Ready(door.url))
 
     def read() -> None:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from importlib.util import find_spec
 from threading import Event as Flag
 from typing import Any
 
+from pydantic import ValidationError
+
 from q2r2_control.config.bindings import Action
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event
 from q2r2_control.inputs.web import WebInput
@@ -20,10 +23,19 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
-from q2r2_control.viewer.web.exchange import Frame, PageHand, PageLost, PageRequest, PageSetup, Ready
+from q2r2_control.viewer.web.exchange import (
+    Frame,
+    PageChange,
+    PageHand,
+    PageLost,
+    PageRequest,
+    PageSetting,
+    PageSetup,
+    Ready,
+)
 
 _PERIOD = 1.0 / 30.0  # between frames [s]
-_READY = 30.0  # for the process to be ready, before the run [s]
+_READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
 _PATIENCE = 2.0  # for it to end [s]
 
 _logger = logging.getLogger(__name__)
@@ -46,10 +58,12 @@ class PageView(AbstractContextManager["PageView"]):
         self._due = 0.0  # of the next frame, by the clock on the wall [s]
         self._events: list[Event] = []
         self._binding: dict[ActiveLimit, None] = {}
-        self._ticks = 0
+        self._ticks, self._slowest = 0, 0.0
         self._plant: MujocoPlant | None = None  # whose loose objects are shown
         self._input: WebInput | None = None  # that the page drives
         self._requests: dict[PageRequest, Callable[[], None]] = {}
+        self._on_request: Callable[[Any], None] | None = None  # instead of the run
+        self._changes: dict[PageSetting, Callable[[float], None]] = {}
         try:
             # Room for one frame: a newer one is better than a queue.
             self._process = HelperProcess("serves the page", "q2r2_control.viewer.web.server", self._on_answer, room=1)
@@ -58,6 +72,21 @@ class PageView(AbstractContextManager["PageView"]):
 
     def begin(self, pipeline: Pipeline, title: str, recorded: bool) -> str:
         """Serve the page of a run that is about to begin; returns its URL. Raises :class:`ConfigError`."""
+        url = self.serve(pipeline, title, recorded=recorded)
+        pipeline.listeners.append(self)
+        return url
+
+    def serve(
+        self,
+        pipeline: Pipeline,
+        title: str,
+        *,
+        recorded: bool = False,
+        replayed: bool = False,
+        on_request: Callable[[Any], None] | None = None,
+    ) -> str:
+        """Serve a page; returns its URL. ``on_request`` gets what its buttons ask for, instead of the run."""
+        self._on_request = on_request
         robot, plant = pipeline.robot, pipeline.plant
         self._input = pipeline.input if isinstance(pipeline.input, WebInput) else None
         parts = {}
@@ -72,6 +101,7 @@ class PageView(AbstractContextManager["PageView"]):
             PageRequest.RECORD: partial(pipeline.mark, Action.RECORD_TOGGLE),
             PageRequest.MARK: partial(pipeline.mark, Action.RECORD_MARK),
         }
+        self._changes = _changes_of(pipeline)
         setup = PageSetup(
             host=self._host,
             port=self._port,
@@ -89,6 +119,7 @@ class PageView(AbstractContextManager["PageView"]):
             parts=parts,
             recorded=recorded,
             driven=self._input is not None,
+            replayed=replayed,
         )
         self._process.send(setup)
         waited = 0.0
@@ -96,12 +127,20 @@ class PageView(AbstractContextManager["PageView"]):
             waited += 0.1
         if self.url is None:
             raise ConfigError(self._process.fault or f"--web: the page was not ready within {_READY:g} s")
-        pipeline.listeners.append(self)
         return self.url
+
+    @property
+    def alive(self) -> bool:
+        return self._process.alive
+
+    def send(self, frame: Frame) -> bool:
+        """Show a frame, unless the page is not done with the last one."""
+        return self._process.send(frame, 1)
 
     def __call__(self, tick: Tick) -> None:
         """Store one tick, and send it where a frame is due."""
         self._ticks += 1
+        self._slowest = max(self._slowest, tick.compute_time)
         if tick.events:
             self._events += tick.events
         if tick.reference.report.binding:
@@ -114,18 +153,23 @@ class PageView(AbstractContextManager["PageView"]):
             _logger.warning("the page is gone, the run goes on: %s", self._process.fault)
             return
         moved = None if self._plant is None else self._plant.observed_qpos
-        frame = Frame(tick, tuple(self._events), tuple(self._binding), self._ticks, moved)
-        if self._process.send(frame, 1):
+        frame = Frame(tick, tuple(self._events), tuple(self._binding), self._ticks, self._slowest, moved)
+        if self.send(frame):
             self._due = now + _PERIOD
-            self._events, self._binding, self._ticks = [], {}, 0
+            self._events, self._binding, self._ticks, self._slowest = [], {}, 0, 0.0
 
     def _on_answer(self, answer: Any) -> None:
         """In a thread of its own."""
         if isinstance(answer, Ready):
             self.url = answer.url
             self._ready.set()
+        elif self._on_request is not None:
+            self._on_request(answer)
         elif isinstance(answer, PageRequest):
             self._requests[answer]()
+        elif isinstance(answer, PageChange):
+            with suppress(ConfigError):  # a number that no slider has
+                self._changes[answer.setting](answer.value)
         elif self._input is not None and isinstance(answer, PageHand):
             controls = {"drag": float(answer.drag), "gripper": float(answer.gripper)}
             self._input.receive(answer.hand, answer.position, answer.quaternion, controls)
@@ -134,3 +178,19 @@ class PageView(AbstractContextManager["PageView"]):
 
     def __exit__(self, *_: object) -> None:
         self._process.finish(_PATIENCE)
+
+
+def _changes_of(pipeline: Pipeline) -> dict[PageSetting, Callable[[float], None]]:
+    """The effect of each slider: speeds stay below the cell's, and a number that is not allowed changes nothing."""
+    control, teleop = pipeline.config.control, pipeline.config.teleop
+
+    def limit_speed(part: float) -> None:
+        part = min(part, 1.0)
+        names = ("max_linear_speed", "max_angular_speed")
+        pipeline.change_control({name: part * getattr(control, name) for name in names})
+
+    def scale(factor: float) -> None:
+        with suppress(ValidationError):
+            pipeline.change_teleop(TeleopSettings.model_validate(teleop.model_dump() | {"position_scale": factor}))
+
+    return {PageSetting.SPEED: limit_speed, PageSetting.SCALE: scale}

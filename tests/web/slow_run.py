@@ -1,0 +1,50 @@
+"""A run with its page whose time passes slowly: a busy machine makes neither a hand nor a page late.
+
+python -m tests.web.slow_run INPUT PORT PAUSE
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+from q2r2_control.inputs.base import make_input
+from q2r2_control.inputs.web import WebInput, web_cell
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.summary.tick import Tick
+from q2r2_control.viewer.web import view
+from tests.support.processes import cell
+
+
+class SlowTime:
+    """The loop's time, of which a tick of 1 ms takes ``pause`` [s] and more."""
+
+    def __init__(self, pause: float) -> None:
+        self._pause, self._now = pause, 0.0
+
+    def __call__(self) -> float:
+        return self._now
+
+    def pass_by(self, tick: Tick) -> None:
+        self._now = tick.now
+        time.sleep(self._pause)
+
+
+def main(source: str, port: int, pause: float) -> None:
+    slow = SlowTime(pause)
+    is_web = source == "web"
+    config = web_cell(cell()) if is_web else cell()
+    gate = config.teleop.gate.model_copy(update={"timeout": 2.0})
+    config = config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": gate})})
+    hands = WebInput(slow) if is_web else make_input("scripted", config, trajectory=source)
+    pipeline = Pipeline.from_config(config, input=hands, plant="kinematic")
+    pipeline.listeners.append(slow.pass_by)
+    view._PERIOD = 0.2  # a processor draws the page, which takes long
+    with view.PageView("127.0.0.1", port) as page:
+        print(f"page: {page.begin(pipeline, 'slow', False)}", file=sys.stderr, flush=True)
+        print(json.dumps(pipeline.run(realtime=False).as_json()))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]))
