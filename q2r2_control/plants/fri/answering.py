@@ -12,7 +12,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from subprocess import TimeoutExpired
@@ -27,9 +27,6 @@ from q2r2_control.process.scheduling import few_garbage_collections, how_it_ende
 _TAKEN, _TOO_LATE = b"1", b"0"  # a word about commands
 _LARGEST = 1 << 16  # of what is passed on [bytes]
 _POLL = 0.05  # of looking whether the arms of a loop that has ended stand still [s]
-# A processor that sleeps wakes up as slowly as an answer is made. With a priority it is kept awake around the time at
-# which a message is expected, for this share of the cabinet's period before and after.
-_AWAKE = 0.06
 _PATIENCE = 5.0  # with a process that is to end [s]
 _LONGEST_WORD = 1.0  # until it says whether commands came in time; arms brake meanwhile [s]
 # Linux stamps datagrams as they arrive (SO_TIMESTAMPNS) by its real-time clock; longer waits are jumps of that [s].
@@ -123,14 +120,14 @@ def main(commands: int, states: int) -> None:
                 if priority:
                     stack.enter_context(real_time(priority))
                 stack.enter_context(few_garbage_collections())
-                _Answering(from_loop, to_loop, lines, bool(priority)).run()
+                _Answering(from_loop, to_loop, lines).run()
         except Exception as error:
             from_loop.send(reason_of(error).encode())
 
 
 class _Answering:
-    def __init__(self, commands: socket.socket, states: socket.socket, lines: list[Line], awake: bool) -> None:
-        self._commands, self._states, self._awake = commands, states, awake
+    def __init__(self, commands: socket.socket, states: socket.socket, lines: list[Line]) -> None:
+        self._commands, self._states = commands, states
         self._sessions = {line.session.state.arm: line.session for line in lines}
         self._lines = {line.file: (line, socket.socket(fileno=line.file)) for line in lines}
 
@@ -142,16 +139,12 @@ class _Answering:
                     opened.recv(LONGEST + 1)
         ended = False
         while not (ended and all(session.is_still(time.monotonic()) for session in self._sessions.values())):
-            for file in select.select(files, (), (), self._sleep())[0]:
+            for file in select.select(files, (), (), _POLL)[0]:
                 if not (ended or self._take_commands()):
                     ended = True
                     files.remove(self._commands.fileno())
                 if file in self._lines:
                     self._answer(*self._lines[file])
-
-    def _sleep(self) -> float:
-        now, sessions = time.monotonic(), self._sessions.values() if self._awake else ()
-        return sleep_for((session.next_message - now, _AWAKE * session.state.period) for session in sessions)
 
     def _take_commands(self) -> bool:
         """Take all that was sent before an answer; returns whether the loop is there."""
@@ -182,11 +175,6 @@ class _Answering:
             return
         with suppress(OSError):  # a loop that stands still gets a later state
             self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))
-
-
-def sleep_for(expected: Iterable[tuple[float, float]]) -> float:
-    """How long to sleep [s], with messages ``expected`` after some time, and how long to be awake around it [s]."""
-    return min([max(wait - awake, 0.0) for wait, awake in expected if wait > -awake], default=_POLL)
 
 
 def open_socket(address: str, port: int) -> socket.socket:

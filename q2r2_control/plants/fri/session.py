@@ -59,11 +59,6 @@ class ArmSession:
         self._clock = MessageClock(-math.inf)
         self._begun = False  # the cabinet's own position is known, where the path begins
 
-    @property
-    def next_message(self) -> float:
-        """When the cabinet's next message is expected [s]."""
-        return self._clock.expected + (0.0 if self.state.newest is None else self.state.newest.period)
-
     def is_still(self, now: float) -> bool:
         """Whether nothing moves the arm at ``now`` [s] if no more commands come."""
         if not self.state.following or self.state.is_silent(now):

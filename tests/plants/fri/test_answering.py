@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.errors import PlantError
-from q2r2_control.plants.fri.answering import AnsweringProcess, Line, open_socket, sleep_for
+from q2r2_control.plants.fri.answering import AnsweringProcess, Line, open_socket
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import Command, Monitoring, Quality, Session, read_command, write_monitoring
@@ -111,11 +111,3 @@ def test_a_process_that_fails_says_why(between: Between) -> None:
     still = np.zeros(7)
     with pytest.raises(PlantError, match="the cabinets are answered no more: 'middle'"):
         between.process.send({"middle": ArmCommand(0.0, 0.0, 0.001, still, still, 1.0 + still)})
-
-
-def test_a_process_with_priority_is_awake_around_the_time_of_a_message_only() -> None:
-    awake = 3e-4
-    left = (0.004, awake)
-    assert sleep_for([left, (0.0025, awake)]) == pytest.approx(0.0022), "until shortly before the next message"
-    assert sleep_for([left, (1e-4, awake)]) == sleep_for([left, (-2e-4, awake)]) == 0.0
-    assert sleep_for([(-4e-4, awake), (-4e-4, awake)]) > 0.01, "a cabinet that is silent keeps nobody awake"
