@@ -22,8 +22,8 @@ from q2r2_control.plants.fri.wire import JOINTS, CommandKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Command, CommandMode, RobotState
 
-# From the decision how far the reference goes until the sessions have it [s].
-_MARGIN = 0.002
+# From the decision how far the reference goes until the sessions have it, and after commands that came too late [s].
+_MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 _PASSING = 0.0015  # from a measurement until it has passed cabinet, network and processes, about [s]
 _NO_COMMANDS = 0.1  # so long without one that came in time is told [s]
 # In which an arm loses most of its speed where no overlay comes: several periods of a cabinet [s].
@@ -47,6 +47,7 @@ class FriCell:
         self._data = robot.model.createData()
         self._now = self._start = self._end = -math.inf  # of the newest tick, and of its piece of the path [s]
         self._withdraws, self._in_time = False, -math.inf  # the newest command, and when one was not [s]
+        self._margin = _MARGIN  # for the next command [s]
         self._told = self._ends()
 
     def update(self, state: SessionState) -> None:
@@ -56,7 +57,8 @@ class FriCell:
     def due(self, now: float) -> tuple[float, float]:
         """In a tick at ``now`` [s]: how long the reference has to brake first, and to go on then [s]."""
         following = [state for state in self.states.values() if state.following]
-        latest = max([now + _MARGIN - DELAY, *(state.latest(now + _MARGIN) for state in following)])
+        sent = now + self._margin
+        latest = max([sent - DELAY, *(state.latest(sent) for state in following)])
         self._now, before = now, self._end
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
@@ -104,9 +106,9 @@ class FriCell:
         """The commands of a tick were ``taken`` by the sessions, or came too late for one of them."""
         self._withdraws = not taken
         if taken:
-            self._in_time = self._now
+            self._in_time, self._margin = self._now, _MARGIN
         else:
-            self._end = self._start
+            self._end, self._margin = self._start, min(2.0 * self._margin, _LONGEST_MARGIN)
 
     def withdraws(self) -> bool:
         """Whether the newest command came after an answer that it was for: the arms go on along the stop before it."""

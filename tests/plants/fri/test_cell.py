@@ -119,6 +119,22 @@ def test_a_command_that_answers_have_passed_is_withdrawn_and_the_arms_go_on(conf
         assert (np.abs(to - q - 0.5 * step * (speed + v)) <= 0.5 * ACCELERATION * step**2 + 1e-9).all()
 
 
+def test_arms_go_on_although_each_tick_takes_longer_than_the_loop_allows_for(config: Config) -> None:
+    pipeline = make_loop(config)
+    plant = started(pipeline)
+
+    def think(tick: Tick) -> None:
+        plant.thinking = 0.008 if tick.now > 1.0 else 0.0
+        pipeline.freeze(0.007 if tick.now > 1.0 else 0.0)
+
+    pipeline.listeners.append(think)
+    summary = pipeline.run(4.0, realtime=False)
+    assert trips(plant) == []
+    assert ReasonKind.FRI_OVERTAKEN not in {event.reason.root.kind for event in summary.events}
+    for arm in SIDES:
+        assert summary.arms[arm].engaged_s > 3.0
+
+
 def test_a_loop_that_is_always_too_late_says_so(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
