@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -173,8 +173,9 @@ def test_a_tool_that_is_heavier_than_its_model_ends_the_load(
 
 
 @pytest.fixture
-def interrupted(virtual: Callable[..., None]) -> list[PendantCabinets]:
-    """A person presses Ctrl-C while the left arm moves."""
+def interrupted(virtual: Callable[..., None]) -> Iterator[list[PendantCabinets]]:
+    """A person presses Ctrl-C while the left arm moves, as in a terminal, whatever handles it in this process."""
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     made: list[PendantCabinets] = []
 
     def prepare(cabinets: PendantCabinets) -> None:
@@ -190,7 +191,8 @@ def interrupted(virtual: Callable[..., None]) -> list[PendantCabinets]:
         cabinets.on_message = press
 
     virtual(partial(slow_run, prepare=prepare))
-    return made
+    yield made
+    signal.signal(signal.SIGINT, handler)
 
 
 def test_ctrl_c_brings_the_arms_to_rest_first(cell: Path, interrupted: list[PendantCabinets]) -> None:
