@@ -24,6 +24,11 @@ def machine_notes() -> list[str]:
             notes.append(refused)
     if sys.platform == "linux" and _text("/sys/kernel/realtime") != "1":
         notes.append("the kernel has no PREEMPT_RT: answers may be late by milliseconds; install a real-time kernel")
+    if _text("/proc/sys/kernel/sched_rt_runtime_us") not in ("", "-1"):
+        notes.append(
+            "Linux halts real-time threads for 50 ms once they took 95 % of a processor for a second;"
+            " sysctl -w kernel.sched_rt_runtime_us=-1"
+        )
     governor = _text("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
     if governor not in ("", "performance"):
         notes.append(f"the processors' governor is {governor}; cpupower frequency-set -g performance")

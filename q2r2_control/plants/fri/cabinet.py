@@ -124,7 +124,8 @@ class Cabinet:
         self._heard: int | None = None  # counter of the client's newest message
         self._answer: Command | None = None  # to the newest message that asked for one
         self._in_time: deque[bool] = deque(maxlen=_WINDOW)
-        self._misses = self.missed = 0  # in a row, and in all, of those that were due while the client commanded
+        self._misses = 0  # in a row
+        self.missed = 0  # of a client that commanded and answered again: not those of one that has ended
         self._overlay = False  # the application asks for the client's command
         self._commanded: Joints = arm.q  # by the cabinet's own motion, or by the client
         self._velocity: Joints = (0.0,) * JOINTS
@@ -205,8 +206,11 @@ class Cabinet:
     def _judge(self) -> None:
         answer, self._answer = self._answer, None
         self._in_time.append(answer is not None)
-        self.missed += answer is None and self.session is Session.COMMANDING_ACTIVE
-        self._misses = 0 if answer is not None else self._misses + 1
+        if answer is None:
+            self._misses += 1
+        else:
+            self.missed += self._misses if self.session is Session.COMMANDING_ACTIVE else 0
+            self._misses = 0
         if self.session is Session.COMMANDING_ACTIVE:
             if self._misses > _MISSES or self.quality < Quality.GOOD:
                 self.stop(Trip.LATE)

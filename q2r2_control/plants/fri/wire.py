@@ -230,10 +230,10 @@ def _set_header(message: Any, identifier: int, counter: int, reflected: int) -> 
 
 def _joints(message: Any, name: str) -> Joints | None:
     """Seven finite numbers, or None where the message has none."""
-    if not message.HasField(name):
-        return None
     values = tuple(getattr(message, name).value)
-    if len(values) != JOINTS or not math.isfinite(math.hypot(*values)):
+    if not values:
+        return None
+    if len(values) != JOINTS or not math.isfinite(sum(values)):
         raise ProtocolError(f"FRI {name} = {values!s:.80}: allowed: {JOINTS} finite numbers")
     return values
 

@@ -160,6 +160,14 @@ def test_other_bytes_and_another_version_end_the_command_and_a_late_answer_count
     assert cabinet.trips == [Trip.LATE]
 
 
+def test_answers_that_did_not_come_count_as_missed_where_the_client_goes_on_and_not_where_it_has_ended() -> None:
+    cabinet, client = commanding()
+    run(cabinet, 100, lambda message: client.answer(message) if message.counter % 20 else None)
+    assert cabinet.missed == 6  # with the last message of commanding()
+    run(cabinet, 20, lambda message: None)
+    assert (cabinet.missed, cabinet.trips) == (6, [Trip.LATE])
+
+
 def test_after_a_stop_the_overlay_has_to_be_started_again_and_the_safety_stop_be_over() -> None:
     cabinet, client = commanding()
     cabinet.safety_stop(Safety.STOP_2)
