@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
+import time
 from array import array
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
+from multiprocessing import get_context
 from typing import Annotated, Any
 
 import numpy as np
@@ -27,6 +31,21 @@ from q2r2_control.viewer.tables import figure_table
 
 _CONFIG = "config/dual_iiwa7_fri.yaml"
 _LONGEST_DELAY = 0.1  # that is looked for [s]
+_FIRST = 90  # a priority above all others
+_SLEEP, _STILL = 0.001, 0.001  # a thread that sleeps so long and wakes up later by more was kept waiting [s]
+_MARGIN = 30.0  # for the begin of a run [s]
+
+
+def stand_stills(processor: int, duration: float) -> list[tuple[float, float]]:
+    """From when to when a processor kept even its first thread waiting, which only sleeps, in ``duration`` [s]."""
+    os.sched_setaffinity(0, {processor})
+    found, end = [], time.monotonic() + duration
+    with real_time(_FIRST):
+        while (before := time.monotonic()) < end:
+            time.sleep(_SLEEP)
+            if (now := time.monotonic()) - before > _SLEEP + _STILL:
+                found.append((before + _SLEEP, now))
+    return found
 
 
 class ToolWay:
@@ -52,14 +71,14 @@ class ToolWay:
         return float(1e3 * np.sqrt(np.square(apart[is_new]).sum(axis=1).mean()))
 
 
-def measure_directly(mode: CommandMode, duration: float) -> float:
-    """The error without cabinets, in simulated time [mm RMS]."""
+def measure_directly(mode: CommandMode, duration: float) -> tuple[float, dict[str, float | None]]:
+    """Errors without cabinets, in simulated time [mm RMS]: of the tools behind the reference, and behind the hands."""
     config = load_config(_CONFIG)
     robot = Robot.from_config(config)
     pipeline = Pipeline(config, robot, ScriptedInput("circle"), MujocoPlant(robot, config), mode)
     pipeline.listeners.append(way := ToolWay(robot))
-    pipeline.run(duration, realtime=False)
-    return way.error(0)
+    summary = pipeline.run(duration, realtime=False)
+    return way.error(0), {arm: figures.position_error_mm_rms for arm, figures in summary.arms.items()}
 
 
 def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) -> dict[str, Any]:
@@ -76,6 +95,9 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
         *(["--rt"] if rt else ()),
         *options,
     ]
+    processors = sorted(os.sched_getaffinity(0))
+    watching = ProcessPoolExecutor(len(processors), get_context("spawn"))
+    stills = [watching.submit(stand_stills, each, duration + _MARGIN) for each in processors if rt]
     cabinets = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert cabinets.stderr is not None
     cabinets.stderr.readline()  # that they have begun
@@ -93,18 +115,26 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     finally:
         cabinets.send_signal(signal.SIGINT)
         said, _ = cabinets.communicate()
+    moments = [moment for each in stills for moment in each.result()]
+    watching.shutdown()
+    arrived, took = np.array(plant.answers).T
+    period = max(state.period for state in plant.states().values())
+    late = [(came, came + its) for came, its in zip(arrived, took, strict=True) if its > period]
     errors = [way.error(delay) for delay in range(round(_LONGEST_DELAY * config.loop_rate_hz))]
+    direct_error, direct_errors = measure_directly(mode, min(duration, 30.0))  # the circles repeat
     return {
         "delay_ms": 1e3 * int(np.argmin(errors)) / config.loop_rate_hz,
         "error_after_delay_mm_rms": min(errors),
-        "direct_error_mm_rms": measure_directly(mode, min(duration, 30.0)),  # the circles repeat
-        "answers": len(plant.answer_times),
-        "answer_ms": dict(
-            zip(("p50", "p99", "max"), 1e3 * np.percentile(plant.answer_times, (50, 99, 100)), strict=True)
-        ),
+        "direct_error_mm_rms": direct_error,
+        "answers": len(took),
+        "answer_ms": dict(zip(("p50", "p99", "max"), 1e3 * np.percentile(took, (50, 99, 100)), strict=True)),
+        "late_answers": len(late),
+        "late_answers_in_stand_stills": sum(any(a < end and b > begin for a, b in moments) for begin, end in late),
+        "stand_stills_ms": sorted((round(1e3 * (b - a), 1) for a, b in moments), reverse=True),
         "lost_messages": {arm: state.lost for arm, state in plant.states().items()},
         "engaged_s": {arm: figures.engaged_s for arm, figures in summary.arms.items()},
         "error_mm_rms": {arm: figures.position_error_mm_rms for arm, figures in summary.arms.items()},
+        "direct_errors_mm_rms": direct_errors,
         "cabinets": json.loads(said)["cabinets"],
     }
 
@@ -118,15 +148,20 @@ def main(
 ) -> None:
     """Print how long cabinets wait for their answers, what they missed, and the error of the arms."""
     data = measure(mode, duration, rt, options or [])
+    keys = "engaged_s", "error_mm_rms", "direct_errors_mm_rms"
     # The last end of a session is that of this run.
     rows = [
-        (arm, data["engaged_s"][arm], data["error_mm_rms"][arm], its["missed"], ", ".join(its["trips"][:-1]) or "-")
+        (arm, *(data[key][arm] for key in keys), its["missed"], ", ".join(its["trips"][:-1]) or "-")
         for arm, its in data["cabinets"].items()
     ]
-    columns = ("arm", "engaged [s]", "RMS error [mm]", "missed [answers]", "session ends before the run's")
+    errors = "RMS error [mm]", "without cabinets [mm]"
+    columns = ("arm", "engaged [s]", *errors, "missed [answers]", "session ends before the run's")
     times = data["answer_ms"]
     notes = [
         f"answers after {times['p50']:.2f} ms in the median, {times['p99']:.2f} ms at 99 %",
+        f"{data['late_answers']} answers after more than a period, {data['late_answers_in_stand_stills']} of them while"
+        " this machine kept a processor waiting",
+        f"it did so for {max(data['stand_stills_ms'], default=0.0):.1f} ms at most",
         f"the tools are {data['delay_ms']:.0f} ms behind the reference, and apart from that"
         f" {data['error_after_delay_mm_rms']:.2f} mm from it; without cabinets {data['direct_error_mm_rms']:.2f} mm",
     ]

@@ -95,7 +95,7 @@ def listen(plant: FriPlant, duration: float, asked: Callable[[], bool] = lambda:
                 heard[arm].append((state.newest, state.arrival))
         time.sleep(_LOOKS)
     plant.due(now)
-    fault, answers = plant.fault(), np.array(plant.answer_times)
+    fault, answers = plant.fault(), np.array([took for _, took in plant.answers])
     reports = [cabinet_report(arm, messages, plant.states()[arm].lost) for arm, messages in heard.items()]
     notes = [f"{arm}: gripper {gripper.in_words()}" for arm, gripper in plant.grippers.items()]
     notes += machine_notes() + network_notes(plant.addresses)

@@ -22,7 +22,7 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
 _WAIT = 5.0  # for each cabinet's first message, and for its session, without which a run begins all the same [s]
-_KEPT = 100_000  # answer times
+_KEPT = 1_000_000  # answers
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
@@ -44,8 +44,8 @@ class FriPlant:
         self._mode = CommandMode.POSITION
         self.grippers = self._modbus_grippers()
         self._answering: AnsweringProcess | None = None
-        # Of the newest answers, from a message's arrival until its answer was sent [s].
-        self.answer_times: deque[float] = deque(maxlen=_KEPT)
+        # The newest: when each message arrived, by the monotonic clock, and how long until its answer was sent [s].
+        self.answers: deque[tuple[float, float]] = deque(maxlen=_KEPT)
 
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> FriPlant:
@@ -110,7 +110,7 @@ class FriPlant:
             for state in self._answering.receive():
                 self.cell.update(state)
                 if state.took is not None:
-                    self.answer_times.append(state.took)
+                    self.answers.append((state.arrival, state.took))
         return self.cell.states
 
     def due(self, now: float) -> tuple[float, float]:
