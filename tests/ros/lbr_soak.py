@@ -44,6 +44,7 @@ class LbrSoak:
         self._phase, self._seen = Phase.INACTIVE, dict.fromkeys(SIDES, 0)
         self._commands: dict[str, tuple[int, int, Array, Array]] = {}  # the newest: session, tick, q, v
         self._late = 0  # the last tick that was late
+        self._brakings = 0  # so far
         self._disturbed = 0.0  # until when an end may not be noticed yet [s]
         self.virtual.on_command = self._on_command
         robot, node = self.virtual.robot, self.virtual.node
@@ -95,7 +96,8 @@ class LbrSoak:
         self.activations += phase is Phase.ACTIVE and self._phase is not Phase.ACTIVE
         if phase is Phase.BRAKING and self._phase is not Phase.BRAKING:
             braking = np.abs(virtual.node._loop._velocity) / virtual.node._controller.stop_deceleration
-            virtual.at(now + float(braking.max()) + _ALLOWANCE, self._check_rest)
+            self._brakings += 1
+            virtual.at(now + float(braking.max()) + _ALLOWANCE, partial(self._check_rest, self._brakings))
         self._phase = phase
         followed = self.operator.moves and all(map(virtual.node._supervisor.follows, SIDES))
         if self._ends_at == math.inf and now > self._disturbed and followed:
@@ -178,11 +180,11 @@ class LbrSoak:
         if self.virtual.node._supervisor.phase is Phase.ACTIVE:
             self._fault(f"the controller is active {_NOTICED:g} s after that")
 
-    def _check_rest(self) -> None:
-        """At the end of the time to brake; the controller may be active again, or let a joint creep to its goal."""
+    def _check_rest(self, braking: int) -> None:
+        """After the time to brake: the controller may be active, brake anew, or let a joint creep to its goal."""
         node = self.virtual.node
         fastest = float(np.abs(node._loop._velocity).max())
-        if node._supervisor.phase is Phase.BRAKING and fastest > _CREEPS:
+        if node._supervisor.phase is Phase.BRAKING and braking == self._brakings and fastest > _CREEPS:
             self._fault(f"the reference moves at {fastest:.4f} rad/s after the time to brake")
 
 
