@@ -41,6 +41,7 @@ from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
+from q2r2_control.viewer.headset_display import DisplayInput, HeadsetView
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.tables import print_table
 from q2r2_control.viewer.web.view import PageView
@@ -156,6 +157,8 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, pa
     if options.tasks and isinstance(pipeline.plant, MujocoPlant):
         watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
         pipeline.listeners.append(watch)
+    if isinstance(source, DisplayInput):
+        HeadsetView(source, pipeline, recorder is not None)
     if page is not None:
         say(f"page: {page.begin(pipeline, options.name, recorder is not None)}", console)
     summary = _run(pipeline, options, recorder, console)

@@ -38,11 +38,10 @@ from q2r2_control.config.resources import find_resource
 from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, AssemblyTask, tasks_named
 from q2r2_control.demo.trials import try_tasks
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.base import options_of
+from q2r2_control.inputs.base import adapted, options_of
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, trajectory_named
-from q2r2_control.inputs.web import web_cell
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.types import CommandMode
@@ -62,6 +61,8 @@ Web = Annotated[bool, Option("--web", help="Show the run in a browser, at http:/
 
 Host = Annotated[str | None, Option(help="Address to bind, not the config's; 0.0.0.0: all, :: IPv6 too.")]
 Port = Annotated[int | None, Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
+Usb = Annotated[bool, Option("--usb", help="webxr: the headset is on a USB cable; its page is http://localhost:8443.")]
+Certificate = Annotated[Path | None, Option(metavar="FILE", help="webxr: PEM of your own certificate and its key.")]
 
 
 def run(
@@ -78,6 +79,8 @@ def run(
     takeover: Annotated[str | None, Option(metavar="NAME", help="The same: an input whose hands take over.")] = None,
     host: Host = None,
     port: Port = None,
+    usb: Usb = False,
+    certificate: Certificate = None,
     viewer: Viewer = False,
     headless: Headless = False,
     web: Web = False,
@@ -107,9 +110,9 @@ def run(
         cell = slowed(cell)
         say("real cabinets: joints at a tenth of their speed; --full-speed ends that", style="yellow")
     source = input or cell.input
-    if source == "web":
-        cell, web = web_cell(cell), True
+    cell, web = adapted(source, cell), web or source == "web"
     asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
+    asked |= {"usb": usb or None, "certificate": certificate}
     asked |= {"policy": policy, "takeover": takeover}
     asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}
     given = {option: value for option, value in asked.items() if value is not None}

@@ -1,0 +1,53 @@
+// A headset that is not there: Meta's emulator, and hands that tremble as real ones do.
+const device = new IWER.XRDevice(IWER.metaQuest3);
+device.installRuntime({ forceInstall: true }); // Chromium has a WebXR of its own, without a device
+device.stereoEnabled = false;
+const NOISE = 2e-5; // of a position [m]
+window.headset = device;
+window.hands = { left: [-0.2, 1.2, -0.4], right: [0.2, 1.2, -0.4] }; // x right, y up, z back [m]
+window.guessed = false; // whether poses are guesses, as of controllers out of sight; the emulator calls all of them so
+Object.defineProperty(XRPose.prototype, "emulatedPosition", { get: () => window.guessed });
+window.frames = 0;
+window.vibrations = [];
+window.said = null; // by the run, the newest
+
+const tremble = () => {
+  window.frames += 1;
+  for (const [hand, place] of Object.entries(window.hands)) {
+    const [x, y, z] = place.map((value) => value + NOISE * (Math.random() - 0.5));
+    device.controllers[hand].position.set(x, y, z);
+  }
+  requestAnimationFrame(tremble);
+};
+requestAnimationFrame(tremble);
+
+// As many frames as asked for, a little farther in each.
+window.carry = async (way, frames, hands = ["left", "right"]) => {
+  const from = structuredClone(window.hands);
+  for (let frame = 1; frame <= frames; frame++) {
+    await new Promise(requestAnimationFrame);
+    hands.forEach((hand, index) => {
+      const share = (1 - 0.1 * index) * (frame / frames); // human hands never move as one
+      window.hands[hand] = from[hand].map((value, axis) => value + share * way[axis]);
+    });
+  }
+};
+window.press = async (button, frames = 8) => {
+  for (const value of [1, 0]) {
+    for (const hand of ["left", "right"]) device.controllers[hand].updateButtonValue(button[hand], value);
+    for (let frame = 0; frame < frames; frame++) await new Promise(requestAnimationFrame);
+  }
+};
+
+const Socket = window.WebSocket;
+window.WebSocket = class extends Socket {
+  constructor(...all) {
+    super(...all);
+    this.addEventListener("message", ({ data }) => {
+      if (typeof data !== "string") return;
+      const message = JSON.parse(data);
+      if (message.state) window.said = message.state;
+      if (message.vibration) window.vibrations.push(message.vibration);
+    });
+  }
+};
