@@ -32,6 +32,16 @@ window.carry = async (way, frames, hands = ["left", "right"]) => {
     });
   }
 };
+window.hold = (buttons, hand, value) => {
+  for (const button of buttons) device.controllers[hand].updateButtonValue(button, value);
+};
+window.pulses = 0; // felt
+const actuator = Object.getPrototypeOf(device.controllers.left.inputSource.gamepad.hapticActuators[0]);
+const felt = actuator.pulse;
+actuator.pulse = function (...all) {
+  window.pulses += 1;
+  return felt.apply(this, all);
+};
 window.press = async (button, frames = 8) => {
   for (const value of [1, 0]) {
     for (const hand of ["left", "right"]) device.controllers[hand].updateButtonValue(button[hand], value);

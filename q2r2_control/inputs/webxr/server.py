@@ -61,12 +61,13 @@ class PageClient(Peer):
         self.picture: bytes | None = None
         self.rate = RateLimit(MAX_MESSAGES_PER_SECOND)
         self.reason = ""  # why this side has ended it
+        self.closing: asyncio.Future[None] | None = None
 
     def end(self, code: int, reason: str) -> None:
         """Close the socket, which takes as long as the page likes."""
         self.reason = reason
         shown = reason.encode()[:_LONGEST_REASON].decode(errors="ignore")
-        self._closing = asyncio.ensure_future(self.connection.close(code, shown))
+        self.closing = asyncio.ensure_future(self.connection.close(code, shown))
 
 
 class PageServer:
@@ -169,6 +170,8 @@ class PageServer:
             self._sockets -= 1
             sending.cancel()
             self._forget(client, client.reason or reason)
+            if client.closing is not None:
+                await client.closing  # or the server would close it without the reason
 
     def _receive(self, client: PageClient, text: str | bytes) -> None:
         now = self._clock()
