@@ -44,6 +44,7 @@ class HeadsetServer:
     controls = QUEST_CONTROLS
     options = ("host", "port", "say")
     executable = "tcp_endpoint"
+    url: str | None = None  # the app has no page
 
     def __init__(
         self,

@@ -2,6 +2,7 @@
 const device = new IWER.XRDevice(IWER.metaQuest3);
 device.installRuntime({ forceInstall: true }); // Chromium has a WebXR of its own, without a device
 device.stereoEnabled = false;
+device.quaternion.set(-0.25, 0, 0, 0.968); // the head looks down, at the arms
 const NOISE = 2e-5; // of a position [m]
 window.headset = device;
 window.hands = { left: [-0.2, 1.2, -0.4], right: [0.2, 1.2, -0.4] }; // x right, y up, z back [m]
@@ -21,15 +22,15 @@ const tremble = () => {
 };
 requestAnimationFrame(tremble);
 
-// As many frames as asked for, a little farther in each.
-window.carry = async (way, frames, hands = ["left", "right"]) => {
+// In so many frames, as people reach. The right hand goes half as far: human hands never move as one.
+window.carry = async (way, frames) => {
   const from = structuredClone(window.hands);
   for (let frame = 1; frame <= frames; frame++) {
     await new Promise(requestAnimationFrame);
-    hands.forEach((hand, index) => {
-      const share = (1 - 0.1 * index) * (frame / frames); // human hands never move as one
-      window.hands[hand] = from[hand].map((value, axis) => value + share * way[axis]);
-    });
+    const s = frame / frames;
+    const share = s ** 3 * (10 - 15 * s + 6 * s ** 2);
+    window.hands.left = from.left.map((value, axis) => value + share * way[axis]);
+    window.hands.right = from.right.map((value, axis) => value + 0.5 * share * way[axis]);
   }
 };
 window.hold = (buttons, hand, value) => {

@@ -29,6 +29,7 @@ class PageSetup:
     allow: Sequence[Network] | None  # that may connect; None: all
     certificate: str | None  # a PEM file with its key; None: http
     token: str
+    silence: float  # of the page that drives, after which it is dropped [s]
     display: Display | None
 
 

@@ -21,7 +21,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from q2r2_control.errors import ConfigError, ProtocolError
-from q2r2_control.inputs.connections import MAX_WAITING, SILENCE_ALLOWED, TURN
+from q2r2_control.inputs.connections import MAX_WAITING, TURN
 from q2r2_control.inputs.listener import (
     MAX_HOSTS_NAMED,
     Admission,
@@ -241,8 +241,8 @@ class PageServer:
             asked = self._clock()
             await asyncio.sleep(TURN)
             driver = self._driver
-            if driver is not None and asked - driver.last_frame > SILENCE_ALLOWED:
-                self._drop(driver, f"no message for {SILENCE_ALLOWED:g} s")
+            if driver is not None and asked - driver.last_frame > self._setup.silence:
+                self._drop(driver, f"no message for {self._setup.silence:g} s")
             self._settle(asked)
             self._log.flush(self._clock())
 

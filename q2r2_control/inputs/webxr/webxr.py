@@ -17,6 +17,7 @@ from q2r2_control.config.cell import Config, HeadsetConfig
 from q2r2_control.config.strict import Network
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError, InputError
+from q2r2_control.inputs.connections import SILENCE_ALLOWED
 from q2r2_control.inputs.hand_stream import HandStream
 from q2r2_control.inputs.headset import watch_of
 from q2r2_control.inputs.listener import access_lines, reachable
@@ -68,10 +69,13 @@ class WebXrInput:
         by_usb: bool = False,
         certificate: Path | None = None,
         say: Callable[[str], None] = _LOG.info,
+        silence: float = SILENCE_ALLOWED,
     ) -> None:
+        """A page that says nothing for ``silence`` [s] is dropped; the gate stops the arms long before."""
         self.address = host, port  # after ``start`` the port that was bound
         self.url: str | None = None  # after ``start``
         self._clock, self._allow, self._usb, self._certificate, self._say = clock, allow, by_usb, certificate, say
+        self._silence = silence
         self._stream = HandStream(watch or HandsWatch())
         self._display: Display | None = None
         self._process: HelperProcess | None = None
@@ -129,9 +133,8 @@ class WebXrInput:
                 certificate, line = own_certificate(folder, reachable(host), datetime.now(UTC))
                 if line is not None:
                     self._say(f"webxr: {line}")
-        setup = PageSetup(
-            host, port, self._allow, None if certificate is None else str(certificate), token, self._display
-        )
+        pem = None if certificate is None else str(certificate)
+        setup = PageSetup(host, port, self._allow, pem, token, self._silence, self._display)
         try:
             self._process = HelperProcess("serves the page", "q2r2_control.inputs.webxr.server", self._take, _ROOM)
         except OSError as error:
