@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from playwright.sync_api import sync_playwright
 from typer import Option, run
 
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_report
@@ -107,6 +106,8 @@ def main(
     json: Json = False,
 ) -> None:
     """Measure from a controller's motion in a browser to the joints' command."""
+    from playwright.sync_api import sync_playwright  # which only this needs
+
     config = WebXrInput.cell(load_config(DEMO_CONFIG))
     # A browser that draws by the processor may be late for longer than an arm waits; it is measured all the same.
     gate = config.teleop.gate.model_copy(update={"timeout": _LATEST})

@@ -42,7 +42,7 @@ class DisplayInput(Input, Protocol):
 
 
 class ShownTick(NamedTuple):
-    """What is shown of a tick. Words are made where this is sent."""
+    """The shown part of a run. Words are made where this is sent."""
 
     tick: Tick
     binding: tuple[ActiveLimit, ...]  # limits that held a step back since the last one

@@ -20,7 +20,7 @@ _SHARP = 0.6  # an edge, which is not shaded as round [rad]
 
 
 class ShownRobot(Protocol):
-    """What a tree is made of."""
+    """The source of a tree."""
 
     @property
     def config(self) -> Config: ...

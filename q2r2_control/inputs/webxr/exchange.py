@@ -11,13 +11,13 @@ from q2r2_control.inputs.session import Reception
 
 
 class Display(Protocol):
-    """What a headset shows of a run; made by the run, used in the process of the page."""
+    """Makes a headset's display of a run; made by the run, used in the process of the page."""
 
     def scene(self) -> Mapping[str, Any]:
         """Sent once to each page, as JSON."""
 
     def message(self, shown: Any) -> Mapping[str, Any]:
-        """What was given to :meth:`DisplayInput.show`, as JSON."""
+        """The JSON of what was given to :meth:`DisplayInput.show`."""
 
 
 @dataclass(frozen=True)

@@ -198,7 +198,7 @@ class PageServer:
             client.due.set()
 
     def _take(self, request: Any) -> None:
-        """What the run wants the driver to feel and see."""
+        """Store what the driver is to feel and see."""
         driver = self._driver
         if driver is None:
             return

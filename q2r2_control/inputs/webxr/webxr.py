@@ -192,7 +192,7 @@ class WebXrInput:
         self._ready.clear()
 
     def _take(self, answer: Any) -> None:
-        """What the process says, in a thread of its own."""
+        """Follow an answer of the process, in a thread of its own."""
         match answer:
             case Received(receptions):
                 now = self._clock()

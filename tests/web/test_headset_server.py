@@ -7,6 +7,7 @@ import math
 import ssl
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
@@ -15,15 +16,14 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-
-pytest.importorskip("websockets")
-
+from cryptography.x509 import SubjectAlternativeName, load_pem_x509_certificate
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.inputs.samples import HandsWatch
+from q2r2_control.inputs.webxr.certificate import own_certificate
 from q2r2_control.inputs.webxr.page_messages import LONGEST
 from q2r2_control.inputs.webxr.webxr import WebXrInput
 from q2r2_control.types import HandFault, HandSample, HapticFeedback
@@ -276,6 +276,47 @@ def test_only_the_own_page_connects_and_beyond_this_machine_only_with_the_token(
     assert again.url is not None
     assert urlsplit(again.url).query == token
     assert not any("certificate" in line for line in lines)
+
+
+def test_a_certificate_is_renewed_before_it_expires_and_for_another_address(tmp_path: Path) -> None:
+    now = datetime(2026, 1, 1, tzinfo=UTC)
+
+    def made(address: str, later: int = 0) -> tuple[bytes, str | None]:
+        file, line = own_certificate(tmp_path, address, now + timedelta(days=later))
+        assert file.stat().st_mode & 0o077 == 0, "the key is this user's only"
+        return file.read_bytes(), line
+
+    first, line = made("192.168.1.5")
+    assert "first use" in str(line)
+    assert made("192.168.1.5", 300) == (first, None)
+    second, line = made("192.168.1.5", 360)
+    assert second != first
+    assert "expires on 2027-01-01" in str(line)
+    third, line = made("10.0.0.7", 360)
+    assert "not for 10.0.0.7" in str(line)
+    names = load_pem_x509_certificate(third).extensions.get_extension_for_class(SubjectAlternativeName).value
+    assert {"10.0.0.7", "127.0.0.1", "localhost"} <= {str(name.value) for name in names}
+    (tmp_path / "certificate.pem").write_text("nothing")
+    assert "cannot be read" in str(made("10.0.0.7")[1])
+
+
+def test_a_cable_needs_adb_which_says_what_is_missing(
+    start: Callable[..., WebXrInput], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match="adb, which is not installed: apt install adb"):
+        start(by_usb=True)
+    adb = tmp_path / "adb"
+    adb.write_text("#!/bin/sh\necho 'error: no devices/emulators found' >&2; exit 1\n")
+    adb.chmod(0o700)
+    with pytest.raises(InputError, match="no devices/emulators found; allowed: one headset in developer mode"):
+        start(by_usb=True)
+    asked = tmp_path / "asked"
+    adb.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
+    source = start(by_usb=True)
+    port = source.address[1]
+    source.close()
+    assert asked.read_text().splitlines() == [f"reverse tcp:{port} tcp:{port}", f"reverse --remove tcp:{port}"]
 
 
 def status(url: str) -> int:
