@@ -40,6 +40,9 @@ class DisplayInput(Input, Protocol):
     def show(self, content: Any) -> bool:
         """Show the newest state; False where the last one still waits. Never waits."""
 
+    def show_picture(self, jpeg: bytes) -> bool:
+        """Show the newest picture of a camera, as :meth:`show`; from any thread."""
+
 
 class ShownTick(NamedTuple):
     """The shown part of a run. Words are made where this is sent."""

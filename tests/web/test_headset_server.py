@@ -8,6 +8,7 @@ import ssl
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
@@ -243,6 +244,19 @@ def test_vibrations_reach_the_page_that_drives(start: Callable[..., WebXrInput])
         source.send_haptic(HapticFeedback("left", 0.5, math.nan))
         told = json.loads(page.socket.recv(timeout=60.0))
     assert told == {"vibration": {"hand": "left", "frequency": 1.0, "amplitude": 0.4}}
+
+
+def test_the_newest_picture_goes_to_the_page_behind_the_next_pose(start: Callable[..., WebXrInput]) -> None:
+    source = start()
+    with closing(Page(source)) as page:
+        page.send()
+        wait_until(lambda: source.connected)
+        for jpeg in (b"first", b"newest"):
+            wait_until(partial(source.show_picture, jpeg))
+        source.send_haptic(HapticFeedback("left", 0.5, 0.5))
+        assert "vibration" in page.socket.recv(timeout=60.0)  # the picture has come there too, and waits
+        page.send(left=hand(1.0))
+        assert page.socket.recv(timeout=60.0) == b"newest"
 
 
 def refused(source: WebXrInput, **asked: str) -> bool:

@@ -115,7 +115,7 @@ class WebXrInput:
         return self._process is not None and self._process.send(Shown(content), 1)
 
     def show_picture(self, jpeg: bytes) -> bool:
-        """Show the newest picture of a camera, as :meth:`show`."""
+        """Show the newest picture of a camera, as :meth:`show`; from any thread."""
         return self._process is not None and self._process.send(Picture(jpeg), 1)
 
     def start(self) -> None:
