@@ -114,7 +114,7 @@ export class Drawing {
     session.updateRenderState({ baseLayer: new XRWebGLLayer(session, gl) });
   }
 
-  draw(frame, space, state, board, transparent) {
+  draw(frame, space, state, panel, transparent) {
     const { gl } = this;
     const pose = frame.getViewerPose(space);
     const layer = frame.session.renderState.baseLayer;
@@ -126,10 +126,11 @@ export class Drawing {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, board);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    if (panel.changed) {
+      panel.changed = false;
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, panel.canvas);
+      gl.generateMipmap(gl.TEXTURE_2D);
+    }
     for (const eye of pose.views) {
       const { x, y, width, height } = layer.getViewport(eye);
       if (width === 0) continue; // an eye that is not shown

@@ -66,7 +66,7 @@ async function enter(mode) {
     if (space === null || entered.visibilityState !== "visible") return;
     link.send(hands.read(frame, space, performance.now() < movedUntil));
     panel.draw(state, link);
-    drawing.draw(frame, space, state, panel.canvas, mode === "immersive-ar");
+    drawing.draw(frame, space, state, panel, mode === "immersive-ar");
   };
   entered.requestAnimationFrame(onFrame);
   show();

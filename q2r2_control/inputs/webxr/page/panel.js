@@ -10,12 +10,14 @@ export class Panel {
     this.context = this.canvas.getContext("2d");
     this.picture = null; // of a camera
     this.drawn = -PERIOD;
+    this.changed = true; // since it was put on the board
   }
 
   draw(state, link) {
     const now = performance.now();
     if (now - this.drawn < PERIOD) return;
     this.drawn = now;
+    this.changed = true;
     const { context } = this;
     context.fillStyle = "#1c2126";
     context.fillRect(0, 0, WIDTH, HEIGHT);
