@@ -23,6 +23,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from q2r2_control.errors import ConfigError, InputError
+from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.samples import HandsWatch
 from q2r2_control.inputs.webxr.certificate import own_certificate
 from q2r2_control.inputs.webxr.page_messages import LONGEST
@@ -257,6 +258,20 @@ def test_the_newest_picture_goes_to_the_page_behind_the_next_pose(start: Callabl
         assert "vibration" in page.socket.recv(timeout=60.0)  # the picture has come there too, and waits
         page.send(left=hand(1.0))
         assert page.socket.recv(timeout=60.0) == b"newest"
+
+
+def test_headset_check_shows_what_the_page_sends_and_where_to_open_it(start: Callable[..., WebXrInput]) -> None:
+    source, config = start(), WebXrInput.cell(cell())
+    alone = watch_headset(source, config, 0.0, lambda check: None, lambda: False)
+    assert f"open {source.url} in the headset's browser" in alone.advice
+    assert len(alone.missing) == 4
+    with closing(Page(source)) as page:
+        page.send(left=hand(0.0), right=hand(0.5))
+        page.send(left=hand(0.1), right=hand(0.5))
+        wait_until(lambda: len(source.statistics.topics) == 4 and source.statistics.topics["q2r_left_hand_pose"].count)
+        check = watch_headset(source, config, 0.0, lambda check: None, lambda: False)
+    assert (check.missing, check.advice) == ((), ())
+    assert set(check.directions) == {"left", "right"}
 
 
 def refused(source: WebXrInput, **asked: str) -> bool:

@@ -20,7 +20,7 @@ from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.inputs.connections import SILENCE_ALLOWED
 from q2r2_control.inputs.hand_stream import HandStream
 from q2r2_control.inputs.headset import watch_of
-from q2r2_control.inputs.listener import access_lines, reachable
+from q2r2_control.inputs.listener import reachable
 from q2r2_control.inputs.page_door import is_loopback
 from q2r2_control.inputs.samples import HandsWatch
 from q2r2_control.inputs.session import HeadsetStatistics
@@ -218,8 +218,8 @@ class WebXrInput:
             if not self._usb:
                 self._say("webxr: only this machine can reach it; --host 0.0.0.0 admits the network, --usb a cable")
             return
-        for line in access_lines(host, port, self._allow)[1:]:
-            self._say(f"webxr: {line}")
+        who = "" if self._allow is None else f" from {', '.join(map(str, self._allow))} (headset.allow)"
+        self._say(f"webxr: whoever has this URL{who} can drive the arms")
         if find_spec("segno") is not None:
             import segno
 
