@@ -46,8 +46,16 @@ test-soak: setup
 	$(BIN)/python -m pytest --ignore tests/lerobot --ignore tests/web -m soak
 
 # The page of a run in a real browser. Debian's Chromium, since the browsers of playwright are downloads of its own.
-test-web: chromium $(VENV)/.installed-web
+# Meta's emulator of headsets comes from npm, under a licence of its own; it is no part of this project.
+IWER := $(VENV)/iwer
+
+test-web: chromium $(VENV)/.installed-web $(IWER)/package
 	$(BIN)/python -m pytest tests/web
+
+$(IWER)/package:
+	@command -v npm > /dev/null || { echo 'the emulated headset is fetched with npm: apt-get install npm'; exit 1; }
+	mkdir -p $(IWER)
+	cd $(IWER) && npm pack --silent iwer@2.5.0 && tar xzf iwer-2.5.0.tgz
 
 chromium:
 	@command -v /usr/bin/chromium > /dev/null || { apt-get update -qq && apt-get install -y -qq chromium; } > /dev/null \

@@ -75,6 +75,7 @@ class ReasonKind(StrEnum):
     NO_POSE = "no_pose", "the newest pose is not usable"
     HAND_FROZEN = "hand_frozen", "the hand's pose is frozen"
     HAND_FRAME_MOVED = "hand_frame_moved", "both hands moved as one, as when their frame moves: align"
+    HAND_UNTRACKED = "hand_untracked", "the headset does not see the hand"
     HAND_JUMPED = "hand_jumped", "the hand jumped {distance:.3f} m"
     HAND_ROTATION_JUMPED = "hand_rotation_jumped", "the hand's rotation jumped {angle:.2f} rad"
     HAND_TOO_FAST = "hand_too_fast", "the hand moved at {speed:.1f} m/s"

@@ -85,6 +85,7 @@ class HandFault(StrEnum):
 
     FROZEN = "hand_frozen"
     FRAME_MOVED = "hand_frame_moved"  # both hands moved as one, as when the frame moves that they are measured in
+    UNTRACKED = "hand_untracked"  # the headset says that its pose is none, or a guess
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 
 from rich.console import Console
@@ -41,6 +42,8 @@ from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
+from q2r2_control.viewer.headset_display import DisplayInput, HeadsetView
+from q2r2_control.viewer.headset_pictures import HeadsetPictures
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.tables import print_table
 from q2r2_control.viewer.web.view import PageView
@@ -156,6 +159,8 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, pa
     if options.tasks and isinstance(pipeline.plant, MujocoPlant):
         watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
         pipeline.listeners.append(watch)
+    if isinstance(source, DisplayInput):
+        HeadsetView(source, pipeline, recorder is not None)
     if page is not None:
         say(f"page: {page.begin(pipeline, options.name, recorder is not None)}", console)
     summary = _run(pipeline, options, recorder, console)
@@ -224,6 +229,10 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
             table = LiveTable(title, joints, pipeline.config.teleop.bindings, options.steps, options.duration)
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
+        if isinstance(pipeline.input, DisplayInput) and isinstance(pipeline.plant, MujocoPlant):
+            for name, camera in islice(pipeline.config.simulated_cameras.items(), 1):
+                pictures = HeadsetPictures(pipeline.plant, name, camera, pipeline.input.show_picture)
+                pipeline.listeners.append(stack.enter_context(pictures))
         if options.real_time and (refused := stack.enter_context(real_time())):
             say(refused, console, "yellow")
         if recorder is not None:

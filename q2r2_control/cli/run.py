@@ -9,7 +9,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from rich.console import Console
 from typer import Argument, Exit, Option
@@ -38,11 +38,9 @@ from q2r2_control.config.resources import find_resource
 from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, AssemblyTask, tasks_named
 from q2r2_control.demo.trials import try_tasks
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.base import options_of
-from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, trajectory_named
-from q2r2_control.inputs.web import web_cell
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.types import CommandMode
@@ -62,6 +60,8 @@ Web = Annotated[bool, Option("--web", help="Show the run in a browser, at http:/
 
 Host = Annotated[str | None, Option(help="Address to bind, not the config's; 0.0.0.0: all, :: IPv6 too.")]
 Port = Annotated[int | None, Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
+Usb = Annotated[bool, Option("--usb", help="webxr: the headset is on a USB cable; its page is http://localhost:8443.")]
+Certificate = Annotated[Path | None, Option(metavar="FILE", help="webxr: PEM of your own certificate and its key.")]
 
 
 def run(
@@ -78,6 +78,8 @@ def run(
     takeover: Annotated[str | None, Option(metavar="NAME", help="The same: an input whose hands take over.")] = None,
     host: Host = None,
     port: Port = None,
+    usb: Usb = False,
+    certificate: Certificate = None,
     viewer: Viewer = False,
     headless: Headless = False,
     web: Web = False,
@@ -107,9 +109,9 @@ def run(
         cell = slowed(cell)
         say("real cabinets: joints at a tenth of their speed; --full-speed ends that", style="yellow")
     source = input or cell.input
-    if source == "web":
-        cell, web = web_cell(cell), True
+    cell, web = adapted(source, cell), web or source == "web"
     asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
+    asked |= {"usb": usb or None, "certificate": certificate}
     asked |= {"policy": policy, "takeover": takeover}
     asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}
     given = {option: value for option, value in asked.items() if value is not None}
@@ -241,8 +243,11 @@ def _shows_table(headless: bool, viewer: bool) -> bool:
 
 def headset_check(
     config: Annotated[str, Argument(metavar="[CONFIG]", help="Whose address and teleop.axes to use.")] = (DEMO_CONFIG),
+    input: Annotated[str, Option(metavar="[headset|webxr]", help="Quest2ROS, or a page in its browser.")] = "headset",
     host: Host = None,
     port: Port = None,
+    usb: Usb = False,
+    certificate: Certificate = None,
     duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
     json: Json = False,
 ) -> None:
@@ -251,9 +256,15 @@ def headset_check(
     Move a hand forwards, to the left, up: where the words do not agree, change teleop.axes in the config.
     Exit 1 unless poses and inputs came of every hand that leads an arm; without both, run has nothing to engage.
     """
-    cell, console, stop = load_config(config), Console(stderr=True), StopRequest()
+    console, stop = Console(stderr=True), StopRequest()
     positive("--duration", duration)
-    server = HeadsetServer.from_config(cell, host, port, partial(say, console=console))
+    if input not in ("headset", "webxr"):
+        raise ConfigError(f"--input {input!r:.40}: allowed: headset, webxr")
+    if input == "headset" and (usb or certificate is not None):
+        raise ConfigError(f"{'--usb' if usb else '--certificate'} cannot be used with --input headset")
+    cell = adapted(input, load_config(config))
+    options = {"host": host, "port": port, "usb": usb, "certificate": certificate, "say": partial(say, console=console)}
+    server: Any = make_input(input, cell, **options)
     # From before the announcement on. KeyboardInterrupt would be lost where it comes in the middle of a finaliser.
     with stop_on_signals(stop.ask):
         server.start()

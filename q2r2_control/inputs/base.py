@@ -16,9 +16,10 @@ class Input(Protocol):
     """A source of hand samples, polled once per control tick by the loop's own thread.
 
     Order of use: ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``. An input that is found by
-    its name has a class method ``from_config(config)`` as well. Its class may have two attributes more: ``options``,
+    its name has a class method ``from_config(config)`` as well. Its class may have three attributes more: ``options``,
     names of what ``from_config`` takes by keyword, which are options of ``q2r2 run`` and ``say``, a function that
-    prints a line; and ``executable``, the ROS executable that stands for it instead of ``hand_input``.
+    prints a line; ``cell``, a function that returns a cell with what this input knows better, as its own axes; and
+    ``executable``, the ROS executable that stands for it instead of ``hand_input``.
     """
 
     controls: DeviceControls  # the buttons and axes that its samples have
@@ -61,6 +62,12 @@ class PolicySource(Input, Protocol):
 def options_of(source: str) -> tuple[str, ...]:
     """The options that the input called ``source`` takes. Raises :class:`ConfigError` for an unknown name."""
     return tuple(getattr(load_class(INPUTS, source), "options", ()))
+
+
+def adapted(source: str, config: Config) -> Config:
+    """The cell with the settings that the input called ``source`` knows better."""
+    adapt = getattr(load_class(INPUTS, source), "cell", None)
+    return config if adapt is None else adapt(config)
 
 
 def make_input(source: Input | str, config: Config, **options: object) -> Input:

@@ -22,8 +22,7 @@ from q2r2_control.inputs.listener import (
     is_allowed,
 )
 from q2r2_control.inputs.messages import KEEPALIVE, FrameDecoder, HandPose, WireFrame
-from q2r2_control.inputs.samples import HandTracker
-from q2r2_control.inputs.session import HeadsetSession, Reception, TopicRecorder, log_frame
+from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
 from q2r2_control.types import HapticFeedback
 
 KEEPALIVE_AFTER = 1.0  # of own silence [s]
@@ -43,8 +42,6 @@ class Client(Peer):
         super().__init__(peer, host, since=now, last_frame=now, registrations=registrations)
         self.socket = connection
         self.decoder = FrameDecoder()
-        self.tracker = HandTracker()
-        self.recorders: dict[str, TopicRecorder] = {}
         self.refused_hosts: set[str] = set()
         self.announced = False  # in the log
         self.last_sent = now

@@ -8,15 +8,17 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 from q2r2_control.config.cell import Config, HeadsetConfig
 from q2r2_control.config.strict import Network
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.connections import TURN, Client, Connections, Handlers
+from q2r2_control.inputs.hand_stream import HandStream
 from q2r2_control.inputs.listener import HostLog, TcpListener, access_lines, written
 from q2r2_control.inputs.messages import WireFrame, warm_up
-from q2r2_control.inputs.samples import HandsWatch, SampleQueue, Watched
-from q2r2_control.inputs.session import HeadsetStatistics, TopicRecorder
+from q2r2_control.inputs.samples import HandsWatch, Watched
+from q2r2_control.inputs.session import HeadsetStatistics
 from q2r2_control.types import QUEST_CONTROLS, SIDES, HandSample, HapticFeedback
 
 _LOG = logging.getLogger(__name__)
@@ -42,6 +44,7 @@ class HeadsetServer:
     controls = QUEST_CONTROLS
     options = ("host", "port", "say")
     executable = "tcp_endpoint"
+    url: str | None = None  # the app has no page
 
     def __init__(
         self,
@@ -54,18 +57,14 @@ class HeadsetServer:
         say: Callable[[str], None] = _LOG.debug,
     ) -> None:
         self.address = host, port  # after ``start`` the port that was bound
-        self._allow, self._clock, self._tell, self._say = allow, clock, listener, say
-        self._watch = watch or HandsWatch()
+        self._allow, self._clock, self._say = allow, clock, say
+        self._stream = HandStream(watch or HandsWatch(), listener)
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._samples = SampleQueue()
         self._owed: dict[str, HapticFeedback] = {}  # the newest of each hand
         self._owed_lock = threading.Lock()
-        self._statistics_lock = threading.Lock()  # never taken by poll or what sends
-        self._client: Client | None = None
-        self._last_client: Client | None = None
-        self._connections_made = 0
-        self._last_disconnect: str | None = None
+        self._session_lock = threading.Lock()  # never taken by poll or what sends
+        self._client: Client | None = None  # the last one
 
     @classmethod
     def from_config(
@@ -87,7 +86,7 @@ class HeadsetServer:
         except (OSError, OverflowError, ValueError) as error:
             raise InputError(f"headset: cannot listen on {written(host, port)}: {error}") from error
         self.address = (host, door.port)
-        handlers = Handlers(admitted=self._admit, lost=self._lose, receive=self._receive, due=self._take_owed)
+        handlers = Handlers(admitted=self._admit, lost=self._stream.lose, receive=self._receive, due=self._take_owed)
         self._connections = Connections(door, self._allow, self._clock, handlers)
         self._stop.clear()
         self._thread = threading.Thread(target=self._run, args=(self._connections,), name="headset", daemon=True)
@@ -98,16 +97,16 @@ class HeadsetServer:
     @property
     def connected(self) -> bool:
         """Whether a headset is connected, and no loss is left that ``poll`` has not shown yet."""
-        return self._client is not None and not self._samples.is_cut
+        return self._stream.connected
 
     def poll(self, now: float) -> list[HandSample]:
         """Samples since the last poll, oldest first. None of a lost connection: those poses are not the hand's."""
-        return self._samples.take()
+        return self._stream.take()
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
         """Vibrate, values clipped to 0..1; nothing happens unless a headset listens, or when a value is not finite."""
         values = (feedback.frequency, feedback.amplitude)
-        if feedback.hand not in SIDES or not all(map(math.isfinite, values)) or self._client is None:
+        if feedback.hand not in SIDES or not all(map(math.isfinite, values)) or self._stream.peer is None:
             return
         frequency, amplitude = (min(max(float(value), 0.0), 1.0) for value in values)
         with self._owed_lock:
@@ -117,20 +116,17 @@ class HeadsetServer:
     @property
     def statistics(self) -> HeadsetStatistics:
         """A snapshot for people; see :class:`HeadsetStatistics`."""
-        now = self._clock()
-        with self._statistics_lock:
-            client, last = self._client, self._last_client
-            session = last.session if last else None
-            return HeadsetStatistics(
-                address=self.address,
-                peer=client.peer if client else None,
-                dialect=session.dialect if session else None,
-                topics={name: recorder.snapshot(now) for name, recorder in last.recorders.items()} if last else {},
-                unknown_topics=dict(session.unknown_topics) if session else {},
-                published=tuple(session.published) if session else (),
-                subscribed=tuple(session.subscribed) if session else (),
-                connections=self._connections_made,
-                last_disconnect=self._last_disconnect,
+        statistics, client = self._stream.statistics(self.address, self._clock()), self._client
+        if client is None:
+            return statistics
+        session = client.session
+        with self._session_lock:
+            return replace(
+                statistics,
+                dialect=session.dialect,
+                unknown_topics=dict(session.unknown_topics),
+                published=tuple(session.published),
+                subscribed=tuple(session.subscribed),
             )
 
     def close(self) -> None:
@@ -157,31 +153,15 @@ class HeadsetServer:
     def _admit(self, client: Client) -> None:
         with self._owed_lock:
             self._owed.clear()
-        self._watch.reset()
-        with self._statistics_lock:
-            self._client = self._last_client = client
-            self._connections_made += 1
-
-    def _lose(self, reason: str) -> None:
-        self._samples.cut()  # before _client, so that `connected` cannot be true of the next one too early
-        with self._statistics_lock:
-            self._client = None
-            self._last_disconnect = reason
+        self._client = client
+        self._stream.admit(client.peer)
 
     def _receive(self, client: Client, frame: WireFrame, now: float) -> None:
         # Locked for each frame, so that a snapshot never waits for a whole burst.
-        with self._statistics_lock:
+        with self._session_lock:
             reception = client.receive(frame, now)
-            if reception is not None:
-                client.recorders.setdefault(reception.topic, TopicRecorder()).record(reception.message, now)
-        if reception is None:
-            return
-        for watched in self._watch.receive(reception, now):
-            hand, message = watched.reception.hand, watched.reception.message
-            if self._tell is not None:
-                self._tell(watched)
-            elif (sample := client.tracker.update(hand, message, watched.stamp, watched.fault)) is not None:
-                self._samples.put(sample)
+        if reception is not None:
+            self._stream.receive(reception, now)
 
     def _take_owed(self) -> Iterable[HapticFeedback]:
         with self._owed_lock:

@@ -6,13 +6,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import Stance, axes_matrix
-from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.listener import ONLY_THIS_MACHINE, app_settings, written
 from q2r2_control.inputs.messages import MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, HeadsetStatistics
@@ -56,6 +55,17 @@ class HandMovement:
         return self._positions[-1][1] if self._positions else None
 
 
+class CheckedServer(Protocol):
+    """A server that headsets connect to, by an app or by a page at ``url``."""
+
+    url: str | None
+
+    @property
+    def statistics(self) -> HeadsetStatistics: ...
+
+    def poll(self, now: float) -> list[HandSample]: ...
+
+
 @dataclass(frozen=True, slots=True)
 class HeadsetCheck:
     statistics: HeadsetStatistics
@@ -81,7 +91,7 @@ class HeadsetCheck:
 
 
 def watch_headset(
-    server: HeadsetServer,
+    server: CheckedServer,
     config: Config,
     duration: float | None,
     show: Callable[[HeadsetCheck], None],
@@ -112,7 +122,7 @@ def watch_headset(
             positions={hand: movement.position for hand, movement in hands.items()},
             heard=heard,
             missing=missing,
-            advice=advice(statistics) if nothing_comes else advice_on_some(silent),
+            advice=advice(statistics, server.url) if nothing_comes else advice_on_some(silent),
         )
         show(check)
         if ends:
@@ -142,7 +152,7 @@ def advice_on_some(silent: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def advice(statistics: HeadsetStatistics) -> tuple[str, ...]:
+def advice(statistics: HeadsetStatistics, url: str | None = None) -> tuple[str, ...]:
     """Things to check when no data comes, the most likely cause first."""
     host, port = statistics.address
     lines = [f"nothing arrives for {SILENCE:g} s on {written(host, port)}"]
@@ -150,7 +160,9 @@ def advice(statistics: HeadsetStatistics) -> tuple[str, ...]:
         return (
             *lines,
             f"{statistics.peer} is connected but sends no hand data: put the headset on, keep both controllers in view",
-            "look at the protocol setting in the app: ROS2 and ROS1 are both understood, but has it been started?",
+            "the page sends hands once VR or AR is entered"
+            if url is not None
+            else "look at the protocol setting in the app: ROS2 and ROS1 are both understood, but has it been started?",
         )
     if statistics.last_disconnect is not None:
         lines.append(f"the last connection ended: {statistics.last_disconnect}")
@@ -158,7 +170,9 @@ def advice(statistics: HeadsetStatistics) -> tuple[str, ...]:
         lines.append(f"{host} can be reached from this machine only: start again with --host 0.0.0.0")
     return (
         *lines,
-        f"what the app has to have: {app_settings(host, port)}",
+        f"open {url} in the headset's browser"
+        if url is not None
+        else f"what the app has to have: {app_settings(host, port)}",
         "headset and this machine have to be in the same network, one that lets its members talk to each other",
         f"a firewall on this machine must let TCP port {port} in (ufw allow {port}/tcp)",
     )

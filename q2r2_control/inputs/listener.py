@@ -149,7 +149,7 @@ def written(host: str, port: int) -> str:
 
 def app_settings(host: str, port: int) -> str:
     """The app's settings, for a server that listens on ``host``."""
-    return f"address {_reachable(host)}, port {port}, protocol ROS2"
+    return f"address {reachable(host)}, port {port}, protocol ROS2"
 
 
 def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple[str, ...]:
@@ -166,7 +166,7 @@ def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple
     return (f"enter in the app: {app_settings(host, port)}", drivers)
 
 
-def _reachable(host: str) -> str:
+def reachable(host: str) -> str:
     """The address by which others reach a server on ``host``."""
     if host not in EVERY_NETWORK:
         return host

@@ -110,8 +110,8 @@ class HandsWatch:
         hand, message = reception.hand, reception.message
         if isinstance(message, HandInputs) and self._frame is not None:
             self._frame.take_inputs(hand, message, now)
-        if not isinstance(message, HandPose):
-            return [Watched(reception, now)]
+        if not isinstance(message, HandPose) or reception.fault is not None:
+            return [Watched(reception, now, reception.fault)]
         numbers = message.position.tobytes() + message.quaternion.tobytes()
         if numbers != self._numbers.get(hand):
             self._numbers[hand], self._since[hand] = numbers, now

@@ -19,7 +19,7 @@ from q2r2_control.inputs.messages import (
     encode_frame,
     fits,
 )
-from q2r2_control.types import SIDES, HapticFeedback
+from q2r2_control.types import SIDES, HandFault, HapticFeedback
 
 MAX_OUTGOING_BYTES = 1 << 16  # answers a client may leave unread
 MAX_COMMAND_BYTES = 1 << 14  # JSON of a system command; the app's have under 200
@@ -54,6 +54,7 @@ class Reception(NamedTuple):
     topic: str  # without leading slash
     hand: str
     message: HandMessage
+    fault: HandFault | None = None  # of a pose, that the headset itself tells of
 
 
 def log_frame(level: str, text: str) -> bytes:

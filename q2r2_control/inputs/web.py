@@ -36,6 +36,7 @@ class WebInput:
     """
 
     controls = DeviceControls(buttons=("drag", "gripper"), axes=())
+    cell = staticmethod(web_cell)
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._samples = clock, SampleQueue()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import pickle
@@ -13,11 +12,10 @@ from threading import Event
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from q2r2_control.config.recording import CameraConfig
-from q2r2_control.errors import PlantError
-from q2r2_control.process.helper_process import HelperProcess, reason_of
+from q2r2_control.plants.cell_pictures import ENVIRONMENT, jpeg_of, open_cameras
+from q2r2_control.process.helper_process import HelperProcess
 from q2r2_control.recording.messages import Message, Topic, picture, picture_topic
 from q2r2_control.summary.tick import Tick
 
@@ -35,7 +33,7 @@ _READY = 10.0  # for the process to be ready, before the run [s]
 class CameraSetup:
     """The first request: what pictures are taken of and where they go."""
 
-    model: bytes  # an mujoco.MjModel, pickled: MuJoCo may look for OpenGL when it is imported
+    model: bytes  # an mujoco.MjModel, pickled
     cameras: dict[str, CameraConfig]
     channels: dict[str, int]  # of the recording's file
     waited_for: bool  # by the loop, in simulated time
@@ -56,18 +54,12 @@ def main(requests: Iterator[Any], answer: Callable[[Message | None], None]) -> N
     if not setup.waited_for:
         with suppress(OSError):
             os.nice(_NICENESS)
-    try:
-        from q2r2_control.plants.mujoco_cameras import CellPictures
-    except (ImportError, AttributeError, RuntimeError) as error:
-        raise PlantError(f"no pictures: MUJOCO_GL={os.environ['MUJOCO_GL']}: {reason_of(error)}") from error
-    cell = CellPictures(pickle.loads(setup.model), setup.cameras)
+    cell = open_cameras(setup.model, setup.cameras)
     answer(None)
     for request in requests:
         cell.place(np.frombuffer(request.qpos))
         for name in request.cameras:
-            packed = io.BytesIO()
-            Image.fromarray(cell.take(name)).save(packed, "JPEG", quality=_QUALITY)
-            payload = picture(name, request.time, packed.getvalue())
+            payload = picture(name, request.time, jpeg_of(cell.take(name), _QUALITY))
             answer(Message(setup.channels[name], request.number, request.time, request.time, payload))
 
 
@@ -85,8 +77,8 @@ class CameraRecorder:
             "q2r2_control.recording.camera_recorder",
             self._on_answer,
             room,
-            MUJOCO_GL="egl",  # MuJoCo's own choice needs a display
-            LP_NUM_THREADS="1",  # without a graphics card, one processor stays the loop's
+            idle=None,
+            **ENVIRONMENT,
         )
         self.due = 0  # pictures that should be there by now
         self._plant: MujocoPlant | None = None  # None: not begun

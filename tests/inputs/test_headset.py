@@ -261,7 +261,7 @@ def test_an_unexpected_exception_is_logged_and_costs_that_client_only(
 
 
 def test_poll_and_haptics_do_not_wait_for_a_snapshot_or_for_decoding(server: HeadsetServer) -> None:
-    with connect(server) as headset, server._statistics_lock:
+    with connect(server) as headset, server._session_lock, server._stream._lock:
         headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
 
         def tick() -> None:

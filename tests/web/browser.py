@@ -35,6 +35,9 @@ VIEW = {"width": 680, "height": 360}
 PATIENCE = 120.0  # far longer than a page takes that a processor draws [s]
 
 
+_URL = r"(?:page:|webxr: open) (http\S+)\n"
+
+
 class WebRun:
     """A run with its page, by :mod:`tests.web.slow_run` or another command."""
 
@@ -44,8 +47,8 @@ class WebRun:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", *command], stdout=subprocess.PIPE, stderr=file, text=True
             )
-        wait_until(lambda: "page: http" in self.errors or self._process.poll() is not None)
-        found = re.search(r"page: (http\S+)", self.errors)
+        wait_until(lambda: re.search(_URL, self.errors) or self._process.poll() is not None)
+        found = re.search(_URL, self.errors)
         assert found is not None, self.errors
         self.url = found[1]
 

@@ -14,7 +14,7 @@ from playwright.sync_api import BrowserContext, Page, sync_playwright
 from tests.web.browser import ARGUMENTS, CHROMIUM, HIDDEN, PATIENCE, VIEW, WebRun, one_processor
 
 _COARSE = 0.5  # of a pixel's width, since a processor draws them
-Open = Callable[[str], Page]
+Open = Callable[..., Page]
 Start = Callable[..., WebRun]
 
 
@@ -36,11 +36,15 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserContext
 def open_page(browser: BrowserContext) -> Iterator[Open]:
     pages: list[Page] = []
 
-    def open_one(url: str) -> Page:
+    def open_one(url: str, script: str | None = None) -> Page:
+        """``script`` runs before those of a page that is not viser's."""
         pages.append(browser.new_page())
+        if script is not None:
+            pages[-1].add_init_script(script)
         pages[-1].set_default_timeout(1e3 * PATIENCE)
         pages[-1].goto(f"{url}{'&' if '?' in url else '?'}fixedDpr={_COARSE}")
-        pages[-1].add_style_tag(content=HIDDEN)
+        if script is None:
+            pages[-1].add_style_tag(content=HIDDEN)
         return pages[-1]
 
     yield open_one

@@ -9,6 +9,7 @@ import json
 import sys
 import time
 
+from q2r2_control.config.cell import Config
 from q2r2_control.inputs.base import make_input
 from q2r2_control.inputs.web import WebInput, web_cell
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -31,12 +32,17 @@ class SlowTime:
         time.sleep(self._pause)
 
 
+def patient(config: Config) -> Config:
+    """The cell with a gate that waits long for a browser."""
+    gate = config.teleop.gate.model_copy(update={"timeout": 2.0})
+    return config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": gate})})
+
+
 def main(source: str, port: int, pause: float) -> None:
     slow = SlowTime(pause)
     is_web = source == "web"
     config = web_cell(cell()) if is_web else cell()
-    gate = config.teleop.gate.model_copy(update={"timeout": 2.0})
-    config = config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": gate})})
+    config = patient(config)
     hands = WebInput(slow) if is_web else make_input("scripted", config, trajectory=source)
     pipeline = Pipeline.from_config(config, input=hands, plant="kinematic")
     pipeline.listeners.append(slow.pass_by)

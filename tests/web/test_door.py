@@ -12,7 +12,8 @@ from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.viewer.web.door import Door, is_loopback
+from q2r2_control.inputs.page_door import is_loopback
+from q2r2_control.viewer.web.door import Door
 
 
 @pytest.fixture(scope="module", params=["127.0.0.1", "0.0.0.0"], ids=["loopback", "all addresses"])

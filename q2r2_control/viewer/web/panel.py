@@ -14,6 +14,7 @@ import viser
 from q2r2_control.events import Event
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.live import next_press, why
+from q2r2_control.viewer.state_colours import AMBER, GREEN, RED, state_colour
 from q2r2_control.viewer.web.driving import Driving
 from q2r2_control.viewer.web.exchange import (
     Frame,
@@ -24,7 +25,6 @@ from q2r2_control.viewer.web.exchange import (
     PageSetting,
     PageSetup,
 )
-from q2r2_control.viewer.web.scene import AMBER, GREEN, RED, state_colour
 
 _PERIOD = 0.2  # of the table [s]
 _HISTORY = 150  # values of the plots

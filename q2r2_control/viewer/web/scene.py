@@ -9,22 +9,12 @@ import pinocchio as pin
 import viser
 
 from q2r2_control.robot.pairs import pair_names
-from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.types import Array
+from q2r2_control.viewer.joint_tree import Colour, JointTree, colour_of
+from q2r2_control.viewer.state_colours import GREEN, GREY, RED, state_colour
 from q2r2_control.viewer.web.exchange import Frame, PageSetup
-from q2r2_control.viewer.web.figure import CapsuleFigure, Colour, JointTree, RobotFigure, colour_of, place
+from q2r2_control.viewer.web.figure import CapsuleFigure, RobotFigure, place
 
-GREEN, AMBER, RED, BLUE, GREY = (46, 160, 90), (230, 160, 30), (214, 57, 57), (60, 120, 216), (140, 146, 152)
-_COLOURS: dict[str, Colour] = {
-    ArmState.ENGAGED: GREEN,
-    ArmState.CARRIED: GREEN,
-    ArmState.PAUSING: AMBER,
-    ArmState.PAUSED: AMBER,
-    ArmState.ALIGNING: AMBER,
-    ArmState.HOMING: BLUE,
-    ArmState.LOST: RED,
-    ArmState.STOPPED: RED,
-}
 _TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (150, 80, 190))
 _TRAIL = 90  # points
 _TRAIL_PERIOD = 0.05  # between them, by the run's time [s]
@@ -34,10 +24,6 @@ _NEAR = 0.1  # a pair with more to spare is calm [m]
 _CAMERA = np.array([2.0, 1.0, 1.1])  # from the middle of the arms [m]
 FIELD_OF_VIEW = math.radians(40.0)  # of the camera, upwards
 _BACKGROUND: Colour = (238, 241, 244)
-
-
-def state_colour(state: str) -> Colour:
-    return _COLOURS.get(state, GREY)
 
 
 def first_view(model: pin.Model, home: Array) -> tuple[Array, Array]:

@@ -1,0 +1,72 @@
+"""Who may open a page of this package: browsers of this machine, or those that know the token of its URL."""
+
+from __future__ import annotations
+
+import http
+import ipaddress
+import secrets
+import socket
+from urllib.parse import parse_qs, urlsplit
+
+from websockets import Headers
+from websockets.http11 import Request, Response
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.listener import reachable
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach an address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:
+    body = text.encode()
+    headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))})
+    headers["X-Frame-Options"] = "DENY"  # a page around this one could steal a click
+    return Response(status.value, status.phrase, headers, body)
+
+
+class PageDoor:
+    """A socket that listens, and the check of every request to it.
+
+    A page of another site may not connect, since its ``Origin`` differs. Nor may a name that an attacker's DNS leads
+    here, since the ``Host`` of a loopback address is known. Beyond loopback, a request needs the token of the URL.
+    """
+
+    def __init__(self, host: str, port: int, option: str, token: str, scheme: str = "http") -> None:
+        """``option`` is named in errors. Raises :class:`ConfigError` where the address cannot be bound."""
+        try:
+            ipv6 = ":" in host
+            family, both = (socket.AF_INET6, socket.has_dualstack_ipv6()) if ipv6 else (socket.AF_INET, False)
+            self.socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
+            message = f"{option}: cannot listen on {host} port {port}: {reason}; allowed: a free port"
+            raise ConfigError(message) from error
+        self.port: int = self.socket.getsockname()[1]
+        self._scheme = scheme
+        self._hosts = {f"{name}:{self.port}" for name in ("localhost", "127.0.0.1", "[::1]", host)}
+        self.token = None if is_loopback(host) else token
+        name = reachable(host)
+        query = "" if self.token is None else f"/?token={self.token}"
+        self.url = f"{scheme}://{f'[{name}]' if ':' in name else name}:{self.port}{query}"
+
+    def refusal(self, request: Request, *, with_token: bool = True) -> str | None:
+        """Why a request is not answered, or None."""
+        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+        if len(hosts) != 1 or (self.token is None and hosts[0].lower() not in self._hosts):
+            return "unknown Host"
+        is_socket = request.headers.get("Upgrade") is not None
+        if is_socket and [origin.lower() for origin in origins] != [f"{self._scheme}://{hosts[0].lower()}"]:
+            return "unknown Origin"
+        if self.token is None or not with_token or self._is_known(request):
+            return None
+        return "the token of the URL is missing"
+
+    def _is_known(self, request: Request) -> bool:
+        tokens = parse_qs(urlsplit(request.path).query).get("token", ())
+        return any(secrets.compare_digest(token.encode(), str(self.token).encode()) for token in tokens)

@@ -1,0 +1,110 @@
+"""A certificate and a token of this installation, made on first use. The key never leaves its folder."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+from datetime import datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+
+from q2r2_control.errors import InputError
+
+_VALID = timedelta(days=365)
+_RENEWED = timedelta(days=7)  # before it expires
+
+
+def installation_folder() -> Path:
+    """Where both are kept, for this user only."""
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "q2r2_control" / "webxr"
+
+
+def installation_token(folder: Path) -> str:
+    """The token, the same in each run, or a headset would have to be given a new URL each time."""
+    file = folder / "token"
+    try:
+        if not file.exists():
+            _write(file, secrets.token_urlsafe(16).encode())
+        return file.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"webxr: {file} cannot be used: {error}; allowed: a file of this user's") from error
+
+
+def own_certificate(folder: Path, address: str, now: datetime) -> tuple[Path, str | None]:
+    """A PEM file with certificate and key for a server at ``address``, and a line where it was made anew.
+
+    It is made anew where there is none, where it expires within a week, and for another address. Raises
+    :class:`InputError`.
+    """
+    try:
+        from cryptography import x509
+    except ImportError as error:
+        raise InputError("webxr: HTTPS needs cryptography: pip install 'q2r2_control[web]'") from error
+    file = folder / "certificate.pem"
+    names = _names(address)
+    try:
+        if not file.exists():
+            why = "first use"
+        else:
+            known = x509.load_pem_x509_certificate(file.read_bytes())
+            alternatives = known.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            has = {str(name.value) for name in alternatives}
+            if known.not_valid_after_utc < now + _RENEWED:
+                why = f"the last one expires on {known.not_valid_after_utc:%Y-%m-%d}"
+            elif missing := [name for name in names if name not in has]:
+                why = f"the last one is not for {', '.join(missing)}"
+            else:
+                return file, None
+    except (OSError, ValueError, x509.ExtensionNotFound) as error:
+        why = f"the last one cannot be read ({error})"
+    try:
+        _write(file, _made(names, now))
+    except OSError as error:
+        raise InputError(f"webxr: {file} cannot be written: {error.strerror}; allowed: --certificate FILE") from error
+    return file, f"new certificate, {why}: the headset's browser asks once whether to trust it"
+
+
+def _names(address: str) -> list[str]:
+    host = socket.gethostname().partition(".")[0]
+    return list(dict.fromkeys((address, f"{host}.local", host, "localhost", "127.0.0.1", "::1")))
+
+
+def _made(names: list[str], now: datetime) -> bytes:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.hashes import SHA256
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"q2r2_control on {names[1]}"[:64])])
+    made = (
+        x509.CertificateBuilder(subject, subject, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))  # a headset's clock may be behind
+        .not_valid_after(now + _VALID)
+        .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .sign(key, SHA256())
+    )
+    private = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    return private + made.public_bytes(Encoding.PEM)
+
+
+def _general_name(name: str) -> object:
+    from cryptography import x509
+
+    try:
+        return x509.IPAddress(ip_address(name))
+    except ValueError:
+        return x509.DNSName(name)
+
+
+def _write(file: Path, content: bytes) -> None:
+    """Readable by this user only, and never half written."""
+    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    temporary = file.with_suffix(f".{os.getpid()}")
+    with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as stream:
+        stream.write(content)
+    temporary.replace(file)

@@ -1,0 +1,77 @@
+"""The data that the input of a run and the process of its page exchange."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from q2r2_control.config.strict import Network
+from q2r2_control.inputs.session import Reception
+
+
+class Display(Protocol):
+    """Makes a headset's display of a run; made by the run, used in the process of the page."""
+
+    def scene(self) -> Mapping[str, Any]:
+        """Sent once to each page, as JSON."""
+
+    def message(self, shown: Any) -> Mapping[str, Any]:
+        """The JSON of what was given to :meth:`DisplayInput.show`."""
+
+
+@dataclass(frozen=True)
+class PageSetup:
+    """The first message to the process."""
+
+    host: str
+    port: int  # 0: any free one
+    allow: Sequence[Network] | None  # that may connect; None: all
+    certificate: str | None  # a PEM file with its key; None: http
+    token: str
+    silence: float  # of the page that drives, after which it is dropped [s]
+    display: Display | None
+
+
+class Ready(NamedTuple):
+    """The first answer: it listens."""
+
+    port: int
+    url: str
+
+
+class Admitted(NamedTuple):
+    """A page drives from now on."""
+
+    peer: str
+
+
+class Lost(NamedTuple):
+    """The page that drove is gone."""
+
+    reason: str
+
+
+class Received(NamedTuple):
+    """The newest hands of the page that drives."""
+
+    receptions: list[Reception]
+
+
+class Logged(NamedTuple):
+    """A line for the log."""
+
+    level: int
+    text: str
+
+
+class Shown(NamedTuple):
+    """The newest state of the run, for the display."""
+
+    content: Any
+
+
+class Picture(NamedTuple):
+    """The newest picture of a camera."""
+
+    jpeg: bytes

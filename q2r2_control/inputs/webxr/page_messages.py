@@ -1,0 +1,81 @@
+"""The messages of the page, without sockets: JSON of the hands, once a frame of the headset."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from q2r2_control.config.strict import first_fault
+from q2r2_control.errors import ProtocolError
+from q2r2_control.inputs.messages import HandMessage, HandPose, MessageType
+from q2r2_control.inputs.session import HAND_TOPICS, Reception
+from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandFault, HandInputs
+
+LONGEST = 4096  # of a message [bytes]; those of the page have under 600
+# A pinch of bare fingers, or a touch of a phone's screen: devices without any other button.
+CONTROLS = DeviceControls(buttons=(*QUEST_CONTROLS.buttons, "pinch"), axes=QUEST_CONTROLS.axes)
+
+_Hand = Literal["left", "right"]
+_Seven = tuple[float, float, float, float, float, float, float]
+_NO_POSE = HandPose(np.full(3, np.nan), np.full(4, np.nan), 0.0, "")
+_TOPICS = {(topic.hand, topic.kind): name for name, topic in HAND_TOPICS.items()}
+
+
+class _PageModel(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class PageHand(_PageModel):
+    """One hand. Its numbers may be anything, NaN included: the gate judges them, as those of every headset."""
+
+    pose: _Seven | None  # position [m] and quaternion x y z w in the room: x forward, y left, z up; None: not known
+    fault: Literal["hand_untracked", "hand_frame_moved"] | None = None
+    buttons: tuple[bool, bool, bool] = (False, False, False)  # upper, lower, pinch
+    axes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # stick to the right and forward, index, middle
+
+
+class PageMessage(_PageModel):
+    """One frame; one without hands says only that the page is alive."""
+
+    seq: int = Field(ge=0, le=1 << 53)
+    hands: dict[_Hand, PageHand] = Field(default_factory=dict)
+
+    @property
+    def controls(self) -> dict[str, tuple[bool, ...]]:
+        """Of each hand, the buttons."""
+        return {name: hand.buttons for name, hand in self.hands.items()}
+
+    def receptions(self) -> list[Reception]:
+        """The messages that the Quest2ROS app sends for the same hands."""
+        found = []
+        for name, hand in self.hands.items():
+            upper, lower, pinch = hand.buttons
+            inputs = HandInputs(upper, lower, *hand.axes, more={"pinch": float(pinch)})
+            fault = None if hand.fault is None else HandFault(hand.fault)
+            pose = _NO_POSE
+            if hand.pose is None:
+                fault = fault or HandFault.UNTRACKED
+            else:
+                pose = HandPose(np.array(hand.pose[:3]), np.array(hand.pose[3:]), 0.0, "")
+            found.append(_reception(name, MessageType.POSE, pose, fault))
+            found.append(_reception(name, MessageType.INPUTS, inputs))
+        return found
+
+
+def _reception(hand: str, kind: MessageType, message: HandMessage, fault: HandFault | None = None) -> Reception:
+    return Reception(_TOPICS[hand, kind], hand, message, fault)
+
+
+_MESSAGES = TypeAdapter(PageMessage)
+
+
+def read(message: str | bytes) -> PageMessage:
+    """Raises :class:`ProtocolError` for what is no message of the page."""
+    if isinstance(message, bytes):
+        raise ProtocolError(f"{len(message)} bytes that are no text; allowed: JSON of the hands")
+    try:
+        return _MESSAGES.validate_json(message)
+    except ValidationError as error:
+        raise ProtocolError(f"{message!r:.60} is no message of the page: {first_fault(error, PageMessage)}") from None

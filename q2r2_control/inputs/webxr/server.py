@@ -1,0 +1,316 @@
+"""The process that serves the page and its socket, on one port: who drives, and the newest data in both directions."""
+
+from __future__ import annotations
+
+import asyncio
+import http
+import json
+import logging
+import ssl
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from importlib.resources import files
+from ipaddress import ip_address
+from threading import Thread
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from q2r2_control.errors import ConfigError, ProtocolError
+from q2r2_control.inputs.connections import MAX_WAITING, TURN
+from q2r2_control.inputs.listener import (
+    MAX_HOSTS_NAMED,
+    Admission,
+    HostLog,
+    Peer,
+    RateLimit,
+    decide,
+    is_allowed,
+    written,
+)
+from q2r2_control.inputs.page_door import PageDoor, text_response
+from q2r2_control.inputs.webxr.exchange import Admitted, Logged, Lost, PageSetup, Picture, Ready, Received, Shown
+from q2r2_control.inputs.webxr.page_messages import LONGEST, PageMessage, read
+from q2r2_control.types import HapticFeedback
+
+MAX_MESSAGES_PER_SECOND = 300  # headsets send up to 120
+REFUSED, DROPPED = 4001, 4002  # codes with which a socket is closed, for the page
+_MOST_SOCKETS = 16
+_KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+_POLICY = "default-src 'self'; connect-src 'self'; style-src 'self'; img-src 'self' blob: data:; base-uri 'none'"
+_LONGEST_REASON = 120  # of a closed socket [bytes]
+
+
+class PageClient(Peer):
+    """A page that is connected."""
+
+    def __init__(self, connection: ServerConnection, host: str, peer: str, page: str, now: float) -> None:
+        # A page keeps its number when it is reloaded, as the app repeats its registrations.
+        super().__init__(peer, host, since=now, last_frame=now, registrations=({"page": page} if page else {}, {}))
+        self.connection = connection
+        self.newest: PageMessage | None = None  # that is not passed on yet
+        self.acknowledged = -1  # number of the newest message
+        self.refused_hosts: set[str] = set()
+        self.due = asyncio.Event()
+        self.vibrations: dict[str, HapticFeedback] = {}  # the newest of each hand
+        self.shown: Any = None
+        self.picture: bytes | None = None
+        self.rate = RateLimit(MAX_MESSAGES_PER_SECOND)
+        self.reason = ""  # why this side has ended it
+        self.closing: asyncio.Future[None] | None = None
+
+    def end(self, code: int, reason: str) -> None:
+        """Close the socket, which takes as long as the page likes."""
+        self.reason = reason
+        shown = reason.encode()[:_LONGEST_REASON].decode(errors="ignore")
+        self.closing = asyncio.ensure_future(self.connection.close(code, shown))
+
+
+class PageServer:
+    """Decides on pages as the TCP server does on headsets, by the same rules."""
+
+    def __init__(self, setup: PageSetup, door: PageDoor, answer: Callable[[Any], None]) -> None:
+        self._setup, self._door, self._answer = setup, door, answer
+        self._clock = time.monotonic
+        self._log = HostLog(_logger_of(answer))
+        self._driver: PageClient | None = None
+        self._waiting: list[PageClient] = []
+        self._sockets = 0
+        folder = files(__package__).joinpath("page")
+        self._files = {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir() if file.is_file()}
+        self._scene = json.dumps({"scene": setup.display.scene()}) if setup.display is not None else None
+
+    async def run(self, requests: Iterator[Any]) -> None:
+        """Serve until the run closes its end."""
+        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+
+        def pass_on() -> None:
+            for request in requests:
+                loop.call_soon_threadsafe(self._take, request)
+            loop.call_soon_threadsafe(ended.set)
+
+        context = None
+        if self._setup.certificate is not None:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.minimum_version = ssl.TLSVersion.TLSv1_2
+            try:
+                context.load_cert_chain(self._setup.certificate)
+            except (OSError, ssl.SSLError) as error:
+                allowed = "allowed: a PEM file with the certificate and its private key"
+                raise ConfigError(f"--certificate {self._setup.certificate}: {error}; {allowed}") from error
+        quiet = logging.getLogger("q2r2_control.inputs.webxr.sockets")
+        quiet.addHandler(logging.NullHandler())
+        quiet.propagate = False
+        async with serve(
+            self._serve,
+            sock=self._door.socket,
+            ssl=context,
+            process_request=self._answer_request,
+            max_size=LONGEST,
+            compression=None,
+            ping_interval=None,
+            close_timeout=1.0,
+            open_timeout=5.0,
+            logger=quiet,
+        ):
+            self._answer(Ready(self._door.port, self._door.url))
+            Thread(target=pass_on, daemon=True).start()
+            watch = asyncio.create_task(self._watch())
+            await ended.wait()
+            watch.cancel()
+
+    def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """A file of the page, a refusal, or None for the socket."""
+        path = urlsplit(request.path).path
+        name = path.removeprefix("/") or "index.html"
+        is_socket = path == "/socket"
+        host, _ = _peer_of(connection)
+        if not is_allowed(host, self._setup.allow):
+            return text_response(http.HTTPStatus.FORBIDDEN, f"{host} is not in headset.allow\n")
+        # The page's other files are in the package, open to all, and no secret.
+        reason = self._door.refusal(request, with_token=is_socket or name == "index.html")
+        if reason is None and is_socket and self._sockets >= _MOST_SOCKETS:
+            reason = f"{_MOST_SOCKETS} pages are open"
+        if reason is not None:
+            self._log.write(host, logging.WARNING, f"page {host} refused: {reason}", self._clock())
+            return text_response(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
+        if is_socket:
+            return None
+        if name not in self._files:
+            return text_response(http.HTTPStatus.NOT_FOUND, "no such file\n")
+        response = text_response(http.HTTPStatus.OK, self._files[name], _KINDS[f".{name.rpartition('.')[2]}"])
+        response.headers["Content-Security-Policy"] = _POLICY
+        response.headers["Cache-Control"] = "no-store"
+        response.headers["Referrer-Policy"] = "no-referrer"  # the URL has the token
+        return response
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        assert connection.request is not None
+        page = parse_qs(urlsplit(connection.request.path).query).get("page", [""])[0][:64]
+        host, peer = _peer_of(connection)
+        client = PageClient(connection, host, peer, page, self._clock())
+        self._sockets += 1
+        self._waiting.append(client)
+        self._settle(client.since)
+        sending = asyncio.create_task(self._send(client))
+        reason = "closed by the page"
+        try:
+            async for message in connection:
+                self._receive(client, message)
+        except ProtocolError as error:
+            reason = " ".join(str(error).split())
+            client.end(DROPPED, reason)
+        except ConnectionClosed as error:
+            reason = f"connection lost: {error}"
+        finally:
+            self._sockets -= 1
+            sending.cancel()
+            self._forget(client, client.reason or reason)
+            if client.closing is not None:
+                await client.closing  # or the server would close it without the reason
+
+    def _receive(self, client: PageClient, text: str | bytes) -> None:
+        now = self._clock()
+        if not client.rate.take(now):
+            raise ProtocolError(f"more than {MAX_MESSAGES_PER_SECOND} messages in a second")
+        message = read(text)
+        client.last_frame, client.acknowledged = now, message.seq
+        if message.hands:
+            client.last_pose = now
+        if client is not self._driver:
+            self._settle(now)
+            return
+        # Of messages that came together only the newest counts, but none with another button is left out.
+        if client.newest is None:
+            asyncio.get_running_loop().call_soon(self._pass_on, client)
+        elif client.newest.controls != message.controls:
+            self._pass_on(client)
+        client.newest = message
+
+    def _pass_on(self, client: PageClient) -> None:
+        message, client.newest = client.newest, None
+        if message is not None and client is self._driver:
+            self._answer(Received(message.receptions()))
+            client.due.set()
+
+    def _take(self, request: Any) -> None:
+        """Store what the driver is to feel and see."""
+        driver = self._driver
+        if driver is None:
+            return
+        match request:
+            case HapticFeedback():
+                driver.vibrations[request.hand] = request
+            case Shown():
+                driver.shown = request.content
+            case Picture():
+                driver.picture = request.jpeg
+                return  # it goes after the next pose has come
+        driver.due.set()
+
+    async def _send(self, client: PageClient) -> None:
+        """Send the newest only, whenever the page has taken what was sent before."""
+        connection = client.connection
+        try:
+            if self._scene is not None:
+                await connection.send(self._scene)
+            while True:
+                await client.due.wait()
+                client.due.clear()
+                vibrations, client.vibrations = client.vibrations, {}
+                shown, client.shown = client.shown, None
+                for vibration in vibrations.values():
+                    await connection.send(json.dumps({"vibration": asdict(vibration)}))
+                if shown is not None and self._setup.display is not None:
+                    state = self._setup.display.message(shown)
+                    await connection.send(json.dumps({"state": state, "acknowledged": client.acknowledged}))
+                if client.picture is not None and not connection.transport.get_write_buffer_size():
+                    picture, client.picture = client.picture, None
+                    await connection.send(picture)
+        except ConnectionClosed:
+            pass
+
+    async def _watch(self) -> None:
+        """Look at silent pages, and at those that wait."""
+        while True:
+            # Data sent before this time are read before anybody is judged by it, as in the TCP server.
+            asked = self._clock()
+            await asyncio.sleep(TURN)
+            driver = self._driver
+            if driver is not None and asked - driver.last_frame > self._setup.silence:
+                self._drop(driver, f"no message for {self._setup.silence:g} s")
+            self._settle(asked)
+            self._log.flush(self._clock())
+
+    def _settle(self, now: float) -> None:
+        """Decide who drives."""
+        newest = {client.host: client for client in self._waiting}
+        still_waiting = 0
+        for client in tuple(self._waiting):
+            driver = self._driver
+            verdict, reason = decide(driver, client, now)
+            if verdict is Admission.ADMIT:
+                if driver is not None:
+                    self._drop(driver, reason)
+                self._waiting.remove(client)
+                self._driver = client
+                self._answer(Admitted(client.peer))
+                self._write(client, logging.INFO, "connected")
+            elif verdict is Admission.REFUSE or newest[client.host] is not client or still_waiting == MAX_WAITING:
+                assert driver is not None  # without one, everybody is admitted
+                reason = reason or f"{driver.peer} is connected"
+                self._waiting.remove(client)
+                if client.host not in driver.refused_hosts and len(driver.refused_hosts) < MAX_HOSTS_NAMED:
+                    driver.refused_hosts.add(client.host)
+                    self._write(client, logging.WARNING, f"refused: {reason}")
+                client.end(REFUSED, reason)
+            else:
+                still_waiting += 1
+
+    def _drop(self, client: PageClient, reason: str) -> None:
+        client.end(DROPPED, reason)
+        self._forget(client, reason)
+
+    def _forget(self, client: PageClient, reason: str) -> None:
+        """A page is gone, or does not count any more; may be called twice."""
+        if client in self._waiting:
+            self._waiting.remove(client)
+        if client is self._driver:
+            self._driver = None
+            self._answer(Lost(reason))
+            self._write(client, logging.WARNING if client.reason else logging.INFO, f"gone: {reason}")
+
+    def _write(self, client: PageClient, level: int, what: str) -> None:
+        self._log.write(client.host, level, f"page {client.peer} {what}", self._clock())
+
+
+def _logger_of(answer: Callable[[Any], None]) -> logging.Logger:
+    """A logger whose lines are the run's."""
+
+    class Answering(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            answer(Logged(record.levelno, record.getMessage()))
+
+    logger = logging.Logger(__name__, logging.INFO)
+    logger.addHandler(Answering())
+    return logger
+
+
+def _peer_of(connection: ServerConnection) -> tuple[str, str]:
+    """Host (IPv4 through IPv6 as IPv4), and with its port for people."""
+    address, port = connection.remote_address[:2]
+    host = str(getattr(ip_address(address), "ipv4_mapped", None) or address)
+    return host, written(host, port)
+
+
+def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
+    """Answer :class:`Ready`, then what the page that drives sends. Raises :class:`ConfigError`."""
+    setup: PageSetup | None = next(requests, None)
+    if setup is not None:
+        scheme = "http" if setup.certificate is None else "https"
+        door = PageDoor(setup.host, setup.port, "--input webxr", setup.token, scheme)
+        asyncio.run(PageServer(setup, door, answer).run(requests))

@@ -1,0 +1,228 @@
+"""The input that a web page in a headset's browser brings: the loop's side."""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib.util import find_spec
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from q2r2_control.config.cell import Config, HeadsetConfig
+from q2r2_control.config.strict import Network
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.errors import ConfigError, InputError
+from q2r2_control.inputs.connections import SILENCE_ALLOWED
+from q2r2_control.inputs.hand_stream import HandStream
+from q2r2_control.inputs.headset import watch_of
+from q2r2_control.inputs.listener import reachable
+from q2r2_control.inputs.page_door import is_loopback
+from q2r2_control.inputs.samples import HandsWatch
+from q2r2_control.inputs.session import HeadsetStatistics
+from q2r2_control.inputs.webxr import usb
+from q2r2_control.inputs.webxr.certificate import installation_folder, installation_token, own_certificate
+from q2r2_control.inputs.webxr.exchange import (
+    Admitted,
+    Display,
+    Logged,
+    Lost,
+    PageSetup,
+    Picture,
+    Ready,
+    Received,
+    Shown,
+)
+from q2r2_control.inputs.webxr.page_messages import CONTROLS
+from q2r2_control.process.helper_process import HelperProcess, reason_of
+from q2r2_control.types import SIDES, HandSample, HapticFeedback
+
+PORT = 8443
+_READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
+_PATIENCE = 2.0  # for it to end [s]
+_ROOM = 2  # messages to it that wait; a newer one is better than a queue
+_LOG = logging.getLogger(__name__)
+
+
+class WebXrInput:
+    """Hands of a headset's browser. Implements :class:`~q2r2_control.inputs.base.Input`.
+
+    A process of its own serves page and socket, so neither HTTPS nor JSON takes the interpreter from the loop. From the
+    messages on, samples go the way of those of the Quest2ROS app: :class:`~q2r2_control.inputs.hand_stream.HandStream`.
+    They are stamped with ``clock`` when they come from that process.
+    """
+
+    controls = CONTROLS
+    options = ("host", "port", "usb", "certificate", "say")
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = PORT,
+        clock: Callable[[], float] = time.monotonic,
+        allow: tuple[Network, ...] | None = None,
+        watch: HandsWatch | None = None,
+        by_usb: bool = False,
+        certificate: Path | None = None,
+        say: Callable[[str], None] = _LOG.info,
+        silence: float = SILENCE_ALLOWED,
+    ) -> None:
+        """A page that says nothing for ``silence`` [s] is dropped; the gate stops the arms long before."""
+        self.address = host, port  # after ``start`` the port that was bound
+        self.url: str | None = None  # after ``start``
+        self._clock, self._allow, self._usb, self._certificate, self._say = clock, allow, by_usb, certificate, say
+        self._silence = silence
+        self._stream = HandStream(watch or HandsWatch())
+        self._display: Display | None = None
+        self._process: HelperProcess | None = None
+        self._ready = Event()
+
+    @classmethod
+    def from_config(
+        cls,
+        config: Config,
+        host: str | None = None,
+        port: int | None = None,
+        usb: bool = False,
+        certificate: Path | None = None,
+        say: Callable[[str], None] = _LOG.info,
+    ) -> WebXrInput:
+        """At the host of the cell's headset, or another one. Raises :class:`ConfigError`."""
+        headset = HeadsetConfig(**(config.headset.model_dump() | ({} if host is None else {"host": host})))
+        if usb and not is_loopback(headset.host):
+            raise ConfigError(f"--usb with --host {headset.host}: allowed: 127.0.0.1, which the cable leads to")
+        port, allow = PORT if port is None else port, headset.networks
+        return cls(
+            headset.host, port, allow=allow, watch=watch_of(config), by_usb=usb, certificate=certificate, say=say
+        )
+
+    @staticmethod
+    def cell(config: Config) -> Config:
+        """The cell with the page's axes, which it knows: x forward, y left, z up."""
+        teleop = config.teleop.model_copy(update={"axes": TeleopSettings().axes})
+        return config.model_copy(update={"teleop": teleop})
+
+    def show_on(self, display: Display) -> None:
+        """Let pages show a run by ``display``; before :meth:`start`."""
+        self._display = display
+
+    def show(self, content: Any) -> bool:
+        """Show the newest state of the run; False where the last one still waits. Never waits."""
+        return self._process is not None and self._process.send(Shown(content), 1)
+
+    def show_picture(self, jpeg: bytes) -> bool:
+        """Show the newest picture of a camera, as :meth:`show`; from any thread."""
+        return self._process is not None and self._process.send(Picture(jpeg), 1)
+
+    def start(self) -> None:
+        """Serve the page. Raises :class:`InputError` or :class:`ConfigError` where that is not possible."""
+        if self._process is not None:
+            raise InputError(f"webxr: already serving {self.url}")
+        if find_spec("websockets") is None:
+            raise InputError("--input webxr needs websockets: pip install 'q2r2_control[web]'")
+        host, port = self.address
+        certificate, token = None, ""
+        if not is_loopback(host):  # a browser trusts localhost without
+            folder = installation_folder()
+            token, certificate = installation_token(folder), self._certificate
+            if certificate is None:
+                certificate, line = own_certificate(folder, reachable(host), datetime.now(UTC))
+                if line is not None:
+                    self._say(f"webxr: {line}")
+        pem = None if certificate is None else str(certificate)
+        setup = PageSetup(host, port, self._allow, pem, token, self._silence, self._display)
+        try:
+            self._process = HelperProcess("serves the page", "q2r2_control.inputs.webxr.server", self._take, _ROOM)
+        except OSError as error:
+            raise InputError(f"webxr: {reason_of(error)}") from error
+        self._process.send(setup)
+        waited = 0.0
+        while self._process.alive and waited < _READY and not self._ready.wait(0.1):
+            waited += 0.1
+        if self.url is None:
+            fault = self._process.fault or f"webxr: the page was not ready within {_READY:g} s"
+            self.close()
+            raise InputError(fault)
+        if self._usb:
+            try:
+                usb.reverse(self.address[1])
+            except InputError:
+                self.close()
+                raise
+        self._announce()
+
+    @property
+    def connected(self) -> bool:
+        """Whether a page drives, and no loss is left that ``poll`` has not shown yet."""
+        return self._stream.connected and self._process is not None and self._process.alive
+
+    def poll(self, now: float) -> list[HandSample]:
+        return self._stream.take()
+
+    def send_haptic(self, feedback: HapticFeedback) -> None:
+        """Vibrate, values clipped to 0..1; nothing happens unless a page drives, or when a value is not finite."""
+        values = (feedback.frequency, feedback.amplitude)
+        if self._process is None or feedback.hand not in SIDES or not all(map(math.isfinite, values)):
+            return
+        frequency, amplitude = (min(max(float(value), 0.0), 1.0) for value in values)
+        self._process.send(HapticFeedback(feedback.hand, frequency, amplitude))
+
+    @property
+    def statistics(self) -> HeadsetStatistics:
+        """A snapshot for people."""
+        return self._stream.statistics(self.address, self._clock())
+
+    def close(self) -> None:
+        """End the process; may be called twice."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        if self._usb and self.url is not None:
+            try:
+                usb.reverse(self.address[1], remove=True)
+            except InputError as error:
+                _LOG.debug("%s", error)
+        process.finish(_PATIENCE)
+        self._stream.lose("server closed")
+        self.url = None
+        self._ready.clear()
+
+    def _take(self, answer: Any) -> None:
+        """Follow an answer of the process, in a thread of its own."""
+        match answer:
+            case Received(receptions):
+                now = self._clock()
+                for reception in receptions:
+                    self._stream.receive(reception, now)
+            case Admitted(peer):
+                self._stream.admit(peer)
+            case Lost(reason):
+                self._stream.lose(reason)
+            case Logged(level, text):
+                _LOG.log(level, "%s", text)
+            case Ready(port, url):
+                self.address, self.url = (self.address[0], port), url
+                self._ready.set()
+
+    def _announce(self) -> None:
+        """Say where the page is, as text and as a code for a camera."""
+        assert self.url is not None
+        host, port = self.address
+        where = f"http://localhost:{port} on the headset" if self._usb else self.url
+        self._say(f"webxr: open {where}")
+        if is_loopback(host):
+            if not self._usb:
+                self._say("webxr: only this machine can reach it; --host 0.0.0.0 admits the network, --usb a cable")
+            return
+        who = "" if self._allow is None else f" from {', '.join(map(str, self._allow))} (headset.allow)"
+        self._say(f"webxr: whoever has this URL{who} can drive the arms")
+        if find_spec("segno") is not None:
+            import segno
+
+            drawn = io.StringIO()
+            segno.make(self.url).terminal(drawn, compact=True)
+            self._say(drawn.getvalue().rstrip("\n"))

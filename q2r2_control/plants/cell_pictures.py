@@ -1,0 +1,39 @@
+"""Pictures of a simulated cell for processes beside the loop, as JPEG."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.errors import PlantError
+from q2r2_control.process.helper_process import reason_of
+from q2r2_control.types import Array
+
+if TYPE_CHECKING:
+    from q2r2_control.plants.mujoco_cameras import CellPictures
+
+# Of such a process: MuJoCo's own choice needs a display, and one processor stays the loop's where there is no graphics
+# card.
+ENVIRONMENT = {"MUJOCO_GL": "egl", "LP_NUM_THREADS": "1"}
+
+
+def open_cameras(model: bytes, cameras: Mapping[str, CameraConfig]) -> CellPictures:
+    """The cameras of a pickled ``mujoco.MjModel``. Raises :class:`PlantError` where OpenGL is missing."""
+    try:
+        from q2r2_control.plants.mujoco_cameras import CellPictures  # MuJoCo may look for OpenGL when it is imported
+    except (ImportError, AttributeError, RuntimeError) as error:
+        raise PlantError(f"no pictures: MUJOCO_GL={os.environ['MUJOCO_GL']}: {reason_of(error)}") from error
+    return CellPictures(pickle.loads(model), cameras)
+
+
+def jpeg_of(picture: Array | np.ndarray, quality: int) -> bytes:
+    packed = io.BytesIO()
+    Image.fromarray(picture).save(packed, "JPEG", quality=quality)
+    return packed.getvalue()

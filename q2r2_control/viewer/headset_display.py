@@ -1,0 +1,155 @@
+"""The display of a run on a headset: states with their reasons, the robot, targets, and the recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config.cell import Config
+from q2r2_control.events import Event, ReasonKind
+from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.webxr.exchange import Display
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import ActiveLimit, Array
+from q2r2_control.viewer.live import next_press, why
+from q2r2_control.viewer.state_colours import state_colour
+
+_PERIOD = 1.0 / 30.0  # between messages [s]
+_DIGITS = 4  # of metres and quaternions
+_EPISODE_OVER = (
+    ReasonKind.EPISODE_ENDS,
+    ReasonKind.EPISODE_SUCCEEDED,
+    ReasonKind.EPISODE_FAILED,
+    ReasonKind.EPISODE_DISCARDED,
+)
+
+
+@runtime_checkable
+class DisplayInput(Input, Protocol):
+    """An input whose device shows the run, as a headset does."""
+
+    def show_on(self, display: Display) -> None:
+        """Show a run by ``display``; before ``start``."""
+
+    def show(self, content: Any) -> bool:
+        """Show the newest state; False where the last one still waits. Never waits."""
+
+    def show_picture(self, jpeg: bytes) -> bool:
+        """Show the newest picture of a camera, as :meth:`show`; from any thread."""
+
+
+class ShownTick(NamedTuple):
+    """The shown part of a run. Words are made where this is sent."""
+
+    tick: Tick
+    binding: tuple[ActiveLimit, ...]  # limits that held a step back since the last one
+    last: Mapping[str, Event]  # of each arm
+    recording: str
+
+
+@dataclass(frozen=True)
+class ShownRun:
+    """The cell and the robot of a run."""
+
+    config: Config
+    urdf: str
+    joint_names: tuple[str, ...]
+    joints: Mapping[str, Array]  # of each arm, indices of ``joint_names``
+    fingers: Mapping[str, tuple[str, ...]]  # of each arm, joints of its gripper
+
+
+class RunDisplay:
+    """Makes messages, in the process that sends them, where the robot is read from its URDF."""
+
+    def __init__(self, run: ShownRun) -> None:
+        self._run = run
+        self._names = {arm: [run.joint_names[index] for index in its] for arm, its in run.joints.items()}
+
+    def scene(self) -> Mapping[str, Any]:
+        """Meshes, each in the frame of a joint."""
+        from q2r2_control.viewer.joint_tree import JointTree  # for which trimesh is needed, an extra
+
+        self._tree = JointTree(self._run)
+        self._data = self._tree.model.createData()
+        meshes = [
+            {
+                "joint": joint,
+                "colour": colour,
+                "vertices": np.asarray(mesh.vertices).round(_DIGITS).ravel().tolist(),
+                "faces": np.asarray(mesh.faces).ravel().tolist(),
+            }
+            for joint, colour, mesh in self._tree.meshes()
+        ]
+        return {"meshes": meshes}
+
+    def message(self, shown: ShownTick) -> Mapping[str, Any]:
+        """Poses as x y z qx qy qz qw in the world, of joints by their index in the meshes."""
+        tick, bindings = shown.tick, self._run.config.teleop.bindings
+        pin.forwardKinematics(self._tree.model, self._data, self._tree.posture(tick.state.q, tick.grippers))
+        arms = {
+            arm: {
+                "state": tick.states[arm],
+                "why": why(tick, arm, self._names[arm], shown.binding, shown.last.get(arm)),
+                "next": next_press(tick, arm, bindings),
+                "colour": state_colour(tick.states[arm]),
+                "target": None if (target := tick.targets[arm].pose) is None else _rounded(target),
+            }
+            for arm in tick.tools
+        }
+        joints = [_rounded(placement) for placement in self._data.oMi]
+        return {"arms": arms, "joints": joints, "recording": shown.recording}
+
+
+def _rounded(pose: pin.SE3) -> list[float]:
+    return [round(number, _DIGITS) for number in pin.SE3ToXYZQUATtuple(pose)]
+
+
+class HeadsetView:
+    """A listener of one run. A tick stores references, 30 times a second the input's process gets them."""
+
+    def __init__(self, source: DisplayInput, pipeline: Pipeline, recorded: bool) -> None:
+        self._source, self._recorded = source, recorded
+        self._due = 0.0  # of the next message, by the clock on the wall [s]
+        self._binding: dict[ActiveLimit, None] = {}
+        self._last: dict[str, Event] = {}
+        self._episodes, self._open = 0, False
+        robot = pipeline.robot
+        source.show_on(
+            RunDisplay(
+                ShownRun(
+                    config=pipeline.config,
+                    urdf=robot.urdf,
+                    joint_names=robot.joint_names,
+                    joints={arm: its.joints for arm, its in robot.arms.items()},
+                    fingers={arm: its.finger_joints for arm, its in robot.arms.items()},
+                )
+            )
+        )
+        pipeline.listeners.append(self)
+
+    def __call__(self, tick: Tick) -> None:
+        for event in tick.events:
+            self._last[event.arm] = event
+            if event.kind is ReasonKind.EPISODE_BEGINS:
+                self._episodes, self._open = self._episodes + (not self._open), True
+            elif event.kind in _EPISODE_OVER:
+                self._open = False
+        if tick.reference.report.binding:
+            self._binding.update(dict.fromkeys(tick.reference.report.binding))
+        now = time.monotonic()
+        if now >= self._due and self._source.show(
+            ShownTick(tick, tuple(self._binding), dict(self._last), self._recording())
+        ):
+            self._due = now + _PERIOD
+            self._binding = {}
+
+    def _recording(self) -> str:
+        if not self._recorded:
+            return ""
+        return f"records episode {self._episodes}" if self._open else f"records; {self._episodes} episodes so far"

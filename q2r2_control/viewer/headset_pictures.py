@@ -1,0 +1,73 @@
+"""Pictures of one camera of the simulated cell for a headset, taken in a process of their own."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.plants.cell_pictures import ENVIRONMENT, jpeg_of, open_cameras
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.process.helper_process import HelperProcess
+from q2r2_control.summary.tick import Tick
+
+_MOST = 30.0  # pictures a second
+_NICENESS = 19  # loop and hands go first
+_QUALITY = 70  # of JPEG
+_logger = logging.getLogger(__name__)
+
+
+class PictureSetup(NamedTuple):
+    """The first request."""
+
+    model: bytes  # an mujoco.MjModel, pickled
+    name: str
+    camera: CameraConfig
+
+
+def main(requests: Iterator[Any], answer: Callable[[bytes], None]) -> None:
+    """Answer a JPEG for each request, which says where everything is."""
+    setup = next(requests, None)
+    if setup is None:
+        return
+    with suppress(OSError):
+        os.nice(_NICENESS)
+    cell = open_cameras(setup.model, {setup.name: setup.camera})
+    for qpos in requests:
+        cell.place(np.frombuffer(qpos))
+        answer(jpeg_of(cell.take(setup.name), _QUALITY))
+
+
+class HeadsetPictures(AbstractContextManager["HeadsetPictures"]):
+    """A listener of one run, as a context around it. Where it fails, a line says so and the run goes on."""
+
+    def __init__(self, plant: MujocoPlant, name: str, camera: CameraConfig, show: Callable[[bytes], object]) -> None:
+        """``show`` gets each picture, in a thread of its own. Raises :class:`OSError`."""
+        self._plant, self._period = plant, 1.0 / min(camera.rate, _MOST)
+        self._due = 0.0  # by the clock on the wall [s]
+
+        def pass_on(jpeg: bytes) -> None:
+            show(jpeg)
+
+        # Room for one request: a newer picture is better than a queue.
+        self._process = HelperProcess("takes pictures", __name__, pass_on, room=1, idle=None, **ENVIRONMENT)
+        self._process.send(PictureSetup(pickle.dumps(plant.model), name, camera))
+        self._told = False
+
+    def __call__(self, tick: Tick) -> None:
+        now = time.monotonic()
+        if now >= self._due and self._process.send(self._plant.observed_qpos.tobytes(), 1):
+            self._due = now + self._period
+        elif not self._process.alive and not self._told:
+            self._told = True
+            _logger.warning("no pictures for the headset: %s", self._process.fault)
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()

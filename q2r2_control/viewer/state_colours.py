@@ -1,0 +1,22 @@
+"""The colour of each state of an arm, the same on every display: r g b."""
+
+from __future__ import annotations
+
+from q2r2_control.teleop.arm_states import ArmState
+
+Colour = tuple[int, int, int]
+GREEN, AMBER, RED, BLUE, GREY = (46, 160, 90), (230, 160, 30), (214, 57, 57), (60, 120, 216), (140, 146, 152)
+_COLOURS: dict[str, Colour] = {
+    ArmState.ENGAGED: GREEN,
+    ArmState.CARRIED: GREEN,
+    ArmState.PAUSING: AMBER,
+    ArmState.PAUSED: AMBER,
+    ArmState.ALIGNING: AMBER,
+    ArmState.HOMING: BLUE,
+    ArmState.LOST: RED,
+    ArmState.STOPPED: RED,
+}
+
+
+def state_colour(state: str) -> Colour:
+    return _COLOURS.get(state, GREY)

@@ -1,0 +1,38 @@
+"""Pictures for a headset come from a process of their own, and a fault of it is one line."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from PIL import Image
+
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.viewer.headset_pictures import HeadsetPictures
+from tests.support.processes import cell, wait_until
+
+
+def test_a_picture_of_the_cell_comes_and_a_lost_process_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
+    camera = CameraConfig(position=(1.5, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48)
+    loop = Pipeline.from_config(cell().model_copy(update={"cameras": {"front": camera}}), plant="mujoco")
+    assert isinstance(loop.plant, MujocoPlant)
+    got: list[bytes] = []
+    with HeadsetPictures(loop.plant, "front", camera, got.append) as pictures:
+        loop.begin()
+        tick = loop.tick()
+
+        def taken() -> bool:
+            pictures(tick)
+            return bool(got)
+
+        wait_until(taken)
+        pictures._process.kill()
+        wait_until(lambda: not pictures._process.alive)
+        pictures._due = 0.0
+        for _ in range(3):
+            pictures(tick)
+    loop.end()
+    assert Image.open(io.BytesIO(got[0])).size == (64, 48)
+    assert len([record for record in caplog.records if "no pictures for the headset" in record.message]) == 1

@@ -1,0 +1,163 @@
+"""The page in a headset that is emulated, from entering VR to the arms of the simulated cell."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page
+
+from q2r2_control.types import Array
+from tests.web.browser import count, pixels, wait_until
+from tests.web.conftest import Open, Start
+
+EMULATOR = Path(os.environ.get("Q2R2_IWER", ".venv/iwer/package")) / "build" / "iwer.min.js"
+RUN = ("tests.web.headset_run", "0.004")
+LOWER = {"left": "x-button", "right": "a-button"}
+UPPER = {"left": "y-button", "right": "b-button"}
+ORANGE = (255.0, 107.0, 13.0)  # of the arms' rings
+
+
+@pytest.fixture
+def enter(open_page: Open) -> Any:
+    """Open a page in an emulated headset, and enter VR or AR."""
+    assert EMULATOR.exists(), f"{EMULATOR} is missing: make test-web fetches it with npm"
+    script = f"{EMULATOR.read_text()};{Path(__file__).with_name('emulator.js').read_text()}"
+
+    def enter_one(url: str, mode: str = "vr") -> Page:
+        page = open_page(url, script)
+        page.set_viewport_size({"width": 320, "height": 220})
+        begin(page, mode)
+        return page
+
+    return enter_one
+
+
+def begin(page: Page, mode: str = "vr") -> None:
+    """Enter from the page, as after it was reloaded."""
+    wait_until(lambda: said(page) is not None)
+    page.click(f"#immersive-{mode}")
+    wait_until(lambda: page.evaluate("Boolean(headset.activeSession)"))
+    frames(page, 10)
+
+
+def frames(page: Page, count: int) -> None:
+    """Let the emulator draw so many."""
+    drawn = page.evaluate("frames")
+    wait_until(lambda: page.evaluate("frames") >= drawn + count)
+
+
+def said(page: Page) -> dict[str, Any] | None:
+    """The newest state that the run has told the page."""
+    state: dict[str, Any] | None = page.evaluate("said")
+    return state
+
+
+def arms(page: Page, what: str) -> list[Any]:
+    state = said(page)
+    assert state is not None
+    return [arm[what] for arm in state["arms"].values()]
+
+
+def wait_for(page: Page, states: str, why: str = "") -> None:
+    """Wait until both arms are in a state, for a reason."""
+    wait_until_said(
+        page, lambda: arms(page, "state") == [states] * 2 and all(why in words for words in arms(page, "why"))
+    )
+
+
+def wait_until_said(page: Page, condition: Callable[[], object]) -> None:
+    """Wait until the page was told so; otherwise the last it was told is in the failure."""
+    try:
+        wait_until(condition)
+    except AssertionError as error:
+        told = said(page) or {}
+        raise AssertionError(f"the arms: {told.get('arms')}; the link: {page.inner_text('#link')}") from error
+
+
+def press(page: Page, *buttons: dict[str, str]) -> None:
+    for button in buttons:
+        page.evaluate("button => press(button)", button)
+
+
+def targets(page: Page) -> Array:
+    """(2, 3) positions of both targets [m]."""
+    return np.array(arms(page, "target"))[:, :3]
+
+
+def test_hands_engage_the_arms_move_them_by_the_rooms_axes_and_feel_it(enter: Any, start: Start) -> None:
+    run = start(*RUN)
+    page = enter(run.url)
+    wait_for(page, "idle", "not engaged yet")
+    press(page, LOWER)
+    wait_for(page, "engaged")
+    before = targets(page)
+    page.evaluate("carry([-0.05, 0.06, -0.07], 60)")  # left, up, forward
+    wait_until_said(page, lambda: np.allclose(targets(page)[0] - before[0], [0.07, 0.05, 0.06], atol=2e-3))
+    assert np.allclose(targets(page)[1] - before[1], 0.5 * np.array([0.07, 0.05, 0.06]), atol=2e-3)
+    wait_for(page, "engaged", "follows the hand")
+    wait_until(lambda: count(pixels(page), ORANGE) > 5)  # the robot, not only its board
+    # The chord of the app stops both, and a pause after it is one.
+    page.evaluate("hold(['x-button', 'y-button'], 'left', 1)")
+    wait_for(page, "aligning")
+    page.evaluate("hold(['x-button', 'y-button'], 'left', 0)")
+    wait_for(page, "engaged")
+    press(page, LOWER)
+    wait_for(page, "paused", "lower button")
+    felt = page.evaluate("vibrations.filter(one => one.amplitude > 0).map(one => one.hand)")
+    assert {"left", "right"} <= set(felt)
+    assert page.evaluate("pulses") > 3
+    page.evaluate("document.getElementById('leave').click()")  # behind what the emulator draws
+    wait_until(lambda: not page.evaluate("Boolean(headset.activeSession)"))
+    run.interrupt()
+    assert run.end()["at_rest"]
+
+
+def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: Any, start: Start) -> None:
+    run = start(*RUN)
+    page = enter(run.url)
+
+    def engage() -> None:
+        press(page, LOWER)
+        wait_for(page, "engaged")
+
+    engage()
+    page.evaluate("guessed = true")  # controllers out of the headset's sight
+    wait_for(page, "lost", "does not see the hand")
+    page.evaluate("guessed = false")
+    frames(page, 20)
+    wait_for(page, "lost")
+    engage()
+    page.evaluate("headset.updateVisibilityState('hidden')")  # by the headset's menu, or taken off
+    wait_for(page, "lost", "does not see the hand")
+    page.evaluate("headset.updateVisibilityState('visible')")
+    frames(page, 20)
+    wait_for(page, "lost")
+    engage()
+    page.evaluate("void carry([0.0, 0.3, 0.0], 400)")
+    frames(page, 30)
+    page.reload()  # in the middle of a motion
+    begin(page)
+    wait_for(page, "lost", "connection lost")
+    press(page, LOWER)
+    wait_for(page, "engaged")
+    page.evaluate("headset.activeSession.end()")
+    wait_for(page, "lost", "does not see the hand")
+    run.interrupt()
+    assert run.end()["at_rest"]
+
+
+def test_the_first_headset_drives_and_another_is_told_so(enter: Any, start: Start, open_page: Open) -> None:
+    run = start(*RUN)
+    page = enter(run.url, "ar")
+    press(page, LOWER)
+    wait_for(page, "engaged")
+    other = open_page(run.url, "")
+    wait_until(lambda: "drives" in other.inner_text("#link"))
+    wait_for(page, "engaged")
+    run.interrupt()
+    assert run.end()["at_rest"]
