@@ -101,7 +101,10 @@ def test_nothing_comes_before_start_nor_after_close_and_it_waits_while_nobody_po
     ("arguments", "message"),
     [
         *(
-            ({"trajectory": name}, r"allowed are circle, .*stack, and meet, grasp, handover, stack joined by \+$")
+            (
+                {"trajectory": name},
+                r"allowed are circle, .*stack, and meet, grasp, carry, handover, stack joined by \+$",
+            )
             for name in ("spiral", "handover+", "circle+stack", "")
         ),
         ({"hands": ("middle",)}, "allowed are left, right"),
