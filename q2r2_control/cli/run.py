@@ -107,7 +107,7 @@ def run(
         cell = slowed(cell)
         say("real cabinets: joints at a tenth of their speed; --full-speed ends that", style="yellow")
     source = input or cell.input
-    if source == "web":
+    if "web" in (source, takeover):
         cell, web = web_cell(cell), True
     asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
     asked |= {"policy": policy, "takeover": takeover}
