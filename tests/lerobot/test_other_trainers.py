@@ -14,7 +14,11 @@ pytest.importorskip("lerobot", reason="make test-lerobot installs it")
 pytest.importorskip("robomimic", reason="make test-lerobot installs it")
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset
+
+try:
+    from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
+except ImportError:  # of lerobot 0.4
+    from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset
 from robomimic.utils import obs_utils
 from robomimic.utils.dataset import SequenceDataset
 
