@@ -1,6 +1,6 @@
 """The whole chain in simulation: hands grasp a block 50 times, and a policy that is trained on that grasps it as well.
 
-    .venv-lerobot/bin/python examples/learning/grasp.py FOLDER [--episodes 50] [--steps 1000] [--seeds 20]
+    .venv-lerobot/bin/python examples/learning/grasp.py FOLDER [--episodes 50] [--steps 6000] [--seeds 20]
 
 The block lies elsewhere at each attempt, and the policy is told where: an ACT of lerobot, small and from scratch, on a
 CPU. Its actions go through the door of policies, as those of the policy that it is compared with: the mean episode.
@@ -180,7 +180,7 @@ def mean_episode(dataset: LeRobotDataset) -> Array:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    for name, value in (("episodes", 50), ("steps", 1000), ("seeds", 20)):
+    for name, value in (("episodes", 50), ("steps", 6000), ("seeds", 20)):
         parser.add_argument(f"--{name}", type=int, default=value)
     given = parser.parse_args()
     cell = coarse(load_config("config/dual_iiwa7.yaml"))

@@ -116,7 +116,7 @@ def trained(exported: Path) -> Path:
     given |= {"policy.chunk_size": 10, "policy.n_action_steps": 10, "policy.dim_model": 32, "policy.n_heads": 2}
     given |= {"policy.dim_feedforward": 32, "policy.n_encoder_layers": 1, "policy.use_vae": "false"}
     given |= {"policy.pretrained_backbone_weights": "null", "dataset.video_backend": "pyav"}
-    given |= {"batch_size": 4, "num_workers": 0, "save_freq": 100, "wandb.enable": "false"}
+    given |= {"batch_size": 1, "num_workers": 0, "save_freq": 100, "wandb.enable": "false"}
     program = str(Path(sys.executable).with_name("lerobot-train"))
     run([program, *(f"--{name}={value}" for name, value in given.items())], exported.parent)
     return exported.with_name("act") / "checkpoints/last/pretrained_model"
@@ -235,7 +235,7 @@ def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: P
         f"--policy.path={trained}",
         PACED,
     )
-    options = (*dagger, *teleop, *dataset_options(seen, "corrected"), "--play_sounds=false")
+    options = (*dagger, *teleop, *dataset_options(seen, "rollout_corrected"), "--play_sounds=false")
     terminal = Terminal(command("lerobot-rollout", seen, *options), seen)
     terminal.wait("continuous recording started")
     for _ in range(TAKEOVERS):
@@ -257,7 +257,7 @@ def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: P
         assert np.abs(after[:, :3] - before[:, :3]).max() <= 1e-6
         turns = [turn_between(tuple(one[3:]), tuple(other[3:])) for one, other in zip(before, after, strict=True)]
         assert np.abs(turns).max() <= 1e-6
-    check_tags(LeRobotDataset("q2r2/corrected", root=next(seen.glob("corrected*"))), rows)
+    check_tags(LeRobotDataset("q2r2/corrected", root=next(seen.glob("rollout_corrected*"))), rows)
 
 
 def check_tags(dataset: LeRobotDataset, rows: Rows) -> None:
