@@ -15,7 +15,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 
 from q2r2_control.gym import TASKS
 
@@ -23,7 +22,7 @@ SECONDS, WARM = 20.0, 5  # of each environment, after so many steps
 RATE = 20  # steps in a second of simulated time, robosuite's default
 SHARE = 0.1  # of the largest action
 
-Environment = tuple[str, Any, Callable[[], npt.NDArray[Any]]]  # name, environment, and what draws an action
+Environment = tuple[str, Any, Callable[[], Any]]  # name, environment, and what draws an action
 
 
 def of_ours() -> Iterator[Environment]:
@@ -39,7 +38,14 @@ def of_robosuite() -> Iterator[Environment]:
         print("robosuite is not installed: without it")
         return
     for name in ("TwoArmLift", "TwoArmHandover"):
-        env = robosuite.make(name, robots=["IIWA", "IIWA"], has_renderer=False, use_camera_obs=False, control_freq=RATE)
+        env = robosuite.make(
+            name,
+            robots=["IIWA", "IIWA"],
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            use_camera_obs=False,
+            control_freq=RATE,
+        )
         yield f"robosuite {name}", env, partial(np.random.default_rng(1).uniform, *env.action_spec)
 
 
