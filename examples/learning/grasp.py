@@ -1,6 +1,6 @@
 """The whole chain in simulation: hands grasp a block 50 times, and a policy that is trained on that grasps it as well.
 
-    .venv-lerobot/bin/python examples/learning/grasp.py FOLDER [--episodes 50] [--steps 6000] [--seeds 20]
+    .venv-lerobot/bin/python examples/learning/grasp.py FOLDER [--episodes 50] [--steps 3000] [--seeds 20]
 
 The block lies elsewhere at each attempt, and the policy is told where: an ACT of lerobot, small and from scratch, on a
 CPU. Its actions go through the door of policies, as those of the policy that it is compared with: the mean episode.
@@ -30,7 +30,7 @@ from q2r2_control.demo.assembly_tasks import TaskWatch, tasks_named
 from q2r2_control.export.lerobot import SOURCES
 from q2r2_control.inputs.assembly import GRASP
 from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.policy import PolicyInput
+from q2r2_control.inputs.policy import ActionSpace, PolicyInput
 from q2r2_control.inputs.scripted import ScriptedInput, in_sequence
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
@@ -50,7 +50,7 @@ BATCH, RATE = 16, 1e-3  # of the learning
 class Whole:
     """A policy that says the whole motion when it is asked first, and later what is left of it."""
 
-    rate = float(FPS)
+    space, rate = ActionSpace.TOOL, float(FPS)
 
     def __init__(self, motion: Callable[[Observation], Array]) -> None:
         self._say = motion
@@ -137,14 +137,17 @@ def export(recordings: Path, folder: Path) -> LeRobotDataset:
 
 def train(dataset: LeRobotDataset, steps: int, folder: Path) -> Path:
     """Train an ACT on tensors in memory, since the loader takes longer than the policy; returns its folder."""
-    columns = {name: torch.from_numpy(column(dataset, name)) for name in (STATE, PLACE, ACTION)}
+    actions = actions_of(dataset)
+    columns = {name: torch.from_numpy(column(dataset, name)) for name in (STATE, PLACE)}
+    columns[ACTION] = torch.from_numpy(actions)
     sizes = {name: tuple(values.shape[1:]) for name, values in columns.items()}
     seen = {STATE: PolicyFeature(FeatureType.STATE, sizes[STATE]), PLACE: PolicyFeature(FeatureType.ENV, sizes[PLACE])}
     config = ACTConfig(
         input_features=seen, output_features={ACTION: PolicyFeature(FeatureType.ACTION, sizes[ACTION])}, **SMALL
     )
     policy = ACTPolicy(config)
-    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    stats = dataset.meta.stats | {ACTION: {"mean": actions.mean(axis=0), "std": actions.std(axis=0)}}
+    before, after = make_pre_post_processors(config, dataset_stats=stats)
     ends = torch.from_numpy(np.repeat(dataset.meta.episodes["dataset_to_index"], dataset.meta.episodes["length"]))
     begins = torch.from_numpy(np.flatnonzero(column(dataset, "frame_index") < FPS))  # when the policy is asked
     optimizer = torch.optim.AdamW(policy.parameters(), RATE)
@@ -167,20 +170,25 @@ def train(dataset: LeRobotDataset, steps: int, folder: Path) -> Path:
     return folder
 
 
+def actions_of(dataset: LeRobotDataset) -> Array:
+    """Targets of the tools, whose errors do not add up along an arm, with the openings of both grippers."""
+    return np.hstack((column(dataset, ActionSpace.TOOL), column(dataset, ACTION)[:, -2:]))
+
+
 def column(dataset: LeRobotDataset, name: str) -> Array:
     return np.stack(dataset.hf_dataset.with_format("numpy")[name])
 
 
 def mean_episode(dataset: LeRobotDataset) -> Array:
     """Actions (n, size) of the mean of all episodes, for as long as a policy's chunk is."""
-    actions, frames = column(dataset, ACTION), column(dataset, "frame_index")
+    actions, frames = actions_of(dataset), column(dataset, "frame_index")
     return np.array([actions[frames == frame].mean(axis=0) for frame in range(CHUNK)])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    for name, value in (("episodes", 50), ("steps", 6000), ("seeds", 20)):
+    for name, value in (("episodes", 50), ("steps", 3000), ("seeds", 20)):
         parser.add_argument(f"--{name}", type=int, default=value)
     given = parser.parse_args()
     cell = coarse(load_config("config/dual_iiwa7.yaml"))

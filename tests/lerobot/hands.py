@@ -9,7 +9,7 @@ from q2r2_control.types import SIDES, HandInputs, HandSample
 from tests.support.hands_input import PRESSED, RELEASED, HandsInput
 
 NAME, READY = "taking_over", "hands: have taken over"
-_ASKED_ANEW, _LATER = 0.05, 0.5  # without a poll, and after the first one [s]
+_ASKED_ANEW, _LATER = 0.05, 0.3  # without a poll, and after the first one [s]
 
 
 class TakingOver(HandsInput):
