@@ -69,7 +69,7 @@ IN_LEROBOT := HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/pyt
 test-lerobot: $(LEROBOT)/.installed
 	$(IN_LEROBOT) -m pytest tests/lerobot
 
-# From scripted hands to a trained policy that grasps, an hour on two cores.
+# From scripted hands to a trained policy that grasps: some ten minutes where nothing else runs.
 test-learning: $(LEROBOT)/.installed
 	rm -rf build/learning
 	$(IN_LEROBOT) examples/learning/grasp.py build/learning

@@ -45,6 +45,7 @@ STATE, ACTION = "observation.state", "action"
 SMALL: dict[str, Any] = {"dim_model": 64, "n_heads": 4, "dim_feedforward": 256, "n_encoder_layers": 2}
 SMALL |= {"use_vae": False, "dropout": 0.0, "chunk_size": CHUNK, "n_action_steps": CHUNK, "device": "cpu"}
 BATCH, RATE = 16, 1e-3  # of the learning
+WANTED = 0.5  # of the attempts succeed
 
 
 class Whole:
@@ -203,7 +204,7 @@ def main() -> None:
         print(f"ACT, seed {seed}: {why or 'succeeded'}", flush=True)
         done["mean episode"] += not attempt(cell, PolicyInput(Whole(lambda seen: mean)), place)
     print(", ".join(f"{name}: {count} of {given.seeds}" for name, count in done.items()))
-    sys.exit(done["ACT"] <= done["mean episode"])
+    sys.exit(done["ACT"] < max(WANTED * given.seeds, done["mean episode"] + 1))
 
 
 if __name__ == "__main__":
