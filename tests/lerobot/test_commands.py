@@ -205,14 +205,14 @@ def test_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) ->
     robot = cell_and_robot_of(recording_of(folder))[1]
     asked, rows = column(dataset, "action"), rows_of(folder)
     led = rows["reference_q"][:: round(100 / FPS)][: len(asked)]
-    delay = 1  # frames by which a single action is followed later
+    delay = 1  # frames by which a single action is followed later, to the nearest frame
     for arm in robot.arms:
         pairs = [
             (robot.tool_pose(np.float64(one[:14]), arm), robot.tool_pose(other, arm))
             for one, other in zip(asked, led[delay:], strict=False)
         ]
         apart = [np.linalg.norm(one.translation - other.translation) for one, other in pairs]
-        assert np.sqrt(np.mean(np.square(apart))) < 5e-4
+        assert np.sqrt(np.mean(np.square(apart))) < 1e-3
 
 
 def test_rollout_lets_a_policy_act_that_was_trained_on_an_export(seen: Path, trained: Path) -> None:
