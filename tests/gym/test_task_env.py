@@ -127,10 +127,10 @@ def test_the_arms_follow_small_actions_and_say_why_they_refuse_large_ones() -> N
 def test_steps_end_at_frames_of_a_dataset_at_the_rate() -> None:
     env = shared()
     still = env.reset(seed=0)[0]["observation.state"]
-    start = env._now
+    start = env._policy.observation.time
     for step in range(1, 40):
         env.step(still)
-        assert 0.0 <= start + step / RATE - env._now + 1e-9 < 1.0 / coarse().loop_rate_hz
+        assert 0.0 <= start + step / RATE - env._policy.observation.time + 1e-9 < 1.0 / coarse().loop_rate_hz
 
 
 @pytest.mark.slow
