@@ -52,6 +52,7 @@ class ReasonKind(StrEnum):
     # Requests of a program.
     HOME_REQUESTED = "home_requested", "a program asks for the way home"
     PAUSE_REQUESTED = "pause_requested", "a program asks for a pause"
+    POLICY_REQUESTED = "policy_requested", "a program gives the arms to the policy"
     RECORDING_REQUESTED = "recording_requested", "a program asks for {action}"
     SETTINGS_REQUESTED = "settings_requested", "a program changes settings: {changes}"
     CONTROL_REQUESTED = "control_requested", "a program changes control: {changes}"

@@ -44,7 +44,7 @@ def modules(*extras: str) -> set[str]:
     """The packages that the dependencies, or these extras, bring."""
     optional = PROJECT["optional-dependencies"]
     entries = [entry for extra in extras for entry in optional[extra]] if extras else PROJECT["dependencies"]
-    names = [re.split(r"[<>=]", entry)[0].removeprefix("ros-jazzy-") for entry in entries]
+    names = [re.split(r"[\[<>=]", entry)[0].removeprefix("ros-jazzy-") for entry in entries]
     return {IMPORTS.get(name, name).replace("-", "_") for name in names}
 
 

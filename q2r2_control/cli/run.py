@@ -109,7 +109,9 @@ def run(
         cell = slowed(cell)
         say("real cabinets: joints at a tenth of their speed; --full-speed ends that", style="yellow")
     source = input or cell.input
-    cell, web = adapted(source, cell), web or source == "web"
+    for name in filter(None, (source, takeover)):
+        cell = adapted(name, cell)
+    web |= "web" in (source, takeover)
     asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
     asked |= {"usb": usb or None, "certificate": certificate}
     asked |= {"policy": policy, "takeover": takeover}

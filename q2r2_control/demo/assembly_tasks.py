@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from q2r2_control.config.cell import Config
-from q2r2_control.demo.part_judges import HandoverJudge, Judge, LiftJudge, StackJudge, Toucher, TouchWatch
+from q2r2_control.demo.part_judges import CarryJudge, HandoverJudge, Judge, LiftJudge, StackJudge, Toucher, TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
@@ -45,6 +45,12 @@ _ALL = (
         "a block of 15 mm is taken from the table and put back",
         ("flat_block",),
         lambda parts: tuple(map(LiftJudge, parts)),
+    ),
+    AssemblyTask(
+        "carry",
+        "both hands lift a bar of 120 mm together, carry it to the middle and put it back",
+        ("bar",),
+        lambda parts: tuple(map(CarryJudge, parts)),
     ),
     AssemblyTask(
         "handover",

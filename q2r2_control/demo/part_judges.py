@@ -127,6 +127,8 @@ class LiftJudge(Judge):
     Once it has lain there for a second nobody holds it to this any more: other work may go on with it.
     """
 
+    _wanted = f"held {1e3 * _LIFT:.0f} mm up"
+
     def __init__(self, part: str) -> None:
         super().__init__(part)
         self._start: tuple[float, float, float] | None = None
@@ -140,12 +142,14 @@ class LiftJudge(Judge):
         part = parts[self.parts[0]]
         self._start = self._start or part.place
         self._away = math.dist(part.place[:2], self._start[:2]), part.place[2] - self._start[2]
-        up = part.touched and not part.touched & ~FINGERS and self._away[1] >= _LIFT
-        self._held = self._held + dt if up else 0.0
+        self._held = self._held + dt if self._is_up(part) else 0.0
         self._longest = max(self._longest, self._held)
         self._height = max(self._height, self._away[1])
         back = self._longest >= HELD_TIME and self._is_back and not part.touched & FINGERS
         self._lain = self._lain + dt if back else 0.0
+
+    def _is_up(self, part: PartState) -> bool:
+        return bool(part.touched) and not part.touched & ~FINGERS and self._away[1] >= _LIFT
 
     @property
     def _is_back(self) -> bool:
@@ -159,10 +163,19 @@ class LiftJudge(Judge):
     def faults(self) -> list[str]:
         faults, part = super().faults(), self.parts[0]
         if self._longest < HELD_TIME:
-            faults.append(f"{part}: held {1e3 * _LIFT:.0f} mm up for {self._longest:.1f} s, not {HELD_TIME:g} s")
+            faults.append(f"{part}: {self._wanted} for {self._longest:.1f} s, not {HELD_TIME:g} s")
         if not self._is_back:
             faults.append(f"{part}: ended {1e3 * math.hypot(*self._away):.0f} mm from where it lay")
         return faults
+
+
+class CarryJudge(LiftJudge):
+    """The same with both hands at once, and 100 mm from where it lay."""
+
+    _wanted = f"held by both hands, {1e3 * _LIFT:.0f} mm up and {1e3 * _CARRY:.0f} mm away,"
+
+    def _is_up(self, part: PartState) -> bool:
+        return part.touched == FINGERS and self._away[0] >= _CARRY and self._away[1] >= _LIFT
 
 
 class StackJudge(Judge):

@@ -25,7 +25,7 @@ from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
 
 FASTEST = 1000  # [frames/s]
-_FORMAT = 5  # of kept episodes; those of another one are made again
+_FORMAT = 6  # of kept episodes; those of another one are made again
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,9 @@ from typing import Any
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import EpisodeVectors
+from q2r2_control.inputs.policy import ActionSpace
 
+POSITION = ".pos"  # which lerobot looks for at the end of what a policy sees and commands
 SOURCES = "meta/recordings.json"  # which recording an episode is of; lerobot itself does not read it
 _NAME = "q2r2/recordings"  # datasets have one on the hub, where these are never sent
 # The package asks no hub, and what it and the encoder of videos print are no results of a command.
@@ -54,7 +56,7 @@ def write_shard(episode: EpisodeVectors, folder: Path) -> None:
 
     _renounce_real_time()
     features: dict[str, dict[str, Any]] = {
-        name: {"dtype": "float32", "shape": (len(labels),), "names": list(labels)}
+        name: {"dtype": "float32", "shape": (len(labels),), "names": _as_lerobot(name, labels)}
         for name, labels in episode.names.items()
     }
     outcome = {name: flags[:, None] for name, flags in episode.outcome().items()}
@@ -73,6 +75,11 @@ def write_shard(episode: EpisodeVectors, folder: Path) -> None:
     dataset.save_episode(parallel_encoding=False)  # there are processes enough
     dataset.finalize()
     (folder / SOURCES).write_text(json.dumps([source_of(episode)]), encoding="utf-8")
+
+
+def _as_lerobot(feature: str, labels: Sequence[str]) -> list[str]:
+    ends = POSITION if feature in ("observation.state", ActionSpace.JOINTS) else ""
+    return [f"{label}{ends}" for label in labels]
 
 
 def join_shards(shards: Sequence[Path], folder: Path) -> None:

@@ -30,7 +30,6 @@ from q2r2_control.types import Array
 
 CELL = "config/dual_iiwa7.yaml"
 _FRONT = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=320, height=240)
-_ROUNDING = 1e-9  # [s]
 _REACH = 2.0  # from the world's origin, of any tool along any axis [m]
 
 Observed = dict[str, npt.NDArray[Any]]
@@ -96,7 +95,7 @@ class TaskEnv(gymnasium.Env):
         self._pipeline.listeners[:] = [self._watch, self._promises]
         self._pipeline.begin()
         self._scatter()
-        self._start = self._now = self._pipeline.tick().now
+        self._start = self._pipeline.tick().now
         self._steps, self._tools = 0, None
         return self._observed(), self._info("")
 
@@ -104,13 +103,9 @@ class TaskEnv(gymnasium.Env):
         self._policy.send(action, names=self.action_names)
         self._promises.begin()
         self._steps += 1
-        # Up to the newest tick at or before the end of the step.
-        last = self._start + self._steps / self._rate - 1.0 / self._config.loop_rate_hz + _ROUNDING
         fault = ""
         try:
-            while self._now <= last:
-                self._now = self._pipeline.tick().now
-                self._pipeline.check()
+            self._pipeline.tick_until(self._start + self._steps / self._rate)
         except PlantError as error:
             fault = str(error)
         info = self._info(fault)

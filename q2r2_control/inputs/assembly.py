@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
@@ -59,6 +59,14 @@ class HandWork:
     tools: Mapping[str, tuple[WayPoint, ...]]  # after home, at rising times since the start; a hand without any rests
     steps: tuple[tuple[float, str], ...]  # from when on [s], in words
     presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # of the upper buttons, by hand [s]
+
+    def moved(self, x: float, y: float) -> HandWork:
+        """The same work on parts that lie ``x`` and ``y`` [m] farther along the axes of the world."""
+        tools = {
+            hand: tuple((p[0], p[1] + x, p[2] + y, *p[3:]) if p[1:4] != HOME[hand] else p for p in points)
+            for hand, points in self.tools.items()
+        }
+        return replace(self, tools=tools)
 
 
 # A block of 60 mm, held 17 mm above its middle.
@@ -203,5 +211,40 @@ HANDOVER = HandWork(
     presses={"left": (3.5, 8.7), "right": (8.1, 14.7)},
 )
 
+
+def _carrying(side: float, tilt: tuple[float, float]) -> tuple[WayPoint, ...]:
+    """The way of the hand at the end of the bar that is to this ``side`` of its middle along y, 1 or -1."""
+    lies, middle = 0.15 + side * _OFF, side * _OFF
+    return (
+        (2.2, 0.44, lies + side * _BACK_Y, _BAR_LOW + _BACK_Z, *tilt),
+        (3.4, 0.44, lies, _BAR_LOW, *tilt),
+        (4.2, 0.44, lies, _BAR_LOW, *tilt),  # grasp
+        (5.6, 0.44, lies, 0.33, *tilt),  # lift
+        (7.4, 0.46, middle, 0.33, *tilt),  # to the middle
+        (8.8, 0.46, middle, 0.33, *tilt),
+        (10.6, 0.44, lies, 0.33, *tilt),  # back
+        (12.0, 0.44, lies, _BAR_LOW, *tilt),  # put down
+        (12.8, 0.44, lies, _BAR_LOW, *tilt),  # let go
+        (13.8, 0.44, lies + side * _BACK_Y, _BAR_LOW + _BACK_Z, *tilt),
+    )
+
+
+CARRY = HandWork(
+    duration=16.0,
+    tools={
+        "left": (*_carrying(1.0, _LEFT), (16.0, *_LEFT_HOME)),
+        "right": (*_carrying(-1.0, _RIGHT), (16.0, *_RIGHT_HOME)),
+    },
+    steps=(
+        (0.0, "each hand reaches for an end of the bar"),
+        (3.4, "both grasp"),
+        (4.2, "both lift the bar"),
+        (5.6, "they carry it to the middle"),
+        (8.8, "they put it back"),
+        (12.0, "both let go"),
+    ),
+    presses={"left": (3.5, 12.1), "right": (3.5, 12.1)},
+)
+
 # In the order in which they can follow each other.
-WORKS: Mapping[str, HandWork] = {"meet": MEET, "grasp": GRASP, "handover": HANDOVER, "stack": STACK}
+WORKS: Mapping[str, HandWork] = {"meet": MEET, "grasp": GRASP, "carry": CARRY, "handover": HANDOVER, "stack": STACK}

@@ -81,7 +81,7 @@ class PolicyInput:
             raise ConfigError(f"space = {shown(space)}: allowed: {', '.join(ActionSpace)}")
         if not (isinstance(rate, float | int) and _GAPS[0] <= 1.0 / max(rate, 1e-9) <= _GAPS[1]):
             raise ConfigError(f"rate = {shown(rate)}: allowed: {1.0 / _GAPS[1]:g} to {1.0 / _GAPS[0]:g} Hz")
-        self.space, self.period, self._policy, self._operator = ActionSpace(space), 1.0 / float(rate), policy, operator
+        self.space, self.period, self._policy, self.operator = ActionSpace(space), 1.0 / float(rate), policy, operator
         self.controls = QUEST_CONTROLS if operator is None else operator.controls
         self.observation: Observation | None = None  # the newest one
         self._chunks: deque[ActionChunk] = deque(maxlen=_KEPT)
@@ -103,7 +103,7 @@ class PolicyInput:
 
     @property
     def connected(self) -> bool:
-        return self._started if self._operator is None else self._operator.connected
+        return self._started if self.operator is None else self.operator.connected
 
     def prepare(self, robot: Robot, realtime: bool) -> None:
         """See :class:`PolicySource`."""
@@ -112,8 +112,8 @@ class PolicyInput:
         self._chunks.clear()
 
     def start(self) -> None:
-        if self._operator is not None:
-            self._operator.start()
+        if self.operator is not None:
+            self.operator.start()
         self._started = True
         self._ends.clear()
         if self._policy is not None and self._realtime:
@@ -121,7 +121,7 @@ class PolicyInput:
             self._thread.start()
 
     def poll(self, now: float) -> list[HandSample]:
-        return [] if self._operator is None else self._operator.poll(now)
+        return [] if self.operator is None else self.operator.poll(now)
 
     def chunks(self) -> list[ActionChunk]:
         """See :class:`PolicySource`."""
@@ -136,8 +136,8 @@ class PolicyInput:
             self._wake.set()
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
-        if self._operator is not None:
-            self._operator.send_haptic(feedback)
+        if self.operator is not None:
+            self.operator.send_haptic(feedback)
 
     def close(self) -> None:
         self._started = False
@@ -146,8 +146,8 @@ class PolicyInput:
         if self._thread is not None:
             self._thread.join(_JOINED)
             self._thread = None
-        if self._operator is not None:
-            self._operator.close()
+        if self.operator is not None:
+            self.operator.close()
 
     def send(self, actions: npt.ArrayLike, times: npt.ArrayLike | None = None, names: Sequence[str] = ()) -> None:
         """Actions (n, size) or one (size,), to be followed at ``times`` (n,) [s] on the loop's clock.

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.assembly import HOME, WORKS, WayPoint, WayPoints, minimum_jerk
+from q2r2_control.inputs.assembly import HOME, WORKS, HandWork, WayPoint, WayPoints, minimum_jerk
 from q2r2_control.inputs.played import EvenSampling, HeadsetSampling, PlayedInput, SampleTiming
 from q2r2_control.robot.compose import compose
 from q2r2_control.types import SIDES, Array, HandInputs
@@ -89,14 +89,13 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
     return np.array([0.0, 0.0, lift]), turn
 
 
-def in_sequence(names: Sequence[str]) -> HandTrajectory:
-    """Hands that do one of :data:`WORKS` after the other, and then pause."""
+def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
+    """Hands that do one work of a name after the other, and then pause."""
     homes: dict[str, WayPoint] = {hand: (0.0, *HOME[hand], 0.0, 0.0) for hand in SIDES}
     points = {hand: [home] for hand, home in homes.items()}
     presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
     begins, steps = START, [(0.0, "the hands rest")]
-    for name in names:
-        work = WORKS[name]
+    for name, work in works:
         steps += [(begins + t, f"{name}: {words}") for t, words in work.steps]
         for hand, home in homes.items():
             way = [(begins + point[0], *point[1:]) for point in (home, *work.tools.get(hand, ()))]
@@ -127,7 +126,7 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
     "circle": HandTrajectory(_circle),
     "line": HandTrajectory(_line),
     "rotate": HandTrajectory(_rotate),
-    **{name: in_sequence([name]) for name in WORKS},
+    **{name: in_sequence([(name, work)]) for name, work in WORKS.items()},
 }
 
 
@@ -139,7 +138,7 @@ def trajectory_named(name: str) -> HandTrajectory:
     if not all(work in WORKS for work in works):
         allowed = f"{', '.join(TRAJECTORIES)}, and {', '.join(WORKS)} joined by +"
         raise ConfigError(f"scripted trajectory {name!r:.60}: allowed are {allowed}")
-    return in_sequence(works)
+    return in_sequence([(work, WORKS[work]) for work in works])
 
 
 # Where an operator holds the hands; only what follows from here on moves an arm.
@@ -169,7 +168,7 @@ class ScriptedInput(PlayedInput):
 
     def __init__(
         self,
-        trajectory: str,
+        trajectory: str | HandTrajectory,
         hands: Sequence[str] = SIDES,
         human: bool = False,
         seed: int = 0,
@@ -189,7 +188,7 @@ class ScriptedInput(PlayedInput):
             raise ConfigError(
                 f"scripted input: jitter = {jitter!r}: allowed is 0 .. {0.5 / rate_hz:.3g}, half a sample"
             )
-        self._trajectory = trajectory_named(trajectory)
+        self._trajectory = trajectory_named(trajectory) if isinstance(trajectory, str) else trajectory
         self._frequency, self._scale = frequency_hz, scale
 
         def sampling(hand: str) -> SampleTiming:

@@ -36,18 +36,20 @@ class PendingRequests:
 
     home: bool = False
     pause: bool = False
+    give_back: bool = False
     mark: Action | None = None  # of the recording
     settings: TeleopSettings | None = None
     control: Mapping[str, float] | None = None  # of the controller, by name
     of_recording: list[Reason] = field(default_factory=list)  # verdicts on episodes, and why it ended
 
     def __bool__(self) -> bool:
-        asked = self.home or self.pause or self.settings is not None or self.control is not None
+        asked = self.home or self.pause or self.give_back or self.settings is not None or self.control is not None
         return asked or self.mark is not None or bool(self.of_recording)
 
     def clear(self) -> None:
         """Ask for nothing any more."""
-        self.home, self.pause, self.mark, self.settings, self.control = False, False, None, None, None
+        self.home, self.pause, self.give_back = False, False, False
+        self.mark, self.settings, self.control = None, None, None
         self.of_recording.clear()
 
     def reasons(self, current: TeleopSettings) -> Iterator[Reason]:
@@ -56,6 +58,8 @@ class PendingRequests:
             yield Reason(ReasonKind.HOME_REQUESTED)
         if self.pause:
             yield Reason(ReasonKind.PAUSE_REQUESTED)
+        if self.give_back:
+            yield Reason(ReasonKind.POLICY_REQUESTED)
         if self.mark is not None:
             yield Reason.of(ReasonKind.RECORDING_REQUESTED, action=str(self.mark))
         if self.settings is not None:
@@ -71,6 +75,8 @@ class PendingRequests:
             self.home = True
         elif reason.kind is ReasonKind.PAUSE_REQUESTED:
             self.pause = True
+        elif reason.kind is ReasonKind.POLICY_REQUESTED:
+            self.give_back = True
         elif reason.kind is ReasonKind.RECORDING_REQUESTED:
             self.mark = Action(reason.detail["action"])
         elif reason.kind is ReasonKind.CONTROL_REQUESTED:
@@ -191,6 +197,8 @@ class OperatorSide:
             self._teleop.home(now)
         if requests.pause:
             self._teleop.pause(now, Reason(ReasonKind.PAUSE_REQUESTED))
+        if requests.give_back:
+            self._teleop.give_back(now)
         if requests.mark is not None:
             self._teleop.mark(now, requests.mark)
         if (settings := requests.settings) is not None:

@@ -40,6 +40,7 @@ from q2r2_control.wording import sentence
 STOPPING = "stopping"  # state of every arm while the run ends
 _STOP_ALLOWANCE = 1.0  # after full braking, for an arm that still recovers into its limits [s]
 _REST = 1e-6  # of the reference [rad/s]
+_ROUNDING = 1e-9  # [s]
 _LONGEST_TORQUE = 0.005  # that one torque may push for: in 0.1 s it drives the arms into each other [s]
 _logger = logging.getLogger(__name__)
 
@@ -103,6 +104,10 @@ class Pipeline:
         """Let both arms hold until a new press; from any thread."""
         self.requests.pause = True
 
+    def give_back(self) -> None:
+        """Take the arms from the hands and give them to the policy, which goes on where they are; from any thread."""
+        self.requests.give_back = True
+
     def mark(self, action: Action) -> None:
         """Begin, end or mark an episode of the recording, as an operator may; from any thread."""
         self.requests.mark = action
@@ -161,6 +166,15 @@ class Pipeline:
         self._prepare(realtime=False)
         self._start_input(realtime=False)
         self._begin(realtime=False)
+
+    def tick_until(self, end: float) -> None:
+        """Take the ticks of a run that has begun, up to the newest one at or before ``end`` [s] on the loop's clock.
+
+        Raises :class:`PlantError` where supervision has stopped the arms.
+        """
+        while self._clock.now <= end - self._clock.period + _ROUNDING:
+            self.tick()
+            self.check()
 
     def check(self) -> None:
         """Raises :class:`PlantError` where supervision has stopped the arms."""

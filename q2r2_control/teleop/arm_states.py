@@ -35,6 +35,7 @@ class Cause(StrEnum):
     NOT_ALIGNED = "the same, with something in the way"
     CARRY = "the control that carries, by the hand of the other arm, which is engaged"
     CARRY_ENDS = "that control, one that pauses or an alignment, by either hand"
+    GIVE_BACK = "a program gives the arms to the policy"
     POLICY_ACTS = "an action of a policy counts, with nothing in the way"
     HOME = "the control that brings the arms home, with nothing in the way"
     HOMED = "home, or held up on the way"
@@ -75,6 +76,7 @@ TRANSITIONS = (
     Transition(frozenset({_S.ALIGNING}), Cause.NOT_ALIGNED, _S.LOST),
     Transition(AT_REST | {_S.ENGAGED}, Cause.CARRY, _S.CARRIED),
     Transition(frozenset({_S.ENGAGED, _S.CARRIED}), Cause.CARRY_ENDS, _S.PAUSED, Who.BOTH),
+    Transition(frozenset({_S.ENGAGED, _S.PAUSING, _S.ALIGNING, _S.LOST}), Cause.GIVE_BACK, _S.PAUSED, Who.BOTH),
     Transition(AT_REST, Cause.POLICY_ACTS, _S.POLICY),
     Transition(FOLLOWING, Cause.FAULT, _S.LOST, Who.LINKED),
     Transition(AT_REST | {_S.ENGAGED, _S.PAUSING, _S.POLICY}, Cause.HOME, _S.HOMING, Who.BOTH),

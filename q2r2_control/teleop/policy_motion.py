@@ -70,8 +70,9 @@ class PolicyMotion:
         if self._arm not in chunk.tools and self._arm not in chunk.motions:
             return None
         times = chunk.times.tolist()
-        if max(abs(times[0] - now), abs(times[-1] - now)) > _AHEAD:
-            text = f"times[0] is {times[0] - now:.3g} s from now; allowed: {_AHEAD:g} s at most, on the loop's clock"
+        farthest = max(times[0] - now, times[-1] - now, key=abs)
+        if abs(farthest) > _AHEAD:
+            text = f"a time is {farthest:.3g} s from now; allowed: {_AHEAD:g} s at most, on the loop's clock"
             return Reason.of(ReasonKind.POLICY_UNUSABLE, text=text)
         if self._arm in chunk.tools:
             poses = [_pose(numbers) for numbers in chunk.tools[self._arm].tolist()]

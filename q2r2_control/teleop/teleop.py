@@ -217,6 +217,15 @@ class Teleop:
         elif self._arms[arm].state not in HOLDING:
             self._stop({arm: reason}, now)
 
+    def give_back(self, now: float) -> None:
+        """No hand drives an arm or is waited for: the policy may go on, until a hand is heard of again."""
+        now, _ = self._clock(now)
+        reason = Reason(ReasonKind.POLICY_REQUESTED)
+        self._pair.end_carry(now, reason)
+        self._pair.change(Cause.GIVE_BACK, now, reason)
+        for arm in self._arms.values():
+            arm.heard_of = False
+
     def _clock(self, now: float) -> tuple[float, Reason | None]:
         """The time from now on, which does not go back a little, and the fault of a clock that cannot be followed."""
         last = self._now

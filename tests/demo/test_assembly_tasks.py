@@ -22,7 +22,7 @@ from tests.support.processes import Watch, assert_torque_bounds
 pytestmark = pytest.mark.slow
 
 # The tasks that are shown, by mode, and in which ticks: nothing here needs 1 kHz, and the tests have to be fast.
-SHOWN = {CommandMode.POSITION: "meet+grasp+handover+stack", CommandMode.TORQUE: "handover+stack"}
+SHOWN = {CommandMode.POSITION: "meet+grasp+carry+handover+stack", CommandMode.TORQUE: "handover+stack"}
 PERIODS = {CommandMode.POSITION: 0.01, CommandMode.TORQUE: 0.005}  # [s]
 
 
@@ -126,7 +126,7 @@ def test_arms_that_touch_what_they_should_not_spoil_the_task_and_are_named(
 def test_tasks_come_in_the_order_in_which_they_can_follow_each_other() -> None:
     assert [task.name for task in tasks_named(["stack", "meet", "stack"])] == ["meet", "stack"]
     assert tasks_named(["all"]) == tuple(TASKS.values())
-    with pytest.raises(ConfigError, match="task 'juggle': allowed: meet, grasp, handover, stack, all"):
+    with pytest.raises(ConfigError, match="task 'juggle': allowed: meet, grasp, carry, handover, stack, all"):
         tasks_named(["juggle"])
 
 

@@ -7,7 +7,17 @@ from collections.abc import Iterable
 
 import pytest
 
-from q2r2_control.demo.part_judges import FINGERS, HandoverJudge, Judge, LiftJudge, PartState, StackJudge, Toucher
+from q2r2_control.demo.part_judges import (
+    FINGERS,
+    HELD_TIME,
+    CarryJudge,
+    HandoverJudge,
+    Judge,
+    LiftJudge,
+    PartState,
+    StackJudge,
+    Toucher,
+)
 
 DT = 0.1
 LEFT, RIGHT, TABLE = Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER, Toucher.SURROUNDINGS
@@ -61,6 +71,20 @@ def test_a_part_that_is_not_lifted_and_put_back_fails(phases: list[Phase], name:
 
 GIVER, BOTH, TAKER = (1.0, 0.0, 0.4, LEFT), (0.5, 0.0, 0.4, FINGERS), (0.5, 0.0, 0.4, RIGHT)
 AWAY = (1.2, -0.12, 0.4, RIGHT)
+
+
+@pytest.mark.parametrize(
+    ("away", "held", "touched"),
+    [
+        pytest.param(0.12, 1.5, FINGERS, id="carried by both"),
+        pytest.param(0.08, 0.0, FINGERS, id="not far enough"),
+        pytest.param(0.12, 0.0, LEFT, id="by one alone"),
+    ],
+)
+def test_a_part_is_carried_by_both_hands_100_mm_away_and_put_back(away: float, held: float, touched: int) -> None:
+    judge = play(CarryJudge("part"), [LIES, (0.5, 0.0, 0.2, TABLE | FINGERS), (1.5, away, 0.3, touched), GRIPPED, BACK])
+    assert judge.measured()["held_s"] == pytest.approx(held)
+    assert (judge.faults() == []) == (held >= HELD_TIME)
 
 
 def test_a_part_that_both_held_and_the_taker_carries_away_succeeds() -> None:

@@ -55,7 +55,8 @@ def test_info_names_every_number_and_says_what_is_in_it(dataset: Path) -> None:
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 125, 2)
     assert info["splits"] == {"train": "0:3"}
     for name, labels in NAMES.items():
-        assert info["features"][name] == {"dtype": "float32", "shape": [len(labels)], "names": list(labels)}
+        known = [f"{label}.pos" for label in labels]  # as lerobot's commands look for them
+        assert info["features"][name] == {"dtype": "float32", "shape": [len(labels)], "names": known}
     for name in ("next.done", "next.success"):
         assert info["features"][name] == {"dtype": "bool", "shape": [1], "names": None}
 

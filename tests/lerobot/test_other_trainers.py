@@ -14,7 +14,15 @@ pytest.importorskip("lerobot", reason="make test-lerobot installs it")
 pytest.importorskip("robomimic", reason="make test-lerobot installs it")
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset
+
+try:
+    from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
+
+    OF_ALL = False  # whether it wants the folder of all datasets
+except ImportError:  # of lerobot 0.4
+    from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset
+
+    OF_ALL = True
 from robomimic.utils import obs_utils
 from robomimic.utils.dataset import SequenceDataset
 
@@ -49,7 +57,7 @@ def test_robomimic_loads_every_step_with_its_pictures(cache: str | None, tmp_pat
 
 def test_lerobot_takes_v21_for_its_own_and_reads_every_number_and_picture(tmp_path: Path) -> None:
     made = export("lerobot-v2.1", SEEN, tmp_path, ["1", "2", "3"])
-    convert_dataset("made", root=made.parent, push_to_hub=False)
+    convert_dataset("made", root=made.parent if OF_ALL else made, push_to_hub=False)
     loaded = LeRobotDataset("made", root=made, delta_timestamps={"action": [0.0, 1 / FPS]}, video_backend="pyav")
     assert (loaded.num_episodes, loaded.num_frames, loaded.fps) == (3, 125, FPS)
     item = loaded[41]

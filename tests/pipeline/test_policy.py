@@ -19,7 +19,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, Array, HandInputs, HandSample, Observation
 from tests.recording.runs import file_of, pipeline, record
 from tests.support.hands_input import HandsInput
-from tests.support.processes import Watch
+from tests.support.processes import Watch, changes
 
 pytestmark = pytest.mark.slow
 
@@ -99,6 +99,40 @@ def test_a_recording_says_at_every_frame_who_acted_and_is_replayed_to_the_bit(tm
     np.testing.assert_array_equal(vectors["intervention"], tags)
     again = replay(file)
     assert (again.difference, again.ended_by) == (None, None)
+
+
+class Leaving(HandsInput):
+    """Hands that nobody hears any more after a while."""
+
+    def poll(self, now: float) -> list[HandSample]:
+        return super().poll(now) if now < 0.9 else []
+
+
+@pytest.mark.parametrize("stopped", [False, True], ids=["engaged", "after a stop that waits for a press"])
+def test_a_program_gives_the_arms_to_the_policy_which_then_waits_for_no_press(stopped: bool) -> None:
+    policy = PolicyInput(Circle(), operator=Leaving())
+    loop = pipeline(source=policy)
+    watch = Watch(loop)
+
+    def ask(tick: Tick) -> None:
+        if stopped and len(watch.ticks) == 300:
+            loop.pause()
+        if len(watch.ticks) == 500:
+            loop.give_back()
+        if len(watch.ticks) == 600:
+            policy.send([np.nan] * 14)
+
+    loop.listeners.append(ask)
+    summary = loop.run(1.5, realtime=False)
+    given = [("engaged", "paused", "policy_requested")]
+    if stopped:
+        given = [("engaged", "lost", "pause_requested"), ("lost", "paused", "policy_requested")]
+    fault, begins = ("policy", "lost", "policy_unusable"), ("policy", "policy_acts")
+    for arm in SIDES:
+        found = [change for change in changes(list(summary.events), arm) if change[0] != change[1]]
+        place = found.index(given[0])
+        wanted = [*given, ("paused", *begins), fault, ("lost", *begins)]
+        assert found[place : place + len(wanted)] == wanted
 
 
 def colliding(loop: Pipeline) -> Array:

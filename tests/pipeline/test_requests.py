@@ -27,7 +27,7 @@ def test_a_mark_without_a_recording_is_refused() -> None:
 
 
 def test_a_replay_asks_for_the_same() -> None:
-    asked, again = PendingRequests(home=True, pause=True, mark=Action.RECORD_TOGGLE), PendingRequests()
+    asked, again = PendingRequests(True, True, True, mark=Action.RECORD_TOGGLE), PendingRequests()
     settings = TeleopSettings()
     for reason in asked.reasons(settings):
         for _ in ("left", "right"):  # both arms have the event

@@ -1,24 +1,35 @@
-"""A cell in MuJoCo that lerobot records from and sends actions to, by the door of policies.
+"""A cell that lerobot records from and sends actions to, by the door of policies.
 
 Its features have the names and order of ``q2r2 export lerobot``, so a policy that was trained on such a dataset fits.
 """
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import Any, ClassVar
 
 from lerobot.robots import Robot, RobotConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from q2r2_control.config.cell import load_config
-from q2r2_control.errors import Q2R2Error
+from lerobot_robot_q2r2.hands import HandsDoor
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.resources import find_resource
+from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.export.lerobot import POSITION
 from q2r2_control.inputs.policy import ActionSpace, PolicyInput, action_names
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.base import make_plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plants.mujoco_cameras import CellPictures
+from q2r2_control.recording.about import About
+from q2r2_control.recording.recorder import Recorder
+from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.robot.robot import Robot as CellRobot
+from q2r2_control.summary.tick import Tick
+from q2r2_control.supervision.homing import preflight_faults
 
 _BEGINS = 60.0  # how long the kernels of a new version take to compile at most, and more [s]
 
@@ -27,7 +38,11 @@ _BEGINS = 60.0  # how long the kernels of a new version take to compile at most,
 @dataclass(kw_only=True)
 class Q2R2CellConfig(RobotConfig):
     cell: str = "config/dual_iiwa7.yaml"  # a cell's YAML, here or shipped; its cameras are the robot's
+    plant: str | None = None  # an installed plant, such as fri; by default the cell's
     rate: float = 30.0  # of the actions [Hz]
+    simulated_time: bool = False  # an action takes 1 / rate of simulated time, however long lerobot takes for it
+    full_speed: bool = False  # of real cabinets; otherwise joints go at a tenth of their speed
+    record: str | None = None  # folder for recordings of q2r2
 
 
 class Q2R2Cell(Robot):
@@ -38,23 +53,32 @@ class Q2R2Cell(Robot):
 
     config_class = Q2R2CellConfig
     name = "q2r2_cell"
+    newest: ClassVar[Q2R2Cell | None] = None  # the one that a teleoperator's hands drive
 
     def __init__(self, config: Q2R2CellConfig) -> None:
         super().__init__(config)
         self.config = config
-        self._cell = load_config(config.cell)
-        self.cameras = self._cell.cameras
-        self._robot = CellRobot.from_config(self._cell)
-        self._plant = MujocoPlant(self._robot, self._cell)
-        grippers = tuple(f"{arm}_gripper" for arm in self._robot.arms if arm in self._plant.gripper_openings())
+        self._cell = cell = _allowed(config)
+        self._robot = CellRobot.from_config(cell)
+        self._plant = make_plant(config.plant or cell.plant, self._robot, cell)
+        self.cameras = cell.simulated_cameras if isinstance(self._plant, MujocoPlant) else {}
+        self._grippers = tuple(arm for arm in self._robot.arms if arm in self._plant.gripper_openings())
+        grippers = (f"{arm}_gripper" for arm in self._grippers)
         self._names = (*action_names(self._robot, ActionSpace.JOINTS), *grippers)
-        self._policy = PolicyInput(rate=config.rate)
-        self._pipeline = Pipeline(self._cell, self._robot, self._policy, self._plant)
-        self._pipeline.listeners.append(lambda tick: self._begun.set())
+        self.hands = HandsDoor()
+        self._policy = PolicyInput(rate=config.rate, operator=self.hands)
+        self.pipeline = Pipeline(cell, self._robot, self._policy, self._plant)
+        if faults := preflight_faults(self._robot, cell.control.without_contact(), self.pipeline.controller):
+            raise ConfigError(f"{cell.name}: {'; '.join(faults)}")
+        self.pipeline.listeners.append(self._see)
+        self._tick: Tick | None = None  # the newest one
         self._begun = Event()
         self._thread: Thread | None = None
         self._fault: Q2R2Error | None = None
+        self._steps, self._start = 0, 0.0  # of simulated time
         self._pictures: CellPictures | None = None
+        self._recording = ExitStack()
+        Q2R2Cell.newest = self
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -63,33 +87,54 @@ class Q2R2Cell(Robot):
 
     @property
     def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(self._names, float)
+        return {f"{name}{POSITION}": float for name in self._names}
 
     @property
     def is_connected(self) -> bool:
-        return self._thread is not None and self._thread.is_alive()
+        running = self._thread is not None and self._thread.is_alive()
+        return running or (self.config.simulated_time and self._tick is not None)
 
     def connect(self, calibrate: bool = True) -> None:
         if self.is_connected:
             raise DeviceAlreadyConnectedError
         self._begun.clear()
-        self._fault = None
+        self._fault, self.hands.open = None, False
+        self._record()
+        if self.config.simulated_time:
+            self.pipeline.begin()
+            self._steps, self._start = 0, self.pipeline.tick().now
+            return
         self._thread = Thread(target=self._run, name="q2r2", daemon=True)
         self._thread.start()
         self._begun.wait(_BEGINS)
         self._check()
 
+    def _record(self) -> None:
+        if self.config.record is None:
+            return
+        simulated = self.config.simulated_time
+        recorder = self._recording.enter_context(Recorder(Path(self.config.record), self._cell.name, waits=simulated))
+        recorder.begin(About.of(self.pipeline, not simulated, {"cell": self._cell.name}), self._robot)
+        self.pipeline.listeners.append(recorder)
+        self._recording.callback(self.pipeline.listeners.remove, recorder)
+
     def _run(self) -> None:
         try:
-            self._pipeline.run()
+            self.pipeline.run()
         except Q2R2Error as error:
             self._fault = error
         finally:
+            self._recording.close()
             self._begun.set()
 
-    def _check(self) -> None:
-        if not self.is_connected:
+    def _see(self, tick: Tick) -> None:
+        self._tick = tick
+        self._begun.set()
+
+    def _check(self) -> Tick:
+        if not self.is_connected or self._fault is not None or self._tick is None:
             raise DeviceNotConnectedError(f"{self}: {self._fault or 'not connected'}")
+        return self._tick
 
     @property
     def is_calibrated(self) -> bool:
@@ -100,24 +145,61 @@ class Q2R2Cell(Robot):
     def configure(self) -> None: ...
 
     def get_observation(self) -> dict[str, Any]:
-        self._check()
-        observation = self._policy.observation
-        assert observation is not None
-        values = (*observation.state.q, *observation.openings.values())
-        seen: dict[str, Any] = dict(zip(self._names, map(float, values), strict=True))
+        tick = self._check()
+        seen = self._named((*tick.state.q, *tick.openings.values()))
         if self.cameras:
+            assert isinstance(self._plant, MujocoPlant)
             self._pictures = self._pictures or CellPictures(self._plant.model, self.cameras)
             self._pictures.place(self._plant.observed_qpos)
             seen |= {name: self._pictures.take(name) for name in self.cameras}
         return seen
 
+    def _named(self, values: tuple[float, ...]) -> dict[str, Any]:
+        return dict(zip(self.action_features, map(float, values), strict=True))
+
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+        """An action that is not the hands' own is the policy's, which takes the arms from them."""
         self._check()
-        self._policy.send([float(action[name]) for name in self._names], names=self._names)
+        if not self._asked:
+            if self.hands.open:
+                self.hands.open = False
+                self.pipeline.give_back()
+            given = {name.removesuffix(POSITION): value for name, value in action.items()}
+            self._policy.send([float(given[name]) for name in self._names], names=self._names)
+        self._asked = False
+        if self.config.simulated_time:
+            self._steps += 1
+            try:
+                self.pipeline.tick_until(self._start + self._steps / self.config.rate)
+            except Q2R2Error as error:
+                self._fault = error
         return action
 
+    _asked = False  # whether the next action is the hands'
+
+    def hands_action(self) -> dict[str, Any]:
+        """The reference, which the hands drive until an action comes that is not theirs."""
+        tick = self._check()
+        self._asked = self.hands.open = True
+        return self._named((*tick.reference.q, *(tick.command.grippers[arm] for arm in self._grippers)))
+
     def disconnect(self) -> None:
-        self._check()
-        assert self._thread is not None
-        self._pipeline.stop()
-        self._thread.join()
+        if self._tick is None:
+            raise DeviceNotConnectedError(f"{self}: not connected")
+        if self._thread is not None:
+            self.pipeline.stop()
+            self._thread.join()
+            self._thread = None
+        self.pipeline.end()
+        self._recording.close()
+        self._tick = None
+
+
+def _allowed(config: Q2R2CellConfig) -> Config:
+    """The cell. Raises :class:`ConfigError` for real arms that were not commissioned, as ``q2r2 run`` does."""
+    cell = load_config(config.cell)
+    if (config.plant or cell.plant) != "fri":
+        return cell
+    if why := not_commissioned(cell, find_resource(config.cell)):
+        raise ConfigError(f"{config.cell}: {why}; q2r2 commission {config.cell} commissions it")
+    return slowed(cell) if has_real_cabinets(cell) and not config.full_speed else cell

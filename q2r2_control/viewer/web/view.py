@@ -88,7 +88,10 @@ class PageView(AbstractContextManager["PageView"]):
         """Serve a page; returns its URL. ``on_request`` gets what its buttons ask for, instead of the run."""
         self._on_request = on_request
         robot, plant = pipeline.robot, pipeline.plant
-        self._input = pipeline.input if isinstance(pipeline.input, WebInput) else None
+        source: object = pipeline.input
+        while (operator := getattr(source, "operator", None)) is not None:  # of a policy: its hands
+            source = operator
+        self._input = source if isinstance(source, WebInput) else None
         parts = {}
         if isinstance(plant, MujocoPlant):
             self._plant = plant

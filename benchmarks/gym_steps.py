@@ -1,0 +1,67 @@
+"""Steps per second of our environments, and of robosuite's two-arm environments with the same arms, in one run.
+
+    pip install robosuite "mujoco<3.4"  # in an environment of its own: it wants an older numpy and MuJoCo
+    python benchmarks/gym_steps.py
+
+An environment is stepped by one process, with random actions and without pictures.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from q2r2_control.gym import TASKS
+
+SECONDS, WARM = 20.0, 5  # of each environment, after so many steps
+RATE = 20  # steps in a second of simulated time, robosuite's default
+SHARE = 0.1  # of the largest action
+
+Environment = tuple[str, Any, Callable[[], Any]]  # name, environment, and what draws an action
+
+
+def of_ours() -> Iterator[Environment]:
+    for task in TASKS:
+        env = gymnasium.make(f"q2r2_control.gym:q2r2/{task.capitalize()}-v0", space="action.tool_delta", rate=RATE)
+        yield f"q2r2 {task}", env, env.action_space.sample
+
+
+def of_robosuite() -> Iterator[Environment]:
+    try:
+        import robosuite
+    except ImportError:
+        print("robosuite is not installed: without it")
+        return
+    for name in ("TwoArmLift", "TwoArmHandover"):
+        env = robosuite.make(
+            name,
+            robots=["IIWA", "IIWA"],
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            use_camera_obs=False,
+            control_freq=RATE,
+        )
+        yield f"robosuite {name}", env, partial(np.random.default_rng(1).uniform, *env.action_spec)
+
+
+def main() -> None:
+    for environments in (of_ours(), of_robosuite()):
+        for name, env, action in environments:
+            env.reset()
+            for _ in range(WARM):
+                env.step(SHARE * action())
+            steps, began = 0, time.perf_counter()
+            while (passed := time.perf_counter() - began) < SECONDS:
+                if any(env.step(SHARE * action())[2:-1]):  # done, or terminated and truncated
+                    env.reset()
+                steps += 1
+            print(f"{name}: {steps / passed:.1f} steps/s, {steps / passed / RATE:.2f} times real time", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""The whole chain in simulation: hands grasp a block 50 times, and a policy that is trained on that grasps it as well.
+
+    .venv-lerobot/bin/python examples/learning/grasp.py FOLDER [--episodes 50] [--steps 3000] [--seeds 20]
+
+The block lies elsewhere at each attempt, and the policy is told where: an ACT of lerobot, small and from scratch, on a
+CPU. Its actions go through the door of policies, as those of the policy that it is compared with: the mean episode.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.datasets import LeRobotDataset, add_features
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
+
+from q2r2_control import Pipeline, Robot, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.demo.assembly_tasks import TaskWatch, tasks_named
+from q2r2_control.export.lerobot import SOURCES
+from q2r2_control.inputs.assembly import GRASP
+from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.policy import ActionSpace, PolicyInput
+from q2r2_control.inputs.scripted import ScriptedInput, in_sequence
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.recording.about import About
+from q2r2_control.recording.recorder import Recorder
+from q2r2_control.types import Array, Observation
+
+TASK = tasks_named(["grasp"])[0]
+BLOCK, SPREAD = "flat_block", 0.03  # how far from its place along x and y at most [m]
+FPS, CHUNK = 10, 100  # actions a second, and in the one chunk that is the whole motion
+PLACE = "observation.environment_state"  # lerobot's name; where the block lies, x y [m]
+STATE, ACTION = "observation.state", "action"
+SMALL: dict[str, Any] = {"dim_model": 64, "n_heads": 4, "dim_feedforward": 256, "n_encoder_layers": 2}
+SMALL |= {"use_vae": False, "dropout": 0.0, "chunk_size": CHUNK, "n_action_steps": CHUNK, "device": "cpu"}
+BATCH, RATE = 16, 1e-3  # of the learning
+WANTED = 0.5  # of the attempts succeed
+
+
+class Whole:
+    """A policy that says the whole motion when it is asked first, and later what is left of it."""
+
+    space, rate = ActionSpace.TOOL, float(FPS)
+
+    def __init__(self, motion: Callable[[Observation], Array]) -> None:
+        self._say = motion
+        self._begun: tuple[float, Array] | None = None
+
+    def __call__(self, seen: Observation) -> Array:
+        self._begun = start, motion = self._begun or (seen.time, self._say(seen))
+        return motion[min(round((seen.time - start) * FPS), len(motion) - 1) :]
+
+
+def learned(folder: Path, place: Array) -> Callable[[Observation], Array]:
+    """The motion that the policy in ``folder`` makes where the block lies at ``place``."""
+    policy = ACTPolicy.from_pretrained(folder)
+    before, after = make_pre_post_processors(policy.config, str(folder))
+
+    def motion(seen: Observation) -> Array:
+        state = np.hstack((seen.state.q, list(seen.openings.values())))
+        batch = {
+            name: torch.tensor(values, dtype=torch.float32)[None] for name, values in ((STATE, state), (PLACE, place))
+        }
+        with torch.inference_mode():
+            return np.asarray(after(policy.predict_action_chunk(before(batch))[0]))
+
+    return motion
+
+
+def coarse(cell: Config) -> Config:
+    """The cell with a slow control loop, 100 Hz: a tenth of the work."""
+    control = cell.control.model_copy(update={"max_substep": 0.01})
+    return cell.model_copy(update={"loop_rate_hz": 100.0, "control": control})
+
+
+def place_of(seed: int) -> Array:
+    """Of the block in the attempt with this ``seed``, from where the cell has it [m]."""
+    return np.random.default_rng([seed, 7]).uniform(-SPREAD, SPREAD, 2)
+
+
+def attempt(cell: Config, source: Input, place: Array, recorder: Recorder | None = None, seconds: float = 11.0) -> str:
+    """Grasp the block at ``place``, from the cell's place on; returns what fell short, empty: it succeeded."""
+    block = cell.mujoco.objects[BLOCK]
+    x, y, z = block.position
+    moved = block.model_copy(update={"position": (x + place[0], y + place[1], z)})
+    objects = cell.mujoco.objects | {BLOCK: moved}
+    cell = cell.model_copy(update={"mujoco": cell.mujoco.model_copy(update={"objects": objects})})
+    robot = Robot.from_config(cell)
+    plant = MujocoPlant(robot, cell)
+    pipeline = Pipeline(cell, robot, source, plant)
+    pipeline.listeners.append(watch := TaskWatch([TASK], plant, robot, cell))
+    if recorder is not None:
+        notes = {"task": TASK.about, "place": json.dumps(place.tolist())}
+        recorder.begin(About.of(pipeline, False, notes), robot)
+        pipeline.listeners.append(recorder)
+    pipeline.run(seconds, realtime=False)
+    reason = watch.results()[0].reason
+    if recorder is not None:
+        recorder.success = not reason
+    return reason
+
+
+def record(cell: Config, episodes: int, folder: Path) -> None:
+    """Hands that tremble, and whose samples get lost and late, grasp the block wherever it lies."""
+    failed = 0
+    for seed in range(episodes):
+        place = place_of(seed)
+        trajectory = in_sequence([("grasp", GRASP.moved(*place))])
+        hands = ScriptedInput(trajectory, human=True, seed=seed)
+        with Recorder(folder, f"grasp-{seed:03}", waits=True) as recorder:
+            failed += bool(attempt(cell, hands, place, recorder, trajectory.duration or 0.0))
+    print(f"hands: {episodes - failed} of {episodes}", flush=True)
+
+
+def export(recordings: Path, folder: Path) -> LeRobotDataset:
+    """The dataset of q2r2 export lerobot, with where the block lay in each episode."""
+    plain = folder.with_name("exported")
+    command = [sys.executable, "-m", "q2r2_control", "export", "lerobot", recordings, "--output", plain]
+    subprocess.run([*map(str, command), "--fps", str(FPS), "--trim", "--no-pictures"], check=True)
+    dataset = LeRobotDataset("q2r2/grasp", root=plain)
+    places = [json.loads(source["place"]) for source in json.loads((plain / SOURCES).read_text())]
+    lengths = [episode["length"] for episode in dataset.meta.episodes]
+    told = np.repeat(np.array(places, dtype=np.float32), lengths, axis=0)
+    feature = {"dtype": "float32", "shape": (2,), "names": ["x", "y"]}
+    return add_features(dataset, {PLACE: (told, feature)}, folder, "q2r2/grasp")
+
+
+def train(dataset: LeRobotDataset, steps: int, folder: Path) -> Path:
+    """Train an ACT on tensors in memory, since the loader takes longer than the policy; returns its folder."""
+    actions = actions_of(dataset)
+    columns = {name: torch.from_numpy(column(dataset, name)) for name in (STATE, PLACE)}
+    columns[ACTION] = torch.from_numpy(actions)
+    sizes = {name: tuple(values.shape[1:]) for name, values in columns.items()}
+    seen = {STATE: PolicyFeature(FeatureType.STATE, sizes[STATE]), PLACE: PolicyFeature(FeatureType.ENV, sizes[PLACE])}
+    config = ACTConfig(
+        input_features=seen, output_features={ACTION: PolicyFeature(FeatureType.ACTION, sizes[ACTION])}, **SMALL
+    )
+    policy = ACTPolicy(config)
+    stats = dataset.meta.stats | {ACTION: {"mean": actions.mean(axis=0), "std": actions.std(axis=0)}}
+    before, after = make_pre_post_processors(config, dataset_stats=stats)
+    ends = torch.from_numpy(np.repeat(dataset.meta.episodes["dataset_to_index"], dataset.meta.episodes["length"]))
+    begins = torch.from_numpy(np.flatnonzero(column(dataset, "frame_index") < FPS))  # when the policy is asked
+    optimizer = torch.optim.AdamW(policy.parameters(), RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    for step in range(steps):
+        frames = begins[torch.randint(len(begins), (BATCH,))]
+        ahead = frames[:, None] + torch.arange(CHUNK)
+        over = ahead >= ends[frames, None]
+        batch = {name: columns[name][frames] for name in seen}
+        batch |= {ACTION: columns[ACTION][ahead.clamp(max=ends[frames, None] - 1)], f"{ACTION}_is_pad": over}
+        loss, _ = policy.forward(before(batch))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        if step % (steps // 10) == 0:
+            print(f"step {step}: loss {loss.item():.4f}", flush=True)
+    for part in (policy, before, after):
+        part.save_pretrained(folder)
+    return folder
+
+
+def actions_of(dataset: LeRobotDataset) -> Array:
+    """Targets of the tools, whose errors do not add up along an arm, with the openings of both grippers."""
+    return np.hstack((column(dataset, ActionSpace.TOOL), column(dataset, ACTION)[:, -2:]))
+
+
+def column(dataset: LeRobotDataset, name: str) -> Array:
+    return np.stack(dataset.hf_dataset.with_format("numpy")[name])
+
+
+def mean_episode(dataset: LeRobotDataset) -> Array:
+    """Actions (n, size) of the mean of all episodes, for as long as a policy's chunk is."""
+    actions, frames = actions_of(dataset), column(dataset, "frame_index")
+    return np.array([actions[frames == frame].mean(axis=0) for frame in range(CHUNK)])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    for name, value in (("episodes", 50), ("steps", 3000), ("seeds", 20)):
+        parser.add_argument(f"--{name}", type=int, default=value)
+    given = parser.parse_args()
+    cell = coarse(load_config("config/dual_iiwa7.yaml"))
+    record(cell, given.episodes, given.folder / "recordings")
+    dataset = export(given.folder / "recordings", given.folder / "dataset")
+    policy = train(dataset, given.steps, given.folder / "act")
+    mean = mean_episode(dataset)
+    done = {"ACT": 0, "mean episode": 0}
+    for seed in range(given.seeds):
+        place = place_of(1000 + seed)
+        done["ACT"] += not (why := attempt(cell, PolicyInput(Whole(learned(policy, place))), place))
+        print(f"ACT, seed {seed}: {why or 'succeeded'}", flush=True)
+        done["mean episode"] += not attempt(cell, PolicyInput(Whole(lambda seen: mean)), place)
+    print(", ".join(f"{name}: {count} of {given.seeds}" for name, count in done.items()))
+    sys.exit(done["ACT"] < max(WANTED * given.seeds, done["mean episode"] + 1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,274 @@
+"""The commands of lerobot with a cell as the robot and hands of q2r2 as the teleoperator, in simulated time.
+
+Run by ``make test-lerobot``, in an environment of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("lerobot", reason="make test-lerobot installs it")
+pytest.importorskip("lerobot_teleoperator_q2r2", reason="make test-lerobot installs it, for lerobot 0.6")
+
+from lerobot.datasets import LeRobotDataset
+
+from q2r2_control.export.sampling import features, sample
+from q2r2_control.quaternions import turn_between
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.recorded_ticks import cell_and_robot_of
+from q2r2_control.recording.tick_rows import Rows
+from q2r2_control.types import Array
+from tests.lerobot import hands
+from tests.recording.runs import ROOT
+
+FPS = 25  # a whole number of ticks a frame
+TAKEOVERS = 100
+SPACE, TAB, ESCAPE = b" ", b"\t", b"\x1b"
+PACED = f"--fps={FPS}"
+
+
+def command(program: str, folder: Path, *options: str) -> list[str]:
+    """A command of lerobot whose robot is a cell, recorded in ``folder``."""
+    robot = {"type": "q2r2_cell", "cell": folder / "cell.yaml", "simulated_time": "true", "rate": FPS}
+    robot |= {"record": folder / "recordings"}
+    return [str(Path(sys.executable).with_name(program)), *(f"--robot.{key}={robot[key]}" for key in robot), *options]
+
+
+def dataset_options(folder: Path, name: str) -> list[str]:
+    told = {"repo_id": f"q2r2/{name}", "root": folder / name, "fps": FPS, "single_task": "to wave"}
+    return [*(f"--dataset.{option}={value}" for option, value in told.items()), "--dataset.push_to_hub=false"]
+
+
+HANDS = ("--teleop.type=q2r2_hands", "--teleop.input=scripted", "--teleop.options={trajectory: circle}")
+
+
+def environment(folder: Path) -> dict[str, str]:
+    # No sounds and no window: it is in a terminal that nobody sees.
+    known = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    return known | {"PYTHONPATH": f"{folder}:{ROOT}", "MUJOCO_GL": "egl"}
+
+
+def run(arguments: list[str], folder: Path) -> None:
+    done = subprocess.run(arguments, cwd=folder, env=environment(folder), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+CHANGES = {
+    "loop_rate_hz: 1000.0": "loop_rate_hz: 100.0",  # nothing here needs more
+    "max_substep: 0.002": "max_substep: 0.01",
+}
+
+
+# An ACT wants pictures, which are slow to make without a graphics card.
+CAMERA = "{position: [1.9, 0.0, 1.0], look_at: [0.4, 0.0, 0.3], width: 64, height: 48, rate: 25}"
+SEEN = {"cameras: {}": f"cameras: {{front: {CAMERA}}}"}
+
+
+def write_cell(folder: Path, changes: dict[str, str]) -> Path:
+    text = (ROOT / "config/dual_iiwa7.yaml").read_text()
+    for old, new in changes.items():
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    (folder / "cell.yaml").write_text(text)
+    return folder / "cell.yaml"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a cell."""
+    write_cell(tmp_path, CHANGES)
+    return tmp_path
+
+
+@pytest.fixture
+def seen(tmp_path: Path) -> Path:
+    """A folder with a cell that has a camera, and with hands that take over."""
+    write_cell(tmp_path, CHANGES | SEEN)
+    hands.installed(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of a run in which the hands go round a circle."""
+    folder = tmp_path_factory.mktemp("exported")
+    q2r2, recordings = [sys.executable, "-m", "q2r2_control"], str(folder / "recordings")
+    scripted = ["--input", "scripted", "--trajectory", "circle", "--fast", "--duration", "4", "--headless"]
+    run([*q2r2, "run", str(write_cell(folder, CHANGES | SEEN)), *scripted, "--record", recordings], folder)
+    run([*q2r2, "export", "lerobot", recordings, "--output", str(folder / "dataset"), "--fps", str(FPS)], folder)
+    return folder / "dataset"
+
+
+@pytest.fixture(scope="module")
+def trained(exported: Path) -> Path:
+    """A small policy that was trained on it for 100 steps by lerobot-train."""
+    given = {"dataset.repo_id": "q2r2/circle", "dataset.root": exported, "output_dir": exported.with_name("act")}
+    given |= {"policy.type": "act", "policy.device": "cpu", "policy.push_to_hub": "false", "steps": 100}
+    given |= {"policy.chunk_size": 10, "policy.n_action_steps": 10, "policy.dim_model": 32, "policy.n_heads": 2}
+    given |= {"policy.dim_feedforward": 32, "policy.n_encoder_layers": 1, "policy.use_vae": "false"}
+    given |= {"policy.pretrained_backbone_weights": "null", "dataset.video_backend": "pyav"}
+    given |= {"batch_size": 1, "num_workers": 0, "save_freq": 100, "wandb.enable": "false"}
+    program = str(Path(sys.executable).with_name("lerobot-train"))
+    run([program, *(f"--{name}={value}" for name, value in given.items())], exported.parent)
+    return exported.with_name("act") / "checkpoints/last/pretrained_model"
+
+
+class Terminal:
+    """A program in a terminal of its own, whose lines are read one by one and whose keys are pressed."""
+
+    def __init__(self, arguments: list[str], folder: Path) -> None:
+        self._controller, terminal = pty.openpty()
+        out, told = os.pipe()
+        self._process = subprocess.Popen(
+            arguments, cwd=folder, env=environment(folder), stdin=terminal, stdout=told, stderr=told
+        )
+        os.close(told)
+        os.close(terminal)
+        self._seen: list[str] = []
+        self._lines = self._read(out)
+
+    def _read(self, out: int) -> Iterator[str]:
+        with os.fdopen(out, errors="replace") as stream:
+            for line in stream:
+                self._seen.append(line)
+                yield line
+
+    def wait(self, text: str, times: int = 1) -> None:
+        for _ in range(times):
+            found = any(text in line for line in self._lines)
+            assert found, "".join(self._seen[-60:])
+
+    def press(self, key: bytes) -> None:
+        os.write(self._controller, key)
+
+    def interrupt(self) -> None:
+        self._process.send_signal(signal.SIGINT)
+
+    def finish(self) -> None:
+        for _ in self._lines:
+            pass
+        assert self._process.wait() == 0, "".join(self._seen[-60:])
+        os.close(self._controller)
+
+
+def recording_of(folder: Path) -> Recording:
+    (file,) = (folder / "recordings").glob("*/*.mcap")
+    return Recording(file)
+
+
+def column(dataset: LeRobotDataset, name: str) -> Array:
+    return np.stack([np.atleast_1d(value) for value in dataset.hf_dataset.with_format("numpy")[name]])
+
+
+def rows_of(folder: Path) -> Rows:
+    return np.concatenate([chunk.rows for chunk in recording_of(folder).chunks()])
+
+
+def test_teleoperate_lets_the_scripted_hands_drive_the_arms(folder: Path) -> None:
+    terminal = Terminal(command("lerobot-teleoperate", folder, PACED, *HANDS), folder)
+    terminal.wait("Teleop loop time", 2 * FPS)
+    terminal.interrupt()
+    terminal.finish()
+    rows = rows_of(folder)
+    assert (rows["arms"]["engaged"][-1] == 1.0).all()
+    assert (rows["arms"]["policy"] == 0.0).all()
+    assert np.ptp(rows["q"], axis=0).max() > 0.01
+
+
+def test_a_dataset_that_record_makes_has_the_numbers_that_the_export_of_the_same_run_has(folder: Path) -> None:
+    more = ("--dataset.num_episodes=1", "--dataset.episode_time_s=10", "--play_sounds=false")
+    run(command("lerobot-record", folder, *HANDS, *dataset_options(folder, "waved"), *more), folder)
+    (made,) = folder.glob("waved*")
+    dataset = LeRobotDataset("q2r2/waved", root=made)
+    recording = recording_of(folder)
+    wanted, names = features(sample(recording, FPS), cell_and_robot_of(recording)[1])
+    assert len(dataset) > FPS
+    for name in ("observation.state", "action"):
+        assert dataset.features[name]["names"] == [f"{label}.pos" for label in names[name]]
+        found = column(dataset, name)
+        np.testing.assert_array_equal(found, wanted[name][: len(found)])
+
+
+def test_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) -> None:
+    options = ("--dataset.repo_id=q2r2/circle", f"--dataset.root={exported}", "--dataset.episode=0")
+    run(command("lerobot-replay", folder, *options, "--play_sounds=false"), folder)
+    dataset = LeRobotDataset("q2r2/circle", root=exported)
+    robot = cell_and_robot_of(recording_of(folder))[1]
+    asked, rows = column(dataset, "action"), rows_of(folder)
+    led = rows["reference_q"][:: round(100 / FPS)][: len(asked)]
+    delay = 1  # frames by which a single action is followed later, to the nearest frame
+    for arm in robot.arms:
+        pairs = [
+            (robot.tool_pose(np.float64(one[:14]), arm), robot.tool_pose(other, arm))
+            for one, other in zip(asked, led[delay:], strict=False)
+        ]
+        apart = [np.linalg.norm(one.translation - other.translation) for one, other in pairs]
+        assert np.sqrt(np.mean(np.square(apart))) < 1e-3
+
+
+def test_rollout_lets_a_policy_act_that_was_trained_on_an_export(seen: Path, trained: Path) -> None:
+    options = (
+        "--strategy.type=base",
+        f"--policy.path={trained}",
+        PACED,
+        "--duration=4",
+        "--play_sounds=false",
+    )
+    run(command("lerobot-rollout", seen, *options, "--task=to go round"), seen)
+    assert rows_of(seen)["arms"]["policy"].any(axis=0).all()
+
+
+def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: Path, trained: Path) -> None:
+    dagger = ("--strategy.type=dagger", "--strategy.record_autonomous=true", "--strategy.smooth_handover=false")
+    teleop = (
+        "--teleop.type=q2r2_hands",
+        f"--teleop.input={hands.NAME}",
+        f"--policy.path={trained}",
+        PACED,
+    )
+    options = (*dagger, *teleop, *dataset_options(seen, "rollout_corrected"), "--play_sounds=false")
+    terminal = Terminal(command("lerobot-rollout", seen, *options), seen)
+    terminal.wait("continuous recording started")
+    for _ in range(TAKEOVERS):
+        for key, answer in ((SPACE, "autonomous -> paused"), (TAB, "paused -> correcting"), (b"", hands.READY)):
+            terminal.press(key)
+            terminal.wait(answer)
+        for key, answer in ((TAB, "correcting -> paused"), (SPACE, "paused -> autonomous")):
+            terminal.press(key)
+            terminal.wait(answer)
+    terminal.press(ESCAPE)
+    terminal.finish()
+    rows = rows_of(seen)
+    arms = rows["arms"]
+    for arm in range(2):
+        taken = np.flatnonzero(np.diff(arms["intervention"][:, arm]) > 0.0) + 1
+        assert len(taken) == TAKEOVERS
+        assert (arms["policy"][taken - 1, arm] == 1.0).all()
+        before, after = arms["target"][taken - 1, arm], arms["target"][taken, arm]
+        assert np.abs(after[:, :3] - before[:, :3]).max() <= 1e-6
+        turns = [turn_between(tuple(one[3:]), tuple(other[3:])) for one, other in zip(before, after, strict=True)]
+        assert np.abs(turns).max() <= 1e-6
+    check_tags(LeRobotDataset("q2r2/corrected", root=next(seen.glob("rollout_corrected*"))), rows)
+
+
+def check_tags(dataset: LeRobotDataset, rows: Rows) -> None:
+    """Frames are ticks of the recording, in order; hands drive only in those that are tagged."""
+    tags, states = column(dataset, "intervention").ravel(), column(dataset, "observation.state")
+    by_hand = rows["arms"]["intervention"].max(axis=1) > 0.0
+    measured = np.hstack((rows["q"], rows["arms"]["opening"])).astype(np.float32)
+    assert np.count_nonzero(np.diff(tags.astype(int)) > 0) == TAKEOVERS
+    place = 0
+    for state, tag in zip(states, tags, strict=True):
+        place += int(np.argmax((measured[place:] == state).all(axis=1)))
+        np.testing.assert_array_equal(measured[place], state)
+        assert tag or not by_hand[place]
+    assert by_hand.any()
