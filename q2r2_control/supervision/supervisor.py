@@ -5,8 +5,8 @@
 
 Inactive and stopped command nothing more, so that whatever else holds the arms is not disturbed. Activation starts the
 reference at the measured posture and forgets all targets: nothing moves until a stream of targets begins anew at the
-tool, see :mod:`target_stream`. A fault brakes along the controller's certified stop. Knows no ROS and no clock: times
-are passed in.
+tool, see :mod:`target_stream`. At a fault the arms brake, within all promises of the controller, and hold where they
+come to rest. Knows no ROS and no clock: times are passed in.
 """
 
 from __future__ import annotations
