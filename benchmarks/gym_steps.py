@@ -8,6 +8,7 @@ An environment is stepped by one process, with random actions and without pictur
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -15,8 +16,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import typer
 
+from q2r2_control.cli.output import Json, print_report
 from q2r2_control.gym import TASKS
+from q2r2_control.viewer.tables import figure_table
 
 SECONDS, WARM = 20.0, 5  # of each environment, after so many steps
 RATE = 20  # steps in a second of simulated time, robosuite's default
@@ -35,7 +39,7 @@ def of_robosuite() -> Iterator[Environment]:
     try:
         import robosuite
     except ImportError:
-        print("robosuite is not installed: without it")
+        print("robosuite is not installed: without it", file=sys.stderr)
         return
     for name in ("TwoArmLift", "TwoArmHandover"):
         env = robosuite.make(
@@ -49,7 +53,9 @@ def of_robosuite() -> Iterator[Environment]:
         yield f"robosuite {name}", env, partial(np.random.default_rng(1).uniform, *env.action_spec)
 
 
-def main() -> None:
+def main(json: Json = False) -> None:
+    """Print the steps per second of each environment."""
+    data = {}
     for environments in (of_ours(), of_robosuite()):
         for name, env, action in environments:
             env.reset()
@@ -60,8 +66,10 @@ def main() -> None:
                 if any(env.step(SHARE * action())[2:-1]):  # done, or terminated and truncated
                     env.reset()
                 steps += 1
-            print(f"{name}: {steps / passed:.1f} steps/s, {steps / passed / RATE:.2f} times real time", flush=True)
+            data[name] = steps / passed
+    rows = [(name, rate, rate / RATE) for name, rate in data.items()]
+    print_report(data, (figure_table("environments", ("environment", "steps/s", "times real time"), rows),), json)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)
