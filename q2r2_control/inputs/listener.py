@@ -166,6 +166,14 @@ def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple
     return (f"enter in the app: {app_settings(host, port)}", drivers)
 
 
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach an address."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 def reachable(host: str) -> str:
     """The address by which others reach a server on ``host``."""
     if host not in EVERY_NETWORK:

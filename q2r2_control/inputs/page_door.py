@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http
-import ipaddress
 import secrets
 import socket
 from urllib.parse import parse_qs, urlsplit
@@ -12,15 +11,7 @@ from websockets import Headers
 from websockets.http11 import Request, Response
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.listener import reachable
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach an address."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+from q2r2_control.inputs.listener import is_loopback, reachable
 
 
 def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:

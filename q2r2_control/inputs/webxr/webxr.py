@@ -20,8 +20,7 @@ from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.inputs.connections import SILENCE_ALLOWED
 from q2r2_control.inputs.hand_stream import HandStream
 from q2r2_control.inputs.headset import watch_of
-from q2r2_control.inputs.listener import reachable
-from q2r2_control.inputs.page_door import is_loopback
+from q2r2_control.inputs.listener import is_loopback, reachable
 from q2r2_control.inputs.samples import HandsWatch
 from q2r2_control.inputs.session import HeadsetStatistics
 from q2r2_control.inputs.webxr import usb
