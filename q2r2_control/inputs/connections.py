@@ -14,12 +14,11 @@ from q2r2_control.config.strict import Network
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.listener import (
     MAX_HOSTS_NAMED,
-    Admission,
     Peer,
     RateLimit,
     TcpListener,
-    decide,
     is_allowed,
+    verdicts,
 )
 from q2r2_control.inputs.messages import KEEPALIVE, FrameDecoder, HandPose, WireFrame
 from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
@@ -27,7 +26,6 @@ from q2r2_control.types import HapticFeedback
 
 KEEPALIVE_AFTER = 1.0  # of own silence [s]
 SILENCE_ALLOWED = 2.0  # without a whole frame [s]; the app sends a keepalive after 1 s
-MAX_WAITING = 4  # newcomers of which it is not yet known whether they may drive, one of each host
 TURN = 0.05  # longest wait for the network; timeouts are looked at this often [s]
 _RECEIVE_BYTES = 1 << 12  # some 40 messages: the control loop gets the interpreter between two such portions
 MAX_FRAMES_PER_SECOND = 2000  # the app sends about 450; more would take processor time from the control loop
@@ -146,25 +144,19 @@ class Connections:
         driver = self._driver
         if driver is not None and now - driver.last_frame > SILENCE_ALLOWED:
             self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # half-open: it would keep others out
-        newest = {client.host: client for client in self._waiting}
-        still_waiting = 0
         for client in tuple(self._waiting):
             if not is_allowed(client.host, self._allow):
                 self._refuse(client, f"{client.host} is not in headset.allow", self._unwelcome)
-                continue
+        for client, admitted, reason in verdicts(self._waiting, lambda: self._driver, now):
             driver = self._driver
-            verdict, reason = decide(driver, client, now)
-            if verdict is Admission.ADMIT:
+            if admitted:
                 if driver is not None:
                     self._drop(driver, reason)
                 self._waiting.remove(client)
                 self._driver = client
                 self._handlers.admitted(client)
-            elif verdict is Admission.REFUSE or newest[client.host] is not client or still_waiting == MAX_WAITING:
-                assert driver is not None  # without one, everybody is admitted
-                self._refuse(client, reason or f"{driver.peer} is connected", driver.refused_hosts)
-            else:
-                still_waiting += 1
+            elif driver is not None:
+                self._refuse(client, reason, driver.refused_hosts)
 
     def _refuse(self, client: Client, reason: str, named: set[str]) -> None:
         """Send a newcomer away. The app tries again every second: one line for each host is enough."""

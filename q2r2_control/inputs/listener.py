@@ -6,15 +6,17 @@ import logging
 import math
 import socket
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from ipaddress import ip_address
+from typing import TypeVar
 
 from q2r2_control.config.strict import Network
 
 LINES_PERIOD = 1.0  # between two lines about one host [s]
+MAX_WAITING = 4  # newcomers of which it is not yet known whether they may drive, one of each host
 MAX_HOSTS_NAMED = 8  # with lines of their own within LINES_PERIOD; all others share theirs
 EVERY_NETWORK = ("", "0.0.0.0", "::")  # as hosts to listen on
 ONLY_THIS_MACHINE = ("127.0.0.1", "::1", "localhost")
@@ -210,6 +212,9 @@ class Peer:
     registrations: Sequence[Mapping[str, str]] = ({}, {})  # topics that it publishes, and that it listens to
 
 
+SomePeer = TypeVar("SomePeer", bound=Peer)
+
+
 class Admission(Enum):
     ADMIT = "admit"  # drives from now on, instead of the driver if there is one
     WAIT = "wait"  # may stay, unheard, until more is known
@@ -231,6 +236,27 @@ def decide(driver: Peer | None, newcomer: Peer, now: float) -> tuple[Admission, 
     if now - newcomer.since > WAIT_ALLOWED:
         return Admission.REFUSE, f"{driver.peer} is connected"
     return Admission.WAIT, ""
+
+
+def verdicts(
+    waiting: Sequence[SomePeer], driver: Callable[[], SomePeer | None], now: float
+) -> Iterator[tuple[SomePeer, bool, str]]:
+    """Each newcomer that is admitted (True) or refused at ``now`` [s], and why it, or the driver, gets no place.
+
+    Others go on waiting: the newest of each host, and ``MAX_WAITING`` at most. The ``driver`` may change meanwhile.
+    """
+    newest = {client.host: client for client in waiting}
+    still_waiting = 0
+    for client in tuple(waiting):
+        current = driver()
+        verdict, reason = decide(current, client, now)
+        if verdict is Admission.ADMIT:
+            yield client, True, reason
+        elif verdict is Admission.REFUSE or newest[client.host] is not client or still_waiting == MAX_WAITING:
+            assert current is not None  # without one, everybody is admitted
+            yield client, False, reason or f"{current.peer} is connected"
+        else:
+            still_waiting += 1
 
 
 def is_allowed(host: str, networks: Sequence[Network] | None) -> bool:

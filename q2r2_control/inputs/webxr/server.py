@@ -21,15 +21,14 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from q2r2_control.errors import ConfigError, ProtocolError
-from q2r2_control.inputs.connections import MAX_WAITING, TURN
+from q2r2_control.inputs.connections import TURN
 from q2r2_control.inputs.listener import (
     MAX_HOSTS_NAMED,
-    Admission,
     HostLog,
     Peer,
     RateLimit,
-    decide,
     is_allowed,
+    verdicts,
     written,
 )
 from q2r2_control.inputs.page_door import PageDoor, text_response
@@ -248,28 +247,21 @@ class PageServer:
 
     def _settle(self, now: float) -> None:
         """Decide who drives."""
-        newest = {client.host: client for client in self._waiting}
-        still_waiting = 0
-        for client in tuple(self._waiting):
+        for client, admitted, reason in verdicts(self._waiting, lambda: self._driver, now):
             driver = self._driver
-            verdict, reason = decide(driver, client, now)
-            if verdict is Admission.ADMIT:
+            if admitted:
                 if driver is not None:
                     self._drop(driver, reason)
                 self._waiting.remove(client)
                 self._driver = client
                 self._answer(Admitted(client.peer))
                 self._write(client, logging.INFO, "connected")
-            elif verdict is Admission.REFUSE or newest[client.host] is not client or still_waiting == MAX_WAITING:
-                assert driver is not None  # without one, everybody is admitted
-                reason = reason or f"{driver.peer} is connected"
+            elif driver is not None:
                 self._waiting.remove(client)
                 if client.host not in driver.refused_hosts and len(driver.refused_hosts) < MAX_HOSTS_NAMED:
                     driver.refused_hosts.add(client.host)
                     self._write(client, logging.WARNING, f"refused: {reason}")
                 client.end(REFUSED, reason)
-            else:
-                still_waiting += 1
 
     def _drop(self, client: PageClient, reason: str) -> None:
         client.end(DROPPED, reason)
