@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from array import array
+from collections import deque
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from multiprocessing import get_context
@@ -104,6 +105,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     config = load_config(_CONFIG)
     robot = Robot.from_config(config)
     plant = FriPlant.from_config(robot, config)
+    plant.answers = deque()  # all of them
     with notice_of_compiling():
         pipeline = Pipeline(config, robot, ScriptedInput("circle"), plant, mode)
     pipeline.listeners.append(way := ToolWay(robot))
