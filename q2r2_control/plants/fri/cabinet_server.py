@@ -18,7 +18,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings
-from q2r2_control.plants.fri.wire import JOINTS, LONGEST, CommandKind, Joints, Session, write_monitoring
+from q2r2_control.plants.fri.wire import JOINTS, LONGEST, CommandKind, Joints, Session, joints_of, write_monitoring
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
@@ -40,27 +40,30 @@ class Network:
     jitter: float = 0.0  # each datagram is late by up to this, and may overtake another [s]
 
 
+_PERFECT = Network()
+
+
 class SimulatedArm:
     """One arm of a :class:`SimulatedArms`."""
 
     def __init__(self, cell: SimulatedArms, arm: str) -> None:
         self._cell, self._name, self._joints = cell, arm, cell.robot.arms[arm].joints
-        start = tuple(cell.robot.home[self._joints].tolist())
+        start = joints_of(cell.robot.home[self._joints])
         self._from, self._to, self._began, self._lasts = start, start, 0.0, 1.0
         self.overlay: Joints | None = None
 
     @property
     def q(self) -> Joints:
-        return tuple(self._cell.state.q[self._joints].tolist())
+        return joints_of(self._cell.state.q[self._joints])
 
     @property
     def tau(self) -> Joints:
-        return tuple(self._cell.state.tau[self._joints].tolist())
+        return joints_of(self._cell.state.tau[self._joints])
 
     @property
     def external_tau(self) -> Joints:
         external = self._cell.state.tau_external
-        return (0.0,) * JOINTS if external is None else tuple(external[self._joints].tolist())
+        return (0.0,) * JOINTS if external is None else joints_of(external[self._joints])
 
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
         """Begin to go to ``q``, which takes ``dt`` [s]; the cell's own time goes on by itself."""
@@ -89,17 +92,19 @@ class SimulatedArms:
     def __init__(self, robot: Robot, config: Config) -> None:
         self.robot, self.plant = robot, MujocoPlant(robot, config)
         self.now, self.openings = 0.0, dict.fromkeys(self.plant.gripper_openings(), 1.0)
+        self._simulated, self._step = 0.0, (1.0 - _ROUNDING) * config.mujoco.timestep
         self.state = self.plant.state()
         self.arms = {arm: SimulatedArm(self, arm) for arm in robot.arms}
         self._data = robot.model.createData()
 
     def advance(self, now: float) -> None:
-        """Let the time until ``now`` [s] pass."""
-        passed = min(now - self.now, _LONGEST_CATCH_UP)
+        """Let the time until ``now`` [s] pass. The physics wait until one of its steps is due."""
         self.now = now
-        if passed > 0.0:
+        passed = now - self._simulated
+        if passed >= self._step:
+            self._simulated = now
             self.plant.apply(self._command())
-            self.plant.advance(passed)
+            self.plant.advance(min(passed, _LONGEST_CATCH_UP))
             self.state = self.plant.state()
 
     def work_gripper(self, arm: str, gripper: GripperIoConfig, cabinet: Cabinet) -> None:
@@ -131,11 +136,11 @@ def settings_of(robot: Robot, arm: str, kind: CommandKind, version: int, period:
     joints = robot.arms[arm].joints
     acceleration = (1.0 + CATCH_UP) ** 2 * robot.acceleration_limit + CATCH_UP_RAMP * robot.velocity_limit
     return CabinetSettings(
-        lower=tuple((robot.position_lower[joints] - _SAG).tolist()),
-        upper=tuple((robot.position_upper[joints] + _SAG).tolist()),
-        velocity=tuple(robot.velocity_limit[joints].tolist()),
-        acceleration=tuple(acceleration[joints].tolist()),
-        torque=tuple(robot.torque_limit[joints].tolist()),
+        lower=joints_of(robot.position_lower[joints] - _SAG),
+        upper=joints_of(robot.position_upper[joints] + _SAG),
+        velocity=joints_of(robot.velocity_limit[joints]),
+        acceleration=joints_of(acceleration[joints]),
+        torque=joints_of(robot.torque_limit[joints]),
         version=version,
         period=period,
         command=kind,
@@ -165,16 +170,16 @@ class CabinetServer:
 
     def run(self, until: Callable[[float], bool], tick: Callable[[float], None] = lambda t: None) -> None:
         """Go on until a function of the time since the begin [s] says so; ``tick`` is called for each message."""
-        self._began, now = time.monotonic(), 0.0
+        self._began, now, arms = time.monotonic(), 0.0, {opened: arm for arm, opened in self._sockets.items()}
         for index, (arm, cabinet) in enumerate(self.cabinets.items()):
             self._at(index * 0.37 * cabinet.settings.period, lambda arm=arm: self._send(arm, 0.0, tick))  # type: ignore[misc]
         try:
             while not until(now):
                 rest = max(self._queue[0][0] - (time.monotonic() - self._began), 0.0)
-                select.select(list(self._sockets.values()), (), (), rest)
+                ready, _, _ = select.select(list(arms), (), (), rest)
                 now = time.monotonic() - self._began
-                for arm in self._sockets:
-                    self._hear(arm, now)
+                for opened in ready:
+                    self._hear(arms[opened], now)
                 if self._queue[0][0] <= now:  # one at a time: an answer that has come is heard before the next
                     heapq.heappop(self._queue)[2]()
         finally:
@@ -224,6 +229,8 @@ class CabinetServer:
 
     def _ways(self, duplicate: float) -> Iterable[float]:
         """How late each copy of a datagram is [s]; none: it is lost."""
+        if self._network == _PERFECT:
+            return [0.0]
         copies = 0 if self._random.random() < self._network.loss else 1 + (self._random.random() < duplicate)
         return [float(self._random.uniform(0.0, self._network.jitter)) for _ in range(copies)]
 

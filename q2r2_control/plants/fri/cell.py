@@ -18,7 +18,7 @@ from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.plants.fri.session import DELAY
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
-from q2r2_control.plants.fri.wire import JOINTS, CommandKind
+from q2r2_control.plants.fri.wire import JOINTS, CommandKind, joints_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Command, CommandMode, RobotState
 
@@ -79,13 +79,16 @@ class FriCell:
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            stop = np.ones(JOINTS) if deceleration is None else deceleration[joints]  # one at rest needs none
-            its = sent[arm] = ArmCommand(self._now, self._start, self._end, command.q[joints], command.v[joints], stop)
+            stop = (
+                (1.0,) * JOINTS if deceleration is None else joints_of(deceleration[joints])
+            )  # one at rest needs none
+            q, v = joints_of(command.q[joints]), joints_of(command.v[joints])
+            its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)
             gripper, opening = self._grippers.get(arm), command.grippers.get(arm)
             if gripper is not None and opening is not None:
                 its.outputs = {gripper.output: opening >= 0.5 if gripper.digital else float(opening)}
             if is_torque:
-                its.tau, its.damping = overlay[joints], damping[joints]
+                its.tau, its.damping = joints_of(overlay[joints]), joints_of(damping[joints])
         return sent
 
     def fault(self) -> Reason | None:

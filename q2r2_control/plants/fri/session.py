@@ -17,6 +17,7 @@ from q2r2_control.plants.fri.wire import (
     IoValue,
     Monitoring,
     Session,
+    joints_of,
     read_monitoring,
     write_command,
 )
@@ -78,18 +79,19 @@ class ArmSession:
             state.following = state.fault(command.now) is None
             self.path = ReferencePath(command.start, self.path.rest)
         if state.following and command.end > self.path.end:  # a second command in a tick is no motion
-            self.path.extend(command.end, command.q, command.v, command.deceleration, command.start)
-            state.rest = self.path.rest
+            there, speed, deceleration = map(np.array, (command.q, command.v, command.deceleration))
+            self.path.extend(command.end, there, speed, deceleration, command.start)
+            state.rest = joints_of(self.path.rest)
         self._outputs |= command.outputs
         if command.tau is not None and command.damping is not None:
-            self._tau, self._tau_came, self._damping = command.tau, command.now, command.damping
+            self._tau, self._damping, self._tau_came = np.array(command.tau), np.array(command.damping), command.now
 
     def _begins(self, command: ArmCommand) -> bool:
         """Whether the reference was at rest a tick ago, where the arm is."""
         state, step = self.state, command.end - command.start
         torques = state.wanted is CommandKind.TORQUE and state.newest
-        there, allowed = (np.array(torques.q), _NEAR) if torques else (self.path.rest, _SAME)
-        way, speed = np.abs(command.q - there), np.abs(command.v)
+        there, allowed = (torques.q, _NEAR) if torques else (self.path.rest, _SAME)
+        way, speed = np.abs(np.subtract(command.q, there)), np.abs(command.v)
         return bool((speed <= _FROM_REST * step).all() and (way <= speed * step + allowed).all())
 
     def answer(self, datagram: bytes, now: float) -> bytes | None:
@@ -146,10 +148,11 @@ class ArmSession:
             self._clock.update(now, passed * message.period)
         if passed > 0 and before is not None:
             state.lost += passed - 1
-            speed = np.subtract(message.q, before.q) / (passed * message.period)
-            state.velocity = 0.5 * (state.velocity + speed)
+            share = 0.5 / (passed * message.period)
+            moved = zip(state.velocity, message.q, before.q, strict=True)
+            state.velocity = tuple(0.5 * v + share * (now_at - was_at) for v, now_at, was_at in moved)
         elif passed == 0 and before is not None and message.counter != before.counter:
-            state.velocity = np.zeros(JOINTS)
+            state.velocity = (0.0,) * JOINTS
         state.newest, state.arrival = message, now
         return True
 
@@ -176,7 +179,7 @@ class ArmSession:
             self._cease()
             self._begun = True
             self.path = ReferencePath(now, np.array(message.ipo_q or message.q))
-            self.state.rest = self.path.rest
+            self.state.rest = joints_of(self.path.rest)
             self._times.restart()
         if self.state.wanted is CommandKind.TORQUE:
             return self._torque(message, now)
@@ -187,15 +190,19 @@ class ArmSession:
         there = self.path.at(time)
         if abs(state.lag) > message.period and np.abs(there - self.path.rest).max() <= _AT_REST:
             self._times.restart()  # where nothing moves, the next answer may be for any time
-        return Command(counter, reflected, tuple(there.tolist()), io=self._outputs)
+        return Command(counter, reflected, joints_of(there), io=self._outputs)
 
     def _torque(self, message: Monitoring, now: float) -> Command | None:
         """The newest overlay, or one that brakes, with the cabinet's own position as KUKA's example clients have it."""
         age = now - self._tau_came
         if self.state.is_too_slow or (message.session is Session.COMMANDING_ACTIVE and age > _TORQUE_GONE):
             return None
-        wanted = self._tau if self.state.following and age <= _TORQUE_LASTS else -self._damping * self.state.velocity
-        tau = tuple(np.clip(wanted, -self._torque_limit, self._torque_limit).tolist())
+        wanted = (
+            self._tau
+            if self.state.following and age <= _TORQUE_LASTS
+            else -self._damping * np.array(self.state.velocity)
+        )
+        tau = joints_of(np.clip(wanted, -self._torque_limit, self._torque_limit))
         return Command(self._answers, message.counter, message.ipo_q or message.q, tau, self._outputs)
 
 

@@ -5,12 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.plants.fri.answers import CATCH_UP
-from q2r2_control.plants.fri.wire import JOINTS, CommandKind, IoValue, Monitoring, Session, in_words
-from q2r2_control.types import Array
+from q2r2_control.plants.fri.wire import JOINTS, CommandKind, IoValue, Joints, Monitoring, Session, in_words
 
 TORQUE_PERIOD = 0.005  # between two answers at most: with 0.01 the arm swings up at the default stiffness [s]
 _SILENT = 0.1  # a cabinet without a message for longer is gone [s]
@@ -20,15 +17,18 @@ _EARLY = 5e-4  # a message may come so much before it is expected [s]
 
 @dataclass
 class SessionState:
-    """One arm's session, as the process that answers its cabinet knows it. Times are of the monotonic clock [s]."""
+    """One arm's session, as the process that answers its cabinet knows it. Times are of the monotonic clock [s].
+
+    Joints are tuples here and in :class:`ArmCommand`: both pass between processes, and arrays are slow to pickle.
+    """
 
     arm: str
     source: str  # the cabinet in words
     wanted: CommandKind = CommandKind.POSITION  # or TORQUE: an overlay of torques
     newest: Monitoring | None = None
     arrival: float = -math.inf  # of the newest message
-    velocity: Array = field(default_factory=lambda: np.zeros(JOINTS))  # measured [rad/s]
-    rest: Array = field(default_factory=lambda: np.zeros(JOINTS))  # where the arm's path ends [rad]
+    velocity: Joints = (0.0,) * JOINTS  # measured [rad/s]
+    rest: Joints = (0.0,) * JOINTS  # where the arm's path ends [rad]
     following: bool = False
     ended: int = 0  # how often the arm ceased to follow, since the cabinet ended its session
     answered: float = -math.inf  # the latest time that an answer was for
@@ -98,9 +98,9 @@ class ArmCommand:
     now: float  # of the tick [s]
     start: float  # when the reference leaves the stop of before [s]
     end: float  # [s]
-    q: Array  # (n,) [rad]
-    v: Array  # (n,) [rad/s]
-    deceleration: Array  # (n,) of the stop [rad/s^2]
+    q: Joints  # [rad]
+    v: Joints  # [rad/s]
+    deceleration: Joints  # of the stop [rad/s^2]
     outputs: dict[str, IoValue] = field(default_factory=dict)  # of the cabinet, by name; those that are set
-    tau: Array | None = None  # (n,) overlay [Nm]; None: positions
-    damping: Array | None = None  # (n,) that brakes where no overlay comes [Nm s/rad]
+    tau: Joints | None = None  # overlay [Nm]; None: positions
+    damping: Joints | None = None  # that brakes where no overlay comes [Nm s/rad]

@@ -8,7 +8,6 @@ import socket
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from q2r2_control.errors import PlantError
@@ -19,6 +18,7 @@ from q2r2_control.plants.fri.wire import Command, Monitoring, Quality, Session, 
 from tests.support.headset_server import eventually
 
 Q = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
+STILL, ONES = (0.0,) * 7, (1.0,) * 7
 MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.005, 1, Q)
 
 
@@ -70,8 +70,7 @@ def test_the_loop_gets_the_state_after_each_message_and_an_answer_goes_by_what_w
     between.ask()
     eventually(between.hear)
     assert between.states[-1].took is not None
-    still, q = np.zeros(7), np.array(Q)
-    command = ArmCommand(0.0, 0.0, 0.001, q, still, 1.0 + still, {"Gripper.Opening": 0.5})
+    command = ArmCommand(0.0, 0.0, 0.001, Q, STILL, ONES, {"Gripper.Opening": 0.5})
     assert between.process.send({"left": command})
     assert between.ask().io == {"Gripper.Opening": 0.5}
 
@@ -108,6 +107,5 @@ def test_a_loop_whose_process_was_killed_is_told(between: Between) -> None:
 
 
 def test_a_process_that_fails_says_why(between: Between) -> None:
-    still = np.zeros(7)
     with pytest.raises(PlantError, match="the cabinets are answered no more: 'middle'"):
-        between.process.send({"middle": ArmCommand(0.0, 0.0, 0.001, still, still, 1.0 + still)})
+        between.process.send({"middle": ArmCommand(0.0, 0.0, 0.001, STILL, STILL, ONES)})

@@ -86,13 +86,9 @@ def begin_torques(cabinet: Cabinet) -> Monitoring:
     active = replace(ACTIVE, command=CommandKind.TORQUE)
     cabinet.ask(replace(WAITING, command=CommandKind.TORQUE))
     cabinet.ask(active)
-    overlay, still = np.ones(7), np.zeros(7)
-    cabinet.session.follow(
-        ArmCommand(
-            cabinet.now, cabinet.now, cabinet.now + 0.002, np.array(Q), still, overlay, {}, overlay, 20.0 * overlay
-        )
-    )
-    cabinet.session.state.velocity = np.full(7, 0.2)
+    now, overlay, still, damping = cabinet.now, (1.0,) * 7, (0.0,) * 7, (20.0,) * 7
+    cabinet.session.follow(ArmCommand(now, now, now + 0.002, Q, still, overlay, {}, overlay, damping))
+    cabinet.session.state.velocity = (0.2,) * 7
     return active
 
 
@@ -145,18 +141,19 @@ def test_a_drop_is_told_and_the_arm_follows_no_more() -> None:
 
 
 def test_commands_for_a_time_that_was_answered_are_refused_for_both_arms_which_stop_as_was_certified() -> None:
-    cabinet, ones = Cabinet(), np.ones(7)
+    cabinet, still, ones = Cabinet(), (0.0,) * 7, (1.0,) * 7
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
     for _ in range(10):  # a reference that leaves IPO at 1 rad/s^2, for 50 ms
         end = cabinet.now + 0.003
         passed = end - 0.013
         way, speed = 0.5 * passed**2, passed
-        cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, IPO + way * ones, speed * ones, ones))
+        there = tuple(q + way for q in IPO)
+        cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, there, (speed,) * 7, ones))
         cabinet.ask(ACTIVE)
     state = cabinet.session.state
     assert state.following
-    late = ArmCommand(cabinet.now, state.answered - 1e-3, cabinet.now, np.array(IPO), 0.0 * ones, ones)
+    late = ArmCommand(cabinet.now, state.answered - 1e-3, cabinet.now, IPO, still, ones)
     other = ArmSession("right", "cabinet")
     other.state.following = True
     assert not follow({"right": other, "left": cabinet.session}, {"right": late, "left": late})
@@ -167,7 +164,7 @@ def test_commands_for_a_time_that_was_answered_are_refused_for_both_arms_which_s
     np.testing.assert_allclose(stop[-1], state.rest, atol=1e-9)
     # From there a reference is followed again.
     now = cabinet.now
-    assert follow({"left": cabinet.session}, {"left": ArmCommand(now, now, now + 0.002, state.rest, 0.0 * ones, ones)})
+    assert follow({"left": cabinet.session}, {"left": ArmCommand(now, now, now + 0.002, state.rest, still, ones)})
     assert cabinet.session.path.end == now + 0.002
 
 
