@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import subprocess
 import sys
@@ -21,25 +22,32 @@ from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
-from q2r2_control.plants.fri.wire import CommandKind, Operation, Session, in_words
+from q2r2_control.plants.fri.wire import CommandKind, Operation, Safety, Session, in_words
 from q2r2_control.process.scheduling import StopRequest, few_garbage_collections, real_time, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
+_SAFETY_STOP = 1.0  # how long one lasts [s]
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
-class _Pendant:
-    """The operator at the cabinets: starts their overlays, stops one now and then, and reads what they say."""
+class Pendant:
+    """The operator at the cabinets: starts their overlays, stops the first one now and then, reads what they say."""
 
     def __init__(
-        self, cabinets: dict[str, Cabinet], start_after: float, drop_every: float | None, console: Console
+        self,
+        cabinets: dict[str, Cabinet],
+        start_after: float,
+        drop_every: float | None,
+        safety_stop_every: float | None,
+        console: Console,
     ) -> None:
-        self._cabinets, self._start_after, self._drop_every, self._console = cabinets, start_after, drop_every, console
+        self._cabinets, self._start_after, self._console = cabinets, start_after, console
+        self._drop_every, self._safety_stop_every = drop_every or math.inf, safety_stop_every or math.inf
         self._said: dict[str, str] = {}
         self._ready_since: dict[str, float | None] = dict.fromkeys(cabinets)
-        self._dropped_at = 0.0
+        self._active_since, self._stopped_at = math.inf, 0.0
 
     def look(self, now: float) -> None:
         for arm, cabinet in self._cabinets.items():
@@ -57,10 +65,15 @@ class _Pendant:
                 self._said[arm] = line
                 say(f"{now:8.3f} s  {arm}: {line}", self._console)
         active = all(cabinet.session is Session.COMMANDING_ACTIVE for cabinet in self._cabinets.values())
-        if not active:
-            self._dropped_at = now
-        elif self._drop_every is not None and now - self._dropped_at >= self._drop_every:
-            next(iter(self._cabinets.values())).stop()
+        first = next(iter(self._cabinets.values()))
+        self._active_since = min(self._active_since, now) if active else math.inf
+        if now - self._stopped_at >= _SAFETY_STOP:
+            first.safety_stop(Safety.NORMAL)
+        if now - self._active_since >= self._safety_stop_every:
+            first.safety_stop(Safety.STOP_1_ON_PATH)
+            self._stopped_at = now
+        elif now - self._active_since >= self._drop_every:
+            first.stop()
 
 
 def fri_cabinet(
@@ -71,6 +84,9 @@ def fri_cabinet(
     fri: Annotated[int, Option(min=1, max=2, help="Version of FRI.")] = 2,
     start_after: Annotated[float, Option(min=0, help="An overlay is started after so long with a client [s].")] = 0.5,
     drop_every: Annotated[float | None, Option(help="The pendant ends a session as often as this [s].")] = None,
+    safety_stop_every: Annotated[
+        float | None, Option(help="A safety stop, for a second, ends a session as often as this [s].")
+    ] = None,
     t1: Annotated[
         bool, Option("--t1", help="Operation mode T1: a tool is not commanded faster than 250 mm/s.")
     ] = False,
@@ -79,6 +95,7 @@ def fri_cabinet(
     ] = False,
     loss: Annotated[float, Option(min=0, max=0.5, help="Share of datagrams that are lost, each way.")] = 0.0,
     duplicate: Annotated[float, Option(min=0, max=0.5, help="Share of messages that come twice.")] = 0.0,
+    cut: Annotated[float, Option(min=0, max=0.5, help="Share of datagrams that lose their end, each way.")] = 0.0,
     jitter: Annotated[
         float, Option(min=0, max=20, help="Datagrams are late by up to this, and overtake others [ms].")
     ] = 0.0,
@@ -106,12 +123,12 @@ def fri_cabinet(
         cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every)
         clients[str(arm)] = "127.0.0.1", its.port
     grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if isinstance(its.gripper, GripperIoConfig)}
-    network = Network(loss, duplicate, 1e-3 * jitter)
+    network = Network(loss, duplicate, 1e-3 * jitter, cut)
     server = CabinetServer(arms, cabinets, clients, grippers, network, seed)
     for cabinet in server.cabinets.values():
         cabinet.load_fits = not wrong_load
         cabinet.operation = Operation.T1 if t1 else Operation.AUTOMATIC
-    pendant = _Pendant(server.cabinets, start_after, drop_every, console)
+    pendant = Pendant(server.cabinets, start_after, drop_every, safety_stop_every, console)
     watch = TaskWatch(tasks_named(task), arms.plant, robot, cell) if task else None
     longest = positive("--duration", duration)
     last = 0.0

@@ -6,7 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from q2r2_control.cli.fri import Pendant
+from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm, Trip
+from q2r2_control.plants.fri.wire import Safety, Session
 from tests.cli.command import q2r2
 
 CELL = "config/dual_iiwa7_fri.yaml"
@@ -18,6 +22,21 @@ def test_without_a_client_the_cabinets_wait() -> None:
     waiting = {"state": "monitoring wait", "missed": 0, "trips": []}
     assert json.loads(done.stdout)["cabinets"] == {"left": waiting, "right": waiting}
     assert "left: monitoring wait" in done.stderr
+
+
+def test_a_safety_stop_ends_a_session_and_lasts_a_second() -> None:
+    ones = (1.0,) * 7
+    settings = CabinetSettings(ones, ones, ones, ones, ones)
+    cabinets = {arm: Cabinet(settings, StillArm((0.0,) * 7)) for arm in ("left", "right")}
+    pendant = Pendant(cabinets, 0.5, None, 3.0, Console(quiet=True))
+    for cabinet in cabinets.values():
+        cabinet.session = Session.COMMANDING_ACTIVE
+    seen = []
+    for now in (1.0, 3.9, 4.0, 4.9, 5.1):
+        pendant.look(now)
+        seen.append(cabinets["left"].safety)
+    assert seen == [Safety.NORMAL] * 2 + [Safety.STOP_1_ON_PATH] * 2 + [Safety.NORMAL]
+    assert (cabinets["left"].trips, cabinets["right"].trips) == ([Trip.SAFETY], [])
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ class Network:
     loss: float = 0.0  # share of the datagrams, each way
     duplicate: float = 0.0  # share of the messages that come twice
     jitter: float = 0.0  # each datagram is late by up to this, and may overtake another [s]
+    cut: float = 0.0  # share of the datagrams that arrive without their end, each way
 
 
 _PERFECT = Network()
@@ -208,7 +209,7 @@ class CabinetServer:
         self.cell.advance(due)
         if (gripper := self._grippers.get(arm)) is not None:
             self.cell.work_gripper(arm, gripper, cabinet)
-        datagram = write_monitoring(cabinet.send(due))
+        datagram = self._cut(write_monitoring(cabinet.send(due)))
         for late in self._ways(self._network.duplicate):
             self._after(late, due, lambda: _sent(opened, datagram, client))
         self._sent_at[arm] = now = time.monotonic() - self._began
@@ -225,7 +226,11 @@ class CabinetServer:
                 return
             if source[:2] == self._clients[arm]:
                 for late in self._ways(0.0):
-                    self._after(late, now, partial(self.cabinets[arm].receive, datagram))
+                    self._after(late, now, partial(self.cabinets[arm].receive, self._cut(datagram)))
+
+    def _cut(self, datagram: bytes) -> bytes:
+        is_cut = self._random.random() < self._network.cut
+        return datagram[: self._random.integers(len(datagram))] if is_cut else datagram
 
     def _ways(self, duplicate: float) -> Iterable[float]:
         """How late each copy of a datagram is [s]; none: it is lost."""

@@ -28,7 +28,7 @@ _ALLOWANCE = {CommandMode.POSITION: 0.05, CommandMode.TORQUE: 0.4}
 _REST = {CommandMode.POSITION: 1e-3, CommandMode.TORQUE: 0.02}  # [rad/s]
 _ENDS = ("pendant", "safety stop", "loop freezes", "computer freezes", "garbage")
 _ASKED = {Trip.STOPPED, Trip.SAFETY}
-_MUTATED = 100  # datagrams with wrong bytes before a session ends so
+_MUTATED = 250  # datagrams with wrong bytes before a session ends so
 
 
 class PressingHands(ScriptedInput):

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.cell import Config
+from q2r2_control.plants.fri.cabinet import Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
 from q2r2_control.plants.fri.session import ArmSession
+from q2r2_control.plants.fri.session_state import SessionState
 from q2r2_control.plants.fri.wire import LONGEST, CommandKind, Session
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES
 from tests.plants.fri.conftest import PATIENCE
 
 PERIOD = 0.005
+PERFECT = Network()
 
 
 @pytest.mark.parametrize("overlay", [None, (0.0,) * 7], ids=["position", "torque"])
@@ -52,16 +55,20 @@ def test_an_arm_moves_on_at_the_end_of_its_way_where_the_next_command_comes(conf
 class Answered:
     """A cabinet, started, and its client in the same thread, so that a busy computer changes nothing."""
 
-    def __init__(self, config: Config, robot: Robot) -> None:
+    def __init__(self, config: Config, robot: Robot, network: Network = PERFECT) -> None:
         settings = {"left": settings_of(robot, "left", CommandKind.POSITION, 2, PERIOD)}
         self._session, self.answers = ArmSession("left", "cabinet"), 0
         self._client = socket.socket(type=socket.SOCK_DGRAM)
         self._client.bind(("127.0.0.1", 0))
         self._client.setblocking(False)
         address = self._client.getsockname()
-        self.server = CabinetServer(SimulatedArms(robot, config), settings, {"left": address}, {}, Network())
+        self.server = CabinetServer(SimulatedArms(robot, config), settings, {"left": address}, {}, network)
         (self.cabinet,) = self.server.cabinets.values()
         self.cabinet.start_overlay()
+
+    @property
+    def state(self) -> SessionState:
+        return self._session.state
 
     def answer(self, now: float) -> bool:
         """Whether a message had come, and was answered."""
@@ -105,3 +112,11 @@ def test_an_answer_that_came_while_the_cabinet_stood_still_is_heard(config: Conf
 
     one.run(until)
     assert (one.cabinet.session, one.cabinet.missed) == (Session.COMMANDING_ACTIVE, 0)
+
+
+def test_a_message_that_was_cut_is_not_answered_and_an_answer_that_was_cut_ends_the_session(
+    config: Config, robot: Robot
+) -> None:
+    one = Answered(config, robot, Network(cut=0.02))
+    one.run(lambda now: one.answer(now) and bool(one.cabinet.trips) and one.state.unreadable > 0)
+    assert set(one.cabinet.trips) == {Trip.MALFORMED}
