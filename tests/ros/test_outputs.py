@@ -263,21 +263,6 @@ def test_an_endpoint_keeps_the_name_of_its_node_where_the_graph_has_lost_it() ->
     assert [node_of(one) for one in (known, lost, other)] == ["/talker", "/talker", None]
 
 
-# How long Fast DDS takes to find it again is its own business, and once was more than 30 s.
-@pytest.mark.slow
-@pytest.mark.soak
-def test_a_node_that_the_graph_had_lost_is_known_when_it_comes_back(node: Any, listener: RosProcess) -> None:
-    def nodes() -> list[str | None]:
-        return [node_of(info) for info in node.get_subscriptions_info_by_topic("/watched")]
-
-    node.create_publisher(PoseStamped, "/watched", 1)
-    wait_until(lambda: nodes() == ["/listener"], "the listener and its name are found")
-    os.kill(listener.pid, signal.SIGSTOP)
-    wait_until(lambda: nodes() == [], "the graph has lost it")
-    os.kill(listener.pid, signal.SIGCONT)
-    wait_until(lambda: nodes() == ["/listener"], "it is found again")
-
-
 def test_the_example_of_an_external_controller_answers_a_target(processes: Processes, node: Any, robot: Robot) -> None:
     example = processes.start(sys.executable, "examples/external_controller.py")
     targets = node.create_publisher(PoseStamped, "/cartesian_controller/safe_target/left", qos_profile_sensor_data)
