@@ -35,7 +35,7 @@ from tests.ros.virtual_lbrs import Operator, lbr_cell, virtual_lbrs
 def test_sessions_that_end_in_every_way_there_is_trip_no_guard_and_jump_nowhere(
     release: str, sessions: int, domain: int
 ) -> None:
-    with virtual_lbrs(release, seed=sessions, domain=domain) as virtual:
+    with virtual_lbrs(release, domain, sessions) as virtual:
         soak = LbrSoak(virtual, sessions).run()
     assert soak.faults == []
     assert soak.activations > 0.4 * sessions
@@ -43,7 +43,7 @@ def test_sessions_that_end_in_every_way_there_is_trip_no_guard_and_jump_nowhere(
 
 
 def test_a_session_that_begins_while_the_arms_still_brake_gets_no_command_of_the_stop(domain: int) -> None:
-    with virtual_lbrs("for Jazzy", domain=domain) as virtual:
+    with virtual_lbrs("for Jazzy", domain) as virtual:
         Operator(virtual)
         left, supervisor = virtual.drivers["left"], virtual.node._supervisor
         for driver in virtual.drivers.values():
