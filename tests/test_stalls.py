@@ -14,32 +14,15 @@ from q2r2_control.errors import PlantError
 from q2r2_control.pipeline import loop_clock
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
-from q2r2_control.plants.kinematic import KinematicPlant
-from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import Array, Command, RobotState
+from q2r2_control.types import Array, RobotState
+from tests.pipeline.loops import RecordingPlant
 from tests.support.hands_input import HandsInput
 from tests.support.processes import Watch, cell, speed
 
 pytestmark = pytest.mark.slow
 
 RATE = 250.0  # [Hz]
-
-
-class RecordingPlant(KinematicPlant):
-    """Keeps every command, and measures what ``disturb`` makes of the truth."""
-
-    def __init__(self) -> None:
-        super().__init__(Robot.from_config(cell()), cell())
-        self.commanded: list[Command] = []
-        self.disturb: Callable[[RobotState], RobotState] = lambda state: state
-
-    def apply(self, command: Command) -> None:
-        super().apply(command)
-        self.commanded.append(command)
-
-    def state(self) -> RobotState:
-        return self.disturb(super().state())
 
 
 def swing(t: float) -> Array:
@@ -59,7 +42,7 @@ def swinging(plant: Plant | str, mode: str = "position", path: Callable[[float],
 
 def largest_step(plant: RecordingPlant, limit: Array) -> float:
     """Of any joint between two commands, as a share of what its limit allows in one period."""
-    ways = np.abs(np.diff(np.array([command.q for command in plant.commanded]), axis=0))
+    ways = np.abs(np.diff(np.array([command.q for command in plant.commands]), axis=0))
     return float((ways / (limit / RATE)).max())
 
 
@@ -161,8 +144,8 @@ def test_a_plant_that_gives_no_more_states_gets_a_last_command_that_holds_the_ar
     loop.listeners.append(lose)
     with pytest.raises(RuntimeError, match="the connection is lost"):
         loop.run(30.0, realtime=False)
-    assert np.abs(plant.commanded[-2].v).max() > 0.5
-    assert not plant.commanded[-1].v.any()
+    assert np.abs(plant.commands[-2].v).max() > 0.5
+    assert not plant.commands[-1].v.any()
 
 
 def blocked(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -38,28 +38,19 @@ def write_pairs(
 
     Raises :class:`ConfigError` for a file that exists, and a clearance that is not above all distances in ``control``.
     """
-    _check_clearance(config, clearance)
+    key, least = config.control.largest_distance
+    if not least < clearance <= 1.0:
+        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.{key}, {least:g}, up to 1")
     if file.exists():
         raise ConfigError(f"{file}: exists; give the name of a new file")
     robot = Robot.from_config(config)
     found = nearest_approaches(robot, samples, 0, clearance, progress)
-    _write({file: srdf_of(robot, found, clearance, samples)})
+    try:
+        file.write_text(srdf_of(robot, found, clearance, samples), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error}") from error
     never = tuple(pair for pair in found if pair.nearest > clearance)
     return PairsWritten(str(file), samples, clearance, never, tuple(pair for pair in found if pair not in never))
-
-
-def _check_clearance(config: Config, clearance: float) -> None:
-    key, least = config.control.largest_distance
-    if not least < clearance <= 1.0:
-        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.{key}, {least:g}, up to 1")
-
-
-def _write(files: Mapping[Path, str]) -> None:
-    for file, text in files.items():
-        try:
-            file.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"{file}: cannot be written: {error}") from error
 
 
 def check(

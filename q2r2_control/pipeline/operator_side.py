@@ -1,12 +1,12 @@
-"""The operator's side of one run: input, teleop layer, way home, a program's requests, vibrations and log."""
+"""The operator's side of one run: input, teleop layer, way home, what a program asks for, vibrations and log."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import cycle
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,6 +17,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.inputs.base import Input, PolicySource
 from q2r2_control.loop.control_loop import ArmConditions
+from q2r2_control.pipeline.requests import change_of, changed
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.gripper_limiter import Grip
 from q2r2_control.supervision.supervisor import Phase, Supervisor
@@ -30,85 +31,6 @@ _PERIOD = 0.02  # of looking at more of an arm than its events [s]
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
-class PendingRequests:
-    """Requests of a program, set from any thread; each is done at the next tick, and recorded for a replay."""
-
-    home: bool = False
-    pause: bool = False
-    give_back: bool = False
-    mark: Action | None = None  # of the recording
-    settings: TeleopSettings | None = None
-    control: Mapping[str, float] | None = None  # of the controller, by name
-    of_recording: list[Reason] = field(default_factory=list)  # verdicts on episodes, and why it ended
-
-    def __bool__(self) -> bool:
-        asked = self.home or self.pause or self.give_back or self.settings is not None or self.control is not None
-        return asked or self.mark is not None or bool(self.of_recording)
-
-    def clear(self) -> None:
-        """Ask for nothing any more."""
-        self.home, self.pause, self.give_back = False, False, False
-        self.mark, self.settings, self.control = None, None, None
-        self.of_recording.clear()
-
-    def reasons(self, current: TeleopSettings) -> Iterator[Reason]:
-        """One for each request; settings by what is not as it is in the ``current`` ones."""
-        if self.home:
-            yield Reason(ReasonKind.HOME_REQUESTED)
-        if self.pause:
-            yield Reason(ReasonKind.PAUSE_REQUESTED)
-        if self.give_back:
-            yield Reason(ReasonKind.POLICY_REQUESTED)
-        if self.mark is not None:
-            yield Reason.of(ReasonKind.RECORDING_REQUESTED, action=str(self.mark))
-        if self.settings is not None:
-            changed = _difference(current.model_dump(mode="json"), self.settings.model_dump(mode="json"))
-            yield Reason.of(ReasonKind.SETTINGS_REQUESTED, changes=changed)
-        if self.control is not None:
-            yield Reason.of(ReasonKind.CONTROL_REQUESTED, changes=dict(self.control))
-        yield from self.of_recording
-
-    def repeat(self, reason: Reason, current: TeleopSettings) -> None:
-        """Request what a recorded ``reason`` says was requested. Raises ValueError for settings that are none."""
-        if reason.kind is ReasonKind.HOME_REQUESTED:
-            self.home = True
-        elif reason.kind is ReasonKind.PAUSE_REQUESTED:
-            self.pause = True
-        elif reason.kind is ReasonKind.POLICY_REQUESTED:
-            self.give_back = True
-        elif reason.kind is ReasonKind.RECORDING_REQUESTED:
-            self.mark = Action(reason.detail["action"])
-        elif reason.kind is ReasonKind.CONTROL_REQUESTED:
-            self.control = reason.detail["changes"]
-        elif reason.kind is ReasonKind.SETTINGS_REQUESTED:
-            changed = _merged(current.model_dump(mode="json"), reason.detail["changes"])
-            self.settings = TeleopSettings.model_validate(changed)
-        elif reason.kind is ReasonKind.VERDICT and reason not in self.of_recording:
-            self.of_recording.append(reason)
-
-
-def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in new.items():
-        before = old.get(name)
-        if value == before:
-            continue
-        same = isinstance(value, dict) and isinstance(before, dict) and value.keys() == before.keys()
-        found[name] = _difference(before, value) if same and isinstance(before, dict) else value
-    return found
-
-
-def _merged(old: Mapping[str, Any], changed: Mapping[str, Any]) -> dict[str, Any]:
-    inner = {
-        name: _merged(old[name], value)
-        if isinstance(value, dict) and isinstance(old.get(name), dict) and value.keys() <= old[name].keys()
-        else value
-        for name, value in changed.items()
-    }
-    return {**old, **inner}
-
-
 class OperatorSide:
     """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and :meth:`feed_back`."""
 
@@ -118,7 +40,7 @@ class OperatorSide:
         source: Input,
         supervisor: Supervisor,
         controller: CartesianController,
-        requests: PendingRequests,
+        requests: deque[Reason | TeleopSettings],
     ) -> None:
         self._teleop, self._input, self._supervisor = teleop, source, supervisor
         self._policy = source if isinstance(source, PolicySource) else None
@@ -189,27 +111,34 @@ class OperatorSide:
             pulses.grasps(self._grips[arm].look(commanded, opening, tick.now))
 
     def _fulfil(self, now: float) -> None:
-        requests = replace(self._requests)
-        for reason in self._requests.reasons(self._teleop.settings):
-            self._teleop.record_event(now, reason)
-        self._requests.clear()
-        if requests.home:
-            self._teleop.home(now)
-        if requests.pause:
-            self._teleop.pause(now, Reason(ReasonKind.PAUSE_REQUESTED))
-        if requests.give_back:
-            self._teleop.give_back(now)
-        if requests.mark is not None:
-            self._teleop.mark(now, requests.mark)
-        if (settings := requests.settings) is not None:
-            problem = self._teleop.change(settings, now)
-            self._record_change(ReasonKind.SETTINGS_CHANGED, problem, now)
-            for pulses in self._pulses.values() if problem is None else ():
-                pulses.strength = settings.haptics.strength
-        if requests.control is not None:
-            refused = self._controller.change(requests.control)
-            problem = None if refused is None else Reason.of(ReasonKind.CONTROL_REFUSED, text=refused)
-            self._record_change(ReasonKind.CONTROL_CHANGED, problem, now)
+        for _ in range(len(self._requests)):  # those of now, however fast others come
+            request = self._requests.popleft()
+            if isinstance(request, TeleopSettings):
+                request = change_of(self._teleop.settings, request)
+            self._teleop.record_event(now, request)
+            self._do(request, now)
+
+    def _do(self, request: Reason, now: float) -> None:
+        """Do what a program asks for; what became of a recording is an event only."""
+        match request.kind:
+            case ReasonKind.HOME_REQUESTED:
+                self._teleop.home(now)
+            case ReasonKind.PAUSE_REQUESTED:
+                self._teleop.pause(now, request)
+            case ReasonKind.POLICY_REQUESTED:
+                self._teleop.give_back(now)
+            case ReasonKind.RECORDING_REQUESTED:
+                self._teleop.mark(now, Action(request.detail["action"]))
+            case ReasonKind.SETTINGS_REQUESTED:
+                settings = changed(self._teleop.settings, request.detail["changes"])
+                problem = self._teleop.change(settings, now)
+                self._record_change(ReasonKind.SETTINGS_CHANGED, problem, now)
+                for pulses in self._pulses.values() if problem is None else ():
+                    pulses.strength = settings.haptics.strength
+            case ReasonKind.CONTROL_REQUESTED:
+                refused = self._controller.change(request.detail["changes"])
+                problem = None if refused is None else Reason.of(ReasonKind.CONTROL_REFUSED, text=refused)
+                self._record_change(ReasonKind.CONTROL_CHANGED, problem, now)
 
     def _record_change(self, changed: ReasonKind, problem: Reason | None, now: float) -> None:
         outcome = Reason(changed) if problem is None else Reason(ReasonKind.NOT_CHANGED, cause=problem)

@@ -11,17 +11,16 @@ from contextlib import suppress
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
-from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive, permitted
-from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
+from q2r2_control.errors import ConfigError, PlantError, shown
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input, PolicySource, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
 from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock
-from q2r2_control.pipeline.operator_side import OperatorSide, PendingRequests
+from q2r2_control.pipeline.operator_side import OperatorSide
+from q2r2_control.pipeline.requests import RequestedRun
 from q2r2_control.pipeline.run_recorder import RunRecorder
 from q2r2_control.pipeline.target_lead import TargetLead
 from q2r2_control.plants.base import Plant, SessionPlant, check_mode, make_plant
@@ -45,7 +44,7 @@ _LONGEST_TORQUE = 0.005  # that one torque may push for: in 0.1 s it drives the 
 _logger = logging.getLogger(__name__)
 
 
-class Pipeline:
+class Pipeline(RequestedRun):
     """Runs a cell. ``listeners`` are called with every :class:`Tick`; they must not take long.
 
     The arms are brought to rest before input and plant are closed, for whatever reason a run ends. A listener that
@@ -56,6 +55,7 @@ class Pipeline:
     def __init__(
         self, config: Config, robot: Robot, input: Input, plant: Plant, mode: CommandMode | str = CommandMode.POSITION
     ) -> None:
+        super().__init__()
         config.teleop.bindings.check_device(input.controls)
         self.config, self.robot, self.input, self.plant = config, robot, input, plant
         # A session is of one mode: its arms follow no positions while torques are not safe.
@@ -66,7 +66,6 @@ class Pipeline:
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
         self._stopping = False
-        self.requests = PendingRequests()
         self._set_up()
 
     @classmethod
@@ -95,45 +94,6 @@ class Pipeline:
     def stop(self) -> None:
         """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
         self._stopping = True
-
-    def go_home(self) -> None:
-        """Bring both arms home, as an operator may; from any thread. Any press ends it; events say how it went."""
-        self.requests.home = True
-
-    def pause(self) -> None:
-        """Let both arms hold until a new press; from any thread."""
-        self.requests.pause = True
-
-    def give_back(self) -> None:
-        """Take the arms from the hands and give them to the policy, which goes on where they are; from any thread."""
-        self.requests.give_back = True
-
-    def mark(self, action: Action) -> None:
-        """Begin, end or mark an episode of the recording, as an operator may; from any thread."""
-        self.requests.mark = action
-
-    def change_teleop(self, settings: TeleopSettings) -> None:
-        """Other settings of the operator's for the rest of this run, without a jump; from any thread.
-
-        :meth:`Teleop.change` says when they count, and an event whether they did. Raises :class:`ConfigError` for a
-        binding to a control that the input lacks.
-        """
-        check_kind("teleop", settings, TeleopSettings, "TeleopSettings, which a Config has as config.teleop")
-        settings.bindings.check_device(self.input.controls)
-        self.requests.settings = settings
-
-    def record_outcome(self, reason: Reason) -> None:
-        """Let the operator know what became of the recording or of an episode in it; from any thread."""
-        self.requests.of_recording.append(reason)
-
-    def change_control(self, values: Mapping[str, float]) -> None:
-        """Other settings of the controller, by name, for the rest of this run, without a jump; from any thread.
-
-        :meth:`CartesianController.change` says how they come to count, and an event whether they did. Raises
-        :class:`ConfigError` for a name or a value that is never allowed.
-        """
-        self.config.control.changed(values)
-        self.requests.control = dict(values)
 
     def run(self, duration: float | None = None, realtime: bool = True) -> RunSummary:
         """Run for ``duration`` [s], or until :meth:`stop`, Ctrl-C or SIGTERM; the arms are brought to rest first.

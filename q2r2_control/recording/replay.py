@@ -18,6 +18,7 @@ from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.pipeline.requests import REPEATED
 from q2r2_control.plants.base import make_plant
 from q2r2_control.recording.about import ROS, About, changes
 from q2r2_control.recording.reader import Recording
@@ -127,9 +128,10 @@ class ReplayPipeline(Pipeline):
         return _Clock(1.0 / self.config.loop_rate_hz, self._recorded)
 
     def _ask_again(self, tick: RecordedTick) -> None:
-        """Repeat what a program asked of the run at this tick; both arms have the event, so it is asked twice."""
-        for event in tick.events:
-            self.requests.repeat(event.reason, self.teleop.settings)
+        """Repeat what a program asked of the run at this tick: an event of both arms, and of no change of a state."""
+        first = next(iter(self.robot.arms))
+        asked = (event for event in tick.events if event.arm == first and event.source == event.destination)
+        self.requests.extend(event.reason for event in asked if event.kind in REPEATED)
 
     def _prepare(self, realtime: bool) -> None:
         settings = permitted(self.config.control.model_copy(update={"solve_time_limit": None}), self.drive)

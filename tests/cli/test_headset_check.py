@@ -38,7 +38,7 @@ def bound_port(running: subprocess.Popen[str]) -> int:
 
 def fake_headset(port: int, duration: float) -> None:
     """A headset in a process of its own that engages both arms and circles."""
-    arguments = ["--port", str(port), "--script", "circle", "--duration", str(duration)]
+    arguments = ["--port", str(port), "--duration", str(duration)]
     subprocess.run([sys.executable, "-m", "tests.support.fake_headset", *arguments], check=True, timeout=30)
 
 

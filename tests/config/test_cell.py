@@ -12,6 +12,7 @@ import pytest
 
 from q2r2_control.config.fri import ModbusGripperConfig
 from tests.config.cell_files import CELL, changed, fault, loaded, shipped
+from tests.support.external_cell import external
 
 ARM = {"model": "iiwa7", "home": [0] * 7, "tip": "link_ee"}
 
@@ -24,12 +25,15 @@ ARM = {"model": "iiwa7", "home": [0] * 7, "tip": "link_ee"}
         "control.distances.arm_table",
         "teleop.filter.cutoff",
         "mujoco.objects.blue_block.weight",
+        *("external.presets", "external.limits.velocity", "external.arms.left.topic"),
+        "external.arms.left.gripper.action",
     ],
 )
 def test_an_unknown_key_is_named_with_those_allowed_there(tmp_path: Path, path: str) -> None:
-    message = fault(tmp_path, changed(path, 1.5))
+    cell = external if path.startswith("external") else shipped
+    message = fault(tmp_path, changed(path, 1.5, cell))
     assert message.startswith(f"{path} = 1.5: unknown key; allowed here: ")
-    data: Any = shipped()
+    data: Any = cell()
     for parent in path.split(".")[:-1]:
         data = data.get(parent, {})
     allowed = message.partition("allowed here: ")[2].partition(" (and")[0].split(", ")
@@ -105,11 +109,21 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("control.position_margin", "0.01 rad", "valid number"),
         ("control.priority", "middle", "allowed here: equal, left, right"),
         ("arms.middle", {"model": "iiwa7", "home": [0] * 7}, "'left' or 'right'"),
+        # of a cell with another controller
+        ("controller", "kuka", "'builtin' or 'external'"),
+        ("external.preset", "kuka", "allowed are kuka_lbr_clik, kuka_lbr_impedance, fzi, mayr, crisp, moveit_servo, "),
+        ("external.preset", "jtc", "it takes joint positions, which the built-in controller has to make"),
+        ("external.rate", 20, "preset kuka_lbr_clik needs at least 50 Hz"),
+        ("external.arms.left.ctrl_prefix", "left_ctrl", "begins with /"),
+        ("external.arms.left.ctrl_prefix", "/left ctrl", "allowed is a ROS name"),
+        ("external.arms.left.ctrl_prefix", "/left_ctrl/", "without / at its end"),
+        ("external.arms.left.base_frame", "", "at least 1 character"),
+        ("external.arms.left.gripper.closed_position", 0.0, "have to differ"),
     ],
     ids=lambda value: value if isinstance(value, str) else f"{value!r:.24}",
 )
 def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, value: object, allowed: str) -> None:
-    message = fault(tmp_path, changed(path, value))
+    message = fault(tmp_path, changed(path, value, external if path.startswith("external") else shipped))
     # A fault of two keys together is told of the mapping that has both.
     assert message.startswith((path, path.rpartition(".")[0] + " = "))
     assert allowed in message

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from textwrap import dedent
-from typing import Any
 
 import pinocchio as pin
 import pytest
@@ -16,41 +15,6 @@ from q2r2_control.config.cell import parse_config
 from q2r2_control.config.resources import find_resource
 from tests.config.cell_files import changed, fault, loaded
 from tests.support.external_cell import external
-
-
-@pytest.mark.parametrize(
-    "path",
-    ["external.presets", "external.limits.velocity", "external.arms.left.topic", "external.arms.left.gripper.action"],
-)
-def test_an_unknown_key_of_an_external_controller_is_named_with_those_allowed_there(tmp_path: Path, path: str) -> None:
-    message = fault(tmp_path, changed(path, 1.5, external))
-    assert message.startswith(f"{path} = 1.5: unknown key; allowed here: ")
-    place: Any = external()
-    for parent in path.split(".")[:-1]:
-        place = place[parent]
-    assert set(place) <= set(message.partition("allowed here: ")[2].split(", "))
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "allowed"),
-    [
-        ("controller", "kuka", "'builtin' or 'external'"),
-        ("external.preset", "kuka", "allowed are kuka_lbr_clik, kuka_lbr_impedance, fzi, mayr, crisp, moveit_servo, "),
-        ("external.preset", "jtc", "it takes joint positions, which the built-in controller has to make"),
-        ("external.rate", 20, "preset kuka_lbr_clik needs at least 50 Hz"),
-        ("external.arms.left.ctrl_prefix", "left_ctrl", "begins with /"),
-        ("external.arms.left.ctrl_prefix", "/left ctrl", "allowed is a ROS name"),
-        ("external.arms.left.ctrl_prefix", "/left_ctrl/", "without / at its end"),
-        ("external.arms.left.base_frame", "", "at least 1 character"),
-        ("external.arms.left.gripper.closed_position", 0.0, "have to differ"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else f"{value!r:.24}",
-)
-def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, value: object, allowed: str) -> None:
-    message = fault(tmp_path, changed(path, value, external))
-    assert message.startswith((path, path.rpartition(".")[0] + " = "))
-    assert allowed in message
-
 
 LEFT = {"left": external()["external"]["arms"]["left"]}
 ROBOT = "/bh_robot/left_arm_clik_controller"

@@ -8,7 +8,10 @@ from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
+from q2r2_control.types import Command, RobotState
 from tests.support.processes import cell, speed
 
 
@@ -19,6 +22,26 @@ def pipeline(
     config = cell().model_copy(update={"loop_rate_hz": 500.0, **changes})
     source = source or ScriptedInput("circle", frequency_hz=0.5)
     return Pipeline.from_config(config, input=source, plant=plant, mode=mode)
+
+
+class RecordingPlant(KinematicPlant):
+    """Keeps every command, counts calls of close, and measures what ``disturb`` makes of the truth."""
+
+    def __init__(self) -> None:
+        super().__init__(Robot.from_config(cell()), cell())
+        self.closed = 0
+        self.commands: list[Command] = []
+        self.disturb: Callable[[RobotState], RobotState] = lambda state: state
+
+    def apply(self, command: Command) -> None:
+        super().apply(command)
+        self.commands.append(command)
+
+    def state(self) -> RobotState:
+        return self.disturb(super().state())
+
+    def close(self) -> None:
+        self.closed += 1
 
 
 def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:

@@ -16,31 +16,10 @@ from q2r2_control.errors import InputError
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import STOPPING, Pipeline
-from q2r2_control.plants.kinematic import KinematicPlant
-from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
-from q2r2_control.types import SIDES, Command
-from tests.pipeline.loops import pipeline, when_moving
+from q2r2_control.types import SIDES
+from tests.pipeline.loops import RecordingPlant, pipeline, when_moving
 from tests.support.processes import Watch, assert_torque_bounds, cell, speed
-
-
-class RecordingPlant(KinematicPlant):
-    """Keeps every command, counts calls of close, and fails at a given command."""
-
-    def __init__(self) -> None:
-        super().__init__(Robot.from_config(cell()), cell())
-        self.closed = 0
-        self.fails_at: int | None = None
-        self.commands: list[Command] = []
-
-    def apply(self, command: Command) -> None:
-        self.commands.append(command)
-        if self.fails_at is not None and len(self.commands) >= self.fails_at:
-            raise RuntimeError("the plant failed")
-        super().apply(command)
-
-    def close(self) -> None:
-        self.closed += 1
 
 
 @pytest.mark.slow
@@ -137,7 +116,7 @@ class TestFailure:
             loop.run(60.0, realtime=False)
         assert speed(watch.ticks[-1]) <= 1e-6 < max(map(speed, watch.ticks))
 
-    @pytest.mark.parametrize("who", ["plant", "listener", "reset", "nobody"])
+    @pytest.mark.parametrize("who", ["apply", "listener", "reset", "nobody"])
     def test_leaves_no_thread_no_port_and_no_plant_behind(self, who: str, monkeypatch: pytest.MonkeyPatch) -> None:
         plant, server = RecordingPlant(), HeadsetServer(port=0)
         loop = Pipeline.from_config(cell(), input=server, plant=plant)
@@ -145,12 +124,10 @@ class TestFailure:
         def fail(*_: object) -> None:
             raise RuntimeError(f"the {who} failed")
 
-        if who == "plant":
-            plant.fails_at = 20
-        elif who == "listener":
+        if who == "listener":
             loop.listeners.append(fail)
-        elif who == "reset":
-            monkeypatch.setattr(plant, "reset", fail)
+        elif who in ("apply", "reset"):
+            monkeypatch.setattr(plant, who, fail)
         if who == "nobody":
             loop.run(0.1, realtime=False)
         else:

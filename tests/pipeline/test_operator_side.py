@@ -10,11 +10,10 @@ import numpy as np
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.teleop.haptics import CONTACT, ENGAGED, GRASP, LIMIT, NEAR, SLIP, Pulse
-from q2r2_control.types import Array, HapticFeedback
+from q2r2_control.types import SIDES, Array, HapticFeedback
 from tests.pipeline.loops import pipeline
 from tests.support.hands_input import ENGAGED as BEGIN
 from tests.support.hands_input import HandsInput, Path
-from tests.support.operator_script import HANDS
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -53,7 +52,7 @@ def straight(way: Array, duration: float = 1.5) -> Path:
 def test_engaging_is_felt_by_both_hands_and_every_vibration_ends_before_the_next_one_begins() -> None:
     hands = FeltHands(left=straight(0.25 * -np.eye(3)[1]))
     pipeline(hands).run(2.5, realtime=False)
-    for hand in HANDS:
+    for hand in SIDES:
         assert hands.by(hand, ENGAGED) == [ENGAGED.amplitude]
         sent = [(t, one.amplitude > 0.0) for t, one in hands.felt if one.hand == hand]
         assert [on for _, on in sent] == [True, False] * (len(sent) // 2)
@@ -64,7 +63,7 @@ def test_engaging_is_felt_by_both_hands_and_every_vibration_ends_before_the_next
 def test_an_arm_that_is_driven_at_the_other_is_felt_by_both_hands_stronger_and_stronger_and_then_no_more() -> None:
     hands = FeltHands(left=straight(0.5 * -np.eye(3)[1]))
     pipeline(hands).run(5.0, realtime=False)
-    for hand in HANDS:
+    for hand in SIDES:
         amplitudes = hands.by(hand, NEAR)
         assert len(amplitudes) >= 4
         assert amplitudes == sorted(amplitudes)

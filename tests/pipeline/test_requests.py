@@ -1,11 +1,9 @@
-"""Requests of a program to a run: each is done at the next tick, and a replay asks for the same."""
+"""Requests of a program to a run: each is done at the next tick."""
 
 from __future__ import annotations
 
 from q2r2_control.config.bindings import Action
-from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import ReasonKind
-from q2r2_control.pipeline.operator_side import PendingRequests
 from tests.pipeline.loops import pipeline, when_moving
 from tests.support.processes import changes
 
@@ -24,12 +22,3 @@ def test_a_mark_without_a_recording_is_refused() -> None:
     loop.listeners.append(when_moving(lambda: loop.mark(Action.RECORD_MARK)))
     kinds = [event.kind for event in loop.run(2.5, realtime=False).events if event.arm == "left"]
     assert kinds[-2:] == [ReasonKind.RECORDING_REQUESTED, ReasonKind.NO_RECORDING]
-
-
-def test_a_replay_asks_for_the_same() -> None:
-    asked, again = PendingRequests(True, True, True, mark=Action.RECORD_TOGGLE), PendingRequests()
-    settings = TeleopSettings()
-    for reason in asked.reasons(settings):
-        for _ in ("left", "right"):  # both arms have the event
-            again.repeat(reason, settings)
-    assert again == asked

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, Solver
 from q2r2_control.errors import PlantError, RecordingError
@@ -66,6 +67,9 @@ def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
         0.8: lambda: loop.change_teleop(other),
         1.0: lambda: loop.change_control({"min_distance": 0.03, "position_gain": 4.0}),
         1.2: loop.go_home,
+        1.3: lambda: loop.mark(Action.RECORD_TOGGLE),
+        1.4: loop.give_back,
+        1.5: loop.pause,
     }
 
     def ask(tick: Tick) -> None:
@@ -78,9 +82,10 @@ def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
     told = [event.reason for event in result.summary.events if event.arm == "left"]
     assert told[1].detail["changes"]["position_scale"] == 0.3
     assert told[3].detail["changes"] == {"min_distance": 0.03, "position_gain": 4.0}
-    assert [reason.kind for reason in told[1:7]] == [
-        *("settings_requested", "settings_changed", "control_requested", "control_changed"),
-        *("home_requested", "homing"),
+    kinds = [reason.kind for reason in told[1:]]
+    assert kinds[:4] == ["settings_requested", "settings_changed", "control_requested", "control_changed"]
+    assert [kind for kind in kinds[4:] if "homing" not in kind] == [
+        *("home_requested", "recording_requested", "episode_begins", "policy_requested", "pause_requested"),
     ]
     assert (result.difference, result.ended_by, result.notes) == (None, None, [])
 

@@ -98,6 +98,13 @@ def node(domain: int) -> Iterator[Any]:
 
 
 @pytest.fixture
+def rig(node: Any) -> Any:
+    from tests.ros.arm_rig import ArmRig
+
+    return ArmRig(node)
+
+
+@pytest.fixture
 def context(domain: int) -> Iterator[Any]:
     """Where nodes are made that never spin."""
     import rclpy

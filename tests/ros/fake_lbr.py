@@ -13,8 +13,9 @@ from q2r2_control import Robot
 from q2r2_control.plants.fri.wire import CommandKind, Drives, Operation, Quality, Safety, Session
 from q2r2_control.types import Array
 
-PERIOD = 0.01  # of the driver, by default [s]
-TAU = 0.04  # of its filter of positions, by default [s]
+PERIOD = 0.005  # of the driver [s]
+TAU = 0.04  # of its filter of positions [s]
+_SHARE = 1.0 - math.exp(-PERIOD / TAU)  # of the way that the filter goes in one period
 NARROWER = math.radians(1.0)  # than the model's limits are the driver's [rad]
 SAME = 3e-4  # of a first command and the cabinet's own position: a step from rest, where it is outside a limit [rad]
 SAG = 2e-3  # of the measured joints below what is commanded [rad]
@@ -27,7 +28,7 @@ _ORDER = [2, 0, 1, 3, 4, 6, 5]  # of the joints in its joint states
 class FakeLbr:
     """Follows commands in commanding active only. Everything that would shut the connection is in ``trips``."""
 
-    def __init__(self, robot: Robot, arm: str, period: float = PERIOD, tau: float = TAU) -> None:
+    def __init__(self, robot: Robot, arm: str) -> None:
         joints = robot.arms[arm].joints
         self.q, self.v = robot.home[joints].copy(), np.zeros(len(joints))  # as commanded to the cabinet [rad], [rad/s]
         self.session, self.quality, self.safety = Session.MONITORING_READY, Quality.EXCELLENT, Safety.NORMAL
@@ -35,9 +36,7 @@ class FakeLbr:
         self.silent = False  # its process has ended
         self.begun, self.trips = 0, list[str]()
         self.target: Array | None = None  # the newest command of this session
-        self.share = 1.0 - math.exp(-period / tau) if tau > 0.0 else 1.0
         self.ipo = self.q  # of the cabinet's own motion, which stays where the session began: commands overlay it
-        self._period = period
         self._lower, self._upper = robot.position_lower[joints] + NARROWER, robot.position_upper[joints] - NARROWER
         self._fastest = robot.velocity_limit[joints] * (1.0 + _ROUNDING)
 
@@ -63,15 +62,15 @@ class FakeLbr:
     def advance(self) -> None:
         """One period: towards the newest command, or to rest by the cabinet's own brakes."""
         if self.session is not Session.COMMANDING_ACTIVE:
-            self.v = np.sign(self.v) * np.maximum(np.abs(self.v) - BRAKES * self._period, 0.0)
+            self.v = np.sign(self.v) * np.maximum(np.abs(self.v) - BRAKES * PERIOD, 0.0)
         elif self.target is not None:
-            q = self.q + self.share * (self.target - self.q)
-            self.v = (q - self.q) / self._period
+            q = self.q + _SHARE * (self.target - self.q)
+            self.v = (q - self.q) / PERIOD
             if not ((self._lower <= q) & (q <= self._upper)).all():
                 self._trip(f"position {q}")
             if (np.abs(self.v) > self._fastest).any():
                 self._trip(f"velocity {self.v}")
-        self.q = self.q + self.v * self._period
+        self.q = self.q + self.v * PERIOD
 
     def state(self) -> LBRState:
         return LBRState(

@@ -1,8 +1,7 @@
-"""Sessions of two KUKA drivers that end in every way there is: ``python -m tests.ros.lbr_soak --sessions 1000``."""
+"""Sessions of two KUKA drivers that end in every way there is."""
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,8 +13,8 @@ import numpy as np
 from q2r2_control.plants.fri.wire import Drives, Operation, Quality, Safety, Session
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.types import SIDES, Array
-from tests.ros.fake_lbr import SAME, TAU, TOPICS
-from tests.ros.virtual_lbrs import Operator, VirtualLbrs, virtual_lbrs
+from tests.ros.fake_lbr import SAME, TOPICS
+from tests.ros.virtual_lbrs import Operator, VirtualLbrs
 
 _NEAR = 1e-9  # relative, of limits
 _UNEVEN = 0.004  # relative, of the times between ticks, which follow their clock
@@ -215,27 +214,3 @@ _ENDS = (
     *("a session ends", "both sessions end", "the quality falls", "a safety stop", "T1", "both arms are moved"),
     *("a driver ends", "the node freezes", *_CHANGES),
 )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sessions", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--tau", type=float, default=TAU, help="of the driver's filter [s]")
-    parser.add_argument("--velocity-scale", type=float, default=1.0, help="of the cell, which takes 0.85 at most")
-    given = parser.parse_args()
-    faults = 0
-    for number, release in enumerate(TOPICS):
-        with virtual_lbrs(release, given.tau, given.seed + number, velocity_scale=given.velocity_scale) as virtual:
-            soak = LbrSoak(virtual, given.sessions // len(TOPICS)).run()
-        print(
-            f"{release}: {soak.ended} sessions, {soak.activations} activations, {soak.moved:.2f} rad/s at most, ",
-            end="",
-        )
-        print(f"{len(soak.faults)} faults", *soak.faults[:20], sep="\n")
-        faults += len(soak.faults)
-    raise SystemExit(1 if faults else 0)
-
-
-if __name__ == "__main__":
-    main()

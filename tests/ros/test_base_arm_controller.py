@@ -33,11 +33,6 @@ from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, patient, steps,
 from tests.ros.programs.stalling_arm import STALL
 
 
-@pytest.fixture
-def rig(node: Any) -> ArmRig:
-    return ArmRig(node)
-
-
 def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_jump(rig: ArmRig, processes: Processes) -> None:
     process = rig.start(processes)
     rig.move((0.2, 0.0, 0.0), 0.1)

@@ -125,11 +125,6 @@ def test_an_impedance_that_is_set_counts_for_both_arms_if_it_is_allowed(context:
     assert [impedance.in_force(arm) for arm in robot.arms] == [asked] * 2
 
 
-@pytest.fixture
-def rig(node: Any) -> ArmRig:
-    return ArmRig(node)
-
-
 def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(context: Any, tmp_path: Path) -> None:
     cell = external()
     cell["external"] |= {"preset": "fzi", "rate": 60.0, "limits": {"max_velocity": 0.2}}

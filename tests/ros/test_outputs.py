@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -47,6 +48,26 @@ from q2r2_control.types import Command, CommandMode
 TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
 
 
+class Stream:
+    def __init__(self, publisher: WatchedPublisher, rate: float, message: type = PoseStamped) -> None:
+        self._publisher, self._period, self._message = publisher, 1.0 / rate, message
+        self.published = self.left_out = 0
+
+    def run(self, seconds: float, fault: Callable[[], Reason | None] | None = None) -> Reason | None:
+        """Publish for so long, or until there is a ``fault``, by default the listener's silence; returns it."""
+        end, find = time.monotonic() + seconds, fault or self._publisher.silence
+        while time.monotonic() < end:
+            if (found := find()) is not None:
+                return found
+            if self._publisher.waits():
+                self.left_out += 1
+            else:
+                self._publisher.publish(self._message(), time.monotonic())
+                self.published += 1
+            time.sleep(self._period)
+        return None
+
+
 class Commands:
     def __init__(self, node: Any, positions: bool) -> None:
         self._node, self.taken = node, 0
@@ -64,14 +85,8 @@ class Commands:
 
     def send(self, seconds: float, off_reference: bool) -> Reason | None:
         """Send 200 commands a second; what was found to be wrong, if anything."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            if (fault := self.output.listener_fault(off_reference)) is not None:
-                return fault
-            if not self.output.waits():
-                self._publisher.publish(Float64MultiArray(), time.monotonic())
-            time.sleep(0.005)
-        return None
+        stream = Stream(self._publisher, 200.0, Float64MultiArray)
+        return stream.run(seconds, lambda: self.output.listener_fault(off_reference))
 
     def _take(self, message: Float64MultiArray) -> None:
         self.taken += 1
@@ -203,26 +218,6 @@ rclpy.spin(node)
 """
 
 
-class Stream:
-    def __init__(self, publisher: WatchedPublisher, rate: float) -> None:
-        self._publisher, self._period = publisher, 1.0 / rate
-        self.published = self.left_out = 0
-
-    def run(self, seconds: float) -> Reason | None:
-        """Publish for so long; returns the reported silence of the listener, if there was one."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            if (silence := self._publisher.silence()) is not None:
-                return silence
-            if self._publisher.waits():
-                self.left_out += 1
-            else:
-                self._publisher.publish(PoseStamped(), time.monotonic())
-                self.published += 1
-            time.sleep(self._period)
-        return None
-
-
 @pytest.fixture
 def listener(processes: Processes) -> RosProcess:
     return processes.start(sys.executable, "-c", LISTENER, name="listener")
@@ -261,21 +256,6 @@ def test_an_endpoint_keeps_the_name_of_its_node_where_the_graph_has_lost_it() ->
         for space, name, number in (("/", "talker", 1), ("_NODE_NAMESPACE_UNKNOWN_", _LOST, 1), ("/", _LOST, 2))
     )
     assert [node_of(one) for one in (known, lost, other)] == ["/talker", "/talker", None]
-
-
-# How long Fast DDS takes to find it again is its own business, and once was more than 30 s.
-@pytest.mark.slow
-@pytest.mark.soak
-def test_a_node_that_the_graph_had_lost_is_known_when_it_comes_back(node: Any, listener: RosProcess) -> None:
-    def nodes() -> list[str | None]:
-        return [node_of(info) for info in node.get_subscriptions_info_by_topic("/watched")]
-
-    node.create_publisher(PoseStamped, "/watched", 1)
-    wait_until(lambda: nodes() == ["/listener"], "the listener and its name are found")
-    os.kill(listener.pid, signal.SIGSTOP)
-    wait_until(lambda: nodes() == [], "the graph has lost it")
-    os.kill(listener.pid, signal.SIGCONT)
-    wait_until(lambda: nodes() == ["/listener"], "it is found again")
 
 
 def test_the_example_of_an_external_controller_answers_a_target(processes: Processes, node: Any, robot: Robot) -> None:

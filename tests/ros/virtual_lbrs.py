@@ -33,18 +33,17 @@ from q2r2_control.ros.launch.processes import nodes_of
 from q2r2_control.ros.nodes.cartesian_controller import CartesianControllerNode
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.types import SIDES, Array
-from tests.ros.fake_lbr import TAU, TOPICS, FakeLbr
+from tests.ros.fake_lbr import PERIOD, TAU, TOPICS, FakeLbr
 from tests.support.external_cell import external
 
-_TARGETS, _PERIOD = 0.01, 0.005  # between two of the operator's, and of a driver [s]
+_TARGETS = 0.01  # between two of the operator's [s]
 _SOON, _LATE_SHARE = 0.002, 0.01  # delivery of messages [s], and how many take longer
-_LATE = 0.25  # at most, of the filter's time constant, which bounds what the driver bears
+_LATE = 0.25 * TAU  # at most: the filter's time constant bounds what the driver bears [s]
 
 
-def lbr_cell(folder: Path, **control: Any) -> str:
-    """A file with the shipped cell behind a driver for each arm, with changed keys of ``control``."""
+def lbr_cell(folder: Path) -> str:
+    """A file with the shipped cell behind a driver for each arm."""
     cell = external()
-    cell["control"] |= control
     arms = {
         arm: {
             "ctrl_prefix": f"/{arm}/lbr_joint_position_command_controller",
@@ -88,12 +87,11 @@ class DirectPublisher:
 class VirtualLbrs:
     """The controller's node and a driver for each arm, in virtual time; each has its own clock."""
 
-    def __init__(self, node: CartesianControllerNode, robot: Robot, release: str, tau: float, seed: int) -> None:
+    def __init__(self, node: CartesianControllerNode, robot: Robot, release: str, seed: int) -> None:
         self.node, self.robot, self.random = node, robot, np.random.default_rng(seed)
-        self.drivers = {arm: FakeLbr(robot, arm, _PERIOD, tau) for arm in SIDES}
+        self.drivers = {arm: FakeLbr(robot, arm) for arm in SIDES}
         self.now = 1.0  # [s]
         self._clock: Any = node.get_clock()
-        self._late = _LATE * tau
         self.frozen_until = 0.0  # the node [s]
         self.change: Callable[[str, Any], Any] = lambda topic, message: message  # of what drivers say; None: it is lost
         self.on_command: Callable[[str, Array], None] = lambda arm, q: None
@@ -106,7 +104,7 @@ class VirtualLbrs:
         outputs: dict[str, Any] = {one.publisher.topic_name: one.publisher for one in node._output._channels}
         for arm in SIDES:
             outputs[f"/{arm}/command/{command}"].deliver = partial(self._command, arm)
-            own = _PERIOD * (1.0 + float(self.random.uniform(-2e-4, 2e-4)))
+            own = PERIOD * (1.0 + float(self.random.uniform(-2e-4, 2e-4)))
             self._every(own, 0.0, partial(self._advance, arm))
         self._every(node._period, 0.1 * node._period, self._tick)
 
@@ -141,7 +139,7 @@ class VirtualLbrs:
 
     def _sent(self, topic: str, act: Callable[[], None]) -> None:
         """Messages of a topic arrive in order, mostly within 2 ms."""
-        longest = self._late if self.random.random() < _LATE_SHARE else _SOON
+        longest = _LATE if self.random.random() < _LATE_SHARE else _SOON
         self._last[topic] = max(self._last.get(topic, 0.0), self.now + float(self.random.uniform(1e-4, longest)))
         self.at(self._last[topic], act)
 
@@ -210,11 +208,9 @@ class Operator:
 
 
 @contextmanager
-def virtual_lbrs(
-    release: str, tau: float = TAU, seed: int = 0, domain: int | None = None, **control: Any
-) -> Iterator[VirtualLbrs]:
+def virtual_lbrs(release: str, domain: int, seed: int = 0) -> Iterator[VirtualLbrs]:
     with tempfile.TemporaryDirectory() as folder:
-        cell = lbr_cell(Path(folder), **control)
+        cell = lbr_cell(Path(folder))
         given = dict(nodes_of(cell)[0].parameters) | {"use_sim_time": True}
         arguments = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
         rclpy.init(
@@ -224,7 +220,7 @@ def virtual_lbrs(
             with patch.object(joint_outputs, "WatchedPublisher", DirectPublisher):
                 node = CartesianControllerNode()
             node.get_logger().set_level(LoggingSeverity.FATAL)  # a session's end is none
-            yield VirtualLbrs(node, Robot.from_config(load_config(cell)), release, tau, seed)
+            yield VirtualLbrs(node, Robot.from_config(load_config(cell)), release, seed)
             node.get_logger().set_level(LoggingSeverity.UNSET)
             node.destroy_node()
         finally:

@@ -1,8 +1,8 @@
 """A fake Quest2ROS headset: the app's bytes over TCP in both dialects, packed here and not by the code under test.
 
-As a process it plays an operator's session against a running server:
+As a process it engages both arms of a running server and circles:
 
-    python -m tests.support.fake_headset --port 10000 --dialect ros2 --script acceptance --duration 20
+    python -m tests.support.fake_headset --port 10000 --duration 20
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import random
-import signal
 import socket
 import struct
 import sys
@@ -18,8 +17,9 @@ import time
 from contextlib import suppress
 from typing import Any
 
+from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.quaternions import Quaternion, Vector
-from tests.support.operator_script import HANDS, SCRIPTS, START, Reading, Script
+from q2r2_control.types import SIDES
 
 RATE_HZ = 75.0
 DIALECTS = ("ros1", "ros2")
@@ -69,7 +69,7 @@ class FakeHeadset:
     def registrations(self) -> bytes:
         """The app's first messages after connecting: a keepalive, its topics, and a question for the server's."""
         parts = [KEEPALIVE]
-        for hand in HANDS:
+        for hand in SIDES:
             for suffix, kind in TOPICS.items():
                 topic = self.topic(hand, suffix)
                 parts.append(self.command("__publish", topic=topic, message_name=kind, queue_size=10, latch=False))
@@ -178,42 +178,24 @@ def pack_inputs(
     return b"\0\1\0\0" + struct.pack("<??2x4f", upper, lower, *analog)
 
 
-def send_reading(headset: FakeHeadset, reading: Reading, noise: random.Random) -> None:
-    """Send the pose, with a little noise, and the inputs of one hand."""
-    position = tuple(value + noise.gauss(0.0, NOISE) for value in reading.position)
-    headset.send(headset.pose(reading.hand, position, reading.quaternion))
-    headset.send(headset.inputs(reading.hand, reading.upper, reading.lower))
-
-
-def play(headset: FakeHeadset, script: Script, duration: float) -> None:
-    """Send the script at RATE_HZ in real time."""
-    start, noise = time.monotonic(), random.Random(0)
-    for index in range(int(duration * RATE_HZ)):
-        time.sleep(max(start + index / RATE_HZ - time.monotonic(), 0.0))
-        headset.discard_received()
-        for hand in HANDS:
-            send_reading(headset, script.reading(hand, index / RATE_HZ), noise)
-
-
 def main() -> int:
-    """Play a script against a server, which may close first. SIGTERM ends it inside a frame."""
+    """Play scripted hands at RATE_HZ in real time, to a server which may close first."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, required=True)
-    parser.add_argument("--dialect", choices=DIALECTS, default="ros2")
-    parser.add_argument("--script", choices=sorted(SCRIPTS), default="acceptance")
     parser.add_argument("--duration", type=float, default=20.0, help="[s]")
     arguments = parser.parse_args()
-    headset = FakeHeadset(("127.0.0.1", arguments.port), arguments.dialect, connect_timeout=30.0)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+    script, noise = ScriptedInput("circle", rate_hz=RATE_HZ), random.Random(0)
+    script.start()
+    with suppress(ConnectionError), FakeHeadset(("127.0.0.1", arguments.port), connect_timeout=30.0) as headset:
         headset.send(headset.registrations())
-        play(headset, SCRIPTS[arguments.script](arguments.duration), arguments.duration)
-    except KeyboardInterrupt:
-        headset.send(headset.pose("left", START["left"], (0.0, 0.0, 0.0, -1.0))[:30])
-    except ConnectionError:
-        pass
-    finally:
-        headset.close()
+        start = time.monotonic()
+        for index in range(int(arguments.duration * RATE_HZ)):
+            time.sleep(max(start + index / RATE_HZ - time.monotonic(), 0.0))
+            headset.discard_received()
+            for sample in script.poll(index / RATE_HZ):
+                x, y, z = (value + noise.gauss(0.0, NOISE) for value in sample.position.tolist())
+                headset.send(headset.pose(sample.hand, (x, y, z), sample.quaternion.tolist()))
+                headset.send(headset.inputs(sample.hand, lower=sample.inputs.button_lower))
     return 0
 
 

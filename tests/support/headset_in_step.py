@@ -21,10 +21,10 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, CommandMode, HandSample, HapticFeedback
 from tests.support.fake_headset import FakeHeadset
 from tests.support.headset_server import eventually
-from tests.support.operator_script import START
 from tests.support.processes import Watch, cell
 from tests.support.reasons import kinds
 
+START = {"left": (0.3, 0.2, 1.1), "right": (0.3, -0.2, 1.1)}  # of the hands [m]
 PERIOD = 1.0 / 72.0  # of samples [s]
 PRESS = 0.12  # longer than a chord's window [s]
 NOISE = 2e-5  # of a position [m]

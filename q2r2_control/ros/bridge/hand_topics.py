@@ -22,24 +22,23 @@ from q2r2_control.ros.monitoring import Publishers, node_of
 from q2r2_control.types import SIDES, HandInputs, HandSample, HapticFeedback
 
 _DEPTH = 10  # of publishers that are reliable, so that any subscriber matches
-_TYPES = {MessageType.POSE: PoseStamped, MessageType.TWIST: Twist, MessageType.INPUTS: OVR2ROSInputs}
-_READERS: dict[MessageType, Callable[[Any], HandMessage]] = {
-    MessageType.POSE: convert.hand_pose,
-    MessageType.TWIST: convert.hand_twist,
-    MessageType.INPUTS: convert.hand_inputs,
+_KINDS: dict[MessageType, tuple[type, Callable[[Any], HandMessage]]] = {
+    MessageType.POSE: (PoseStamped, convert.hand_pose),
+    MessageType.TWIST: (Twist, convert.hand_twist),
+    MessageType.INPUTS: (OVR2ROSInputs, convert.hand_inputs),
 }
 
 
 class HandPublishers:
     """Publishes the messages of a headset on topics of the same names; used by one thread."""
 
-    def __init__(self, node: Node, hands: Iterable[str] = SIDES, kinds: Iterable[MessageType] = tuple(_TYPES)) -> None:
+    def __init__(self, node: Node, hands: Iterable[str] = SIDES, kinds: Iterable[MessageType] = tuple(_KINDS)) -> None:
         self._node = node
         wanted = {(hand, kind) for kind in kinds for hand in hands}
         topics = {name: topic for name, topic in HAND_TOPICS.items() if (topic.hand, topic.kind) in wanted}
         self._topics = {(topic.hand, topic.kind): name for name, topic in topics.items()}
         self._publishers = {
-            name: node.create_publisher(_TYPES[topic.kind], name, _DEPTH) for name, topic in topics.items()
+            name: node.create_publisher(_KINDS[topic.kind][0], name, _DEPTH) for name, topic in topics.items()
         }
         self.sent: dict[str, int] = {publisher.topic_name: 0 for publisher in self._publishers.values()}
 
@@ -75,12 +74,12 @@ class HandPublishers:
 def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None]) -> None:
     """Call ``listener`` with topic and message for every message of either hand."""
     for name, topic in HAND_TOPICS.items():
-        read = _READERS[topic.kind]
+        kind, read = _KINDS[topic.kind]
 
         def hear(message: Any, name: str = name, read: Callable[[Any], HandMessage] = read) -> None:
             listener(name, read(message))
 
-        node.create_subscription(_TYPES[topic.kind], name, hear, STREAM_QOS)
+        node.create_subscription(kind, name, hear, STREAM_QOS)
 
 
 def subscribe_to_haptics(node: Node, vibrate: Callable[[HapticFeedback], None]) -> None:

@@ -1,0 +1,102 @@
+"""Requests of a program to a run, from any thread: each is done at the next tick, and recorded for a replay."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+from q2r2_control.config.bindings import Action
+from q2r2_control.config.cell import Config
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.errors import check_kind
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.inputs.base import Input
+
+
+class RequestedRun:
+    """The requests to a run. Each waits as the reason that is recorded, or as the settings that it is made of."""
+
+    config: Config
+    input: Input
+
+    def __init__(self) -> None:
+        self.requests: deque[Reason | TeleopSettings] = deque()
+
+    def go_home(self) -> None:
+        """Bring both arms home, as an operator may; from any thread. Any press ends it; events say how it went."""
+        self.requests.append(Reason(ReasonKind.HOME_REQUESTED))
+
+    def pause(self) -> None:
+        """Let both arms hold until a new press; from any thread."""
+        self.requests.append(Reason(ReasonKind.PAUSE_REQUESTED))
+
+    def give_back(self) -> None:
+        """Take the arms from the hands and give them to the policy, which goes on where they are; from any thread."""
+        self.requests.append(Reason(ReasonKind.POLICY_REQUESTED))
+
+    def mark(self, action: Action) -> None:
+        """Begin, end or mark an episode of the recording, as an operator may; from any thread."""
+        self.requests.append(Reason.of(ReasonKind.RECORDING_REQUESTED, action=str(action)))
+
+    def change_teleop(self, settings: TeleopSettings) -> None:
+        """Other settings of the operator's for the rest of this run, without a jump; from any thread.
+
+        :meth:`Teleop.change` says when they count, and an event whether they did. Raises :class:`ConfigError` for a
+        binding to a control that the input lacks.
+        """
+        check_kind("teleop", settings, TeleopSettings, "TeleopSettings, which a Config has as config.teleop")
+        settings.bindings.check_device(self.input.controls)
+        self.requests.append(settings)
+
+    def change_control(self, values: Mapping[str, float]) -> None:
+        """Other settings of the controller, by name, for the rest of this run, without a jump; from any thread.
+
+        :meth:`CartesianController.change` says how they come to count, and an event whether they did. Raises
+        :class:`ConfigError` for a name or a value that is never allowed.
+        """
+        self.config.control.changed(values)
+        self.requests.append(Reason.of(ReasonKind.CONTROL_REQUESTED, changes=dict(values)))
+
+    def record_outcome(self, reason: Reason) -> None:
+        """Let the operator know what became of the recording or of an episode in it; from any thread."""
+        self.requests.append(reason)
+
+
+# Kinds of requests, which a replay asks for again; a recording that ended does not end again.
+REPEATED = {
+    *(ReasonKind.HOME_REQUESTED, ReasonKind.PAUSE_REQUESTED, ReasonKind.POLICY_REQUESTED),
+    *(ReasonKind.RECORDING_REQUESTED, ReasonKind.SETTINGS_REQUESTED, ReasonKind.CONTROL_REQUESTED, ReasonKind.VERDICT),
+}
+
+
+def change_of(old: TeleopSettings, new: TeleopSettings) -> Reason:
+    """The request for other settings, by what is not as it is in the ``old`` ones."""
+    changes = _difference(old.model_dump(mode="json"), new.model_dump(mode="json"))
+    return Reason.of(ReasonKind.SETTINGS_REQUESTED, changes=changes)
+
+
+def changed(settings: TeleopSettings, changes: Mapping[str, Any]) -> TeleopSettings:
+    """The settings that such a request asks for. Raises ValueError for changes that are none."""
+    return TeleopSettings.model_validate(_merged(settings.model_dump(mode="json"), changes))
+
+
+def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in new.items():
+        before = old.get(name)
+        if value == before:
+            continue
+        same = isinstance(value, dict) and isinstance(before, dict) and value.keys() == before.keys()
+        found[name] = _difference(before, value) if same and isinstance(before, dict) else value
+    return found
+
+
+def _merged(old: Mapping[str, Any], changed: Mapping[str, Any]) -> dict[str, Any]:
+    inner = {
+        name: _merged(old[name], value)
+        if isinstance(value, dict) and isinstance(old.get(name), dict) and value.keys() <= old[name].keys()
+        else value
+        for name, value in changed.items()
+    }
+    return {**old, **inner}
