@@ -67,7 +67,8 @@ $(VENV)/.installed-web: $(VENV)/.installed
 
 # q2r2 export lerobot with the package that it needs, and what lerobot finds of ours. That takes some gigabytes, so it
 # has an environment of its own, all in one call of pip, which chooses the torch and torchvision that lerobot allows.
-# lerobot 0.6 needs Python 3.12. With 3.11 there is lerobot 0.4.4, without our robot and teleoperator.
+# lerobot 0.5 and 0.6 need Python 3.12; with 3.11 there is 0.4.4. An older one beside the newest:
+# make test-lerobot LEROBOT=.venv-lerobot-0.5 LEROBOT_VERSION='<0.6'
 LEROBOT := .venv-lerobot
 LEROBOT_PYTHON ?= $(shell python3.12 -c '' 2> /dev/null && echo python3.12 || echo $(PYTHON))
 LEROBOT_VERSION ?= <0.7
@@ -86,8 +87,7 @@ $(LEROBOT)/.installed: pyproject.toml setup.py $(wildcard plugins/*/pyproject.to
 	$(LEROBOT_PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
 	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' 'lerobot$(LEROBOT_VERSION)' \
-		'pytest>=8' 'hypothesis>=6.100' \
-		$$($(LEROBOT)/bin/python -c 'import sys; print(sys.version_info >= (3, 12) and "$(LEROBOT_PLUGINS)" or "")')
+		'pytest>=8' 'hypothesis>=6.100' $(LEROBOT_PLUGINS)
 	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # its loader needs torch, which is there
 	touch $@
 
