@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak test-lerobot test-learning test-web chromium lint bench docs picture page-picture soak wheel release-check clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot test-lerobot test-learning test-web chromium lint bench docs picture page-picture soak wheel release-check clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -75,7 +75,9 @@ LEROBOT_VERSION ?= <0.7
 LEROBOT_PLUGINS := $(addprefix --editable plugins/,lerobot_robot_q2r2 lerobot_teleoperator_q2r2)
 IN_LEROBOT := HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/python
 
-test-lerobot: $(LEROBOT)/.installed
+lerobot: $(LEROBOT)/.installed
+
+test-lerobot: lerobot
 	$(IN_LEROBOT) -m pytest tests/lerobot
 
 # From scripted hands to a trained policy that grasps: some ten minutes where nothing else runs.
