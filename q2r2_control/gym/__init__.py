@@ -28,7 +28,7 @@ def make_env(
 ) -> AsyncVectorEnv | SyncVectorEnv:
     """``n_envs`` environments of a task, each in a process of its own where ``use_async_envs``.
 
-    ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`. ``cfg`` is what EnvHub of lerobot tells besides,
+    ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`. ``cfg`` is what lerobot's EnvHub tells besides,
     of which nothing is used.
     """
     made = [partial(gymnasium.make, f"{__name__}:q2r2/{task.capitalize()}-v0", **options)] * n_envs

@@ -30,6 +30,7 @@ from q2r2_control.recording.tick_rows import Rows
 from q2r2_control.types import Array
 from tests.lerobot import hands
 from tests.recording.runs import ROOT
+from tests.support.modules import blocks_of
 
 FPS = 25  # a whole number of ticks a frame
 TAKEOVERS = 100
@@ -227,6 +228,15 @@ def test_rollout_lets_a_policy_act_that_was_trained_on_an_export(seen: Path, tra
         options += [*dataset_options(seen, "eval_round"), "--dataset.num_episodes=1", "--dataset.episode_time_s=4"]
     run(command("lerobot-rollout" if ROLLS_OUT else "lerobot-record", seen, *options), seen)
     assert rows_of(seen)["arms"]["policy"].any(axis=0).all()
+
+
+@pytest.mark.skipif(not ROLLS_OUT, reason="lerobot has lerobot-rollout since 0.6")
+def test_the_commands_of_the_page_train_a_policy_and_let_it_act(tmp_path: Path) -> None:
+    (block,) = (block for block in blocks_of("docs/policies.md", "sh") if "cell.yaml --input scripted" in block)
+    (tmp_path / "config").symlink_to(ROOT / "config")
+    (tmp_path / ".venv-lerobot").symlink_to(sys.prefix)
+    run(["bash", "-e", "-c", block], tmp_path)
+    assert "cameras: {front:" in (tmp_path / "cell.yaml").read_text()
 
 
 @pytest.mark.skipif(not ROLLS_OUT, reason="lerobot has DAgger since 0.6")
