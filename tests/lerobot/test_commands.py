@@ -202,13 +202,15 @@ def test_a_dataset_that_record_makes_has_the_numbers_that_the_export_of_the_same
 
 
 def test_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) -> None:
+    rate = 500  # a slower loop follows a target less closely [Hz]
+    write_cell(folder, {"loop_rate_hz: 1000.0": f"loop_rate_hz: {rate}.0"})
     options = ("--dataset.repo_id=q2r2/circle", f"--dataset.root={exported}", "--dataset.episode=0")
     run(command("lerobot-replay", folder, *options, "--play_sounds=false"), folder)
     dataset = LeRobotDataset("q2r2/circle", root=exported)
     robot = cell_and_robot_of(recording_of(folder))[1]
     asked, rows = column(dataset, "action"), rows_of(folder)
     # A single action is reached a frame after the tick in which it came, which is the one after it was sent.
-    led = rows["reference_q"][100 // FPS + 1 :: 100 // FPS]
+    led = rows["reference_q"][rate // FPS + 1 :: rate // FPS]
     for arm in robot.arms:
         ways = [
             robot.tool_pose(np.float64(one[:14]), arm).actInv(robot.tool_pose(other, arm))
