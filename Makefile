@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak test-lerobot test-learning test-web chromium lint bench docs picture page-picture soak wheel release-check clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot test-lerobot test-learning test-web chromium lint bench docs picture page-picture soak wheel release-check clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -67,14 +67,17 @@ $(VENV)/.installed-web: $(VENV)/.installed
 
 # q2r2 export lerobot with the package that it needs, and what lerobot finds of ours. That takes some gigabytes, so it
 # has an environment of its own, all in one call of pip, which chooses the torch and torchvision that lerobot allows.
-# lerobot 0.6 needs Python 3.12. With 3.11 there is lerobot 0.4.4, without our robot and teleoperator.
+# lerobot 0.5 and 0.6 need Python 3.12; with 3.11 there is 0.4.4. An older one beside the newest:
+# make test-lerobot LEROBOT=.venv-lerobot-0.5 LEROBOT_VERSION='<0.6'
 LEROBOT := .venv-lerobot
 LEROBOT_PYTHON ?= $(shell python3.12 -c '' 2> /dev/null && echo python3.12 || echo $(PYTHON))
 LEROBOT_VERSION ?= <0.7
 LEROBOT_PLUGINS := $(addprefix --editable plugins/,lerobot_robot_q2r2 lerobot_teleoperator_q2r2)
 IN_LEROBOT := HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/python
 
-test-lerobot: $(LEROBOT)/.installed
+lerobot: $(LEROBOT)/.installed
+
+test-lerobot: lerobot
 	$(IN_LEROBOT) -m pytest tests/lerobot
 
 # From scripted hands to a trained policy that grasps: some ten minutes where nothing else runs.
@@ -86,8 +89,7 @@ $(LEROBOT)/.installed: pyproject.toml setup.py $(wildcard plugins/*/pyproject.to
 	$(LEROBOT_PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
 	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' 'lerobot$(LEROBOT_VERSION)' \
-		'pytest>=8' 'hypothesis>=6.100' \
-		$$($(LEROBOT)/bin/python -c 'import sys; print(sys.version_info >= (3, 12) and "$(LEROBOT_PLUGINS)" or "")')
+		'pytest>=8' 'hypothesis>=6.100' $(LEROBOT_PLUGINS)
 	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # its loader needs torch, which is there
 	touch $@
 

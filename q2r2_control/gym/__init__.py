@@ -24,11 +24,12 @@ for _task in TASKS:
 
 
 def make_env(
-    n_envs: int = 1, use_async_envs: bool = False, *, task: str = "stack", **options: Any
+    n_envs: int = 1, use_async_envs: bool = False, *, task: str = "stack", cfg: object = None, **options: Any
 ) -> AsyncVectorEnv | SyncVectorEnv:
     """``n_envs`` environments of a task, each in a process of its own where ``use_async_envs``.
 
-    ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`.
+    ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`. ``cfg`` is what lerobot's EnvHub tells besides,
+    of which nothing is used.
     """
     made = [partial(gymnasium.make, f"{__name__}:q2r2/{task.capitalize()}-v0", **options)] * n_envs
     # Spawned: a copy of this process would share its graphics with it.

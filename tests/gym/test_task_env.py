@@ -149,7 +149,7 @@ def test_the_example_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture
 
 @pytest.mark.slow
 def test_two_environments_run_in_processes_of_their_own() -> None:
-    envs = gym.make_env(2, use_async_envs=True, task="handover", cell=coarse())
+    envs = gym.make_env(n_envs=2, use_async_envs=True, cfg=object(), task="handover", cell=coarse())
     try:
         observed, infos = envs.reset(seed=[1, 2])
         assert observed["observation.state"].shape == (2, 16)

@@ -6,51 +6,84 @@ Run by ``make test-lerobot``, in an environment of its own.
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 pytest.importorskip("lerobot", reason="make test-lerobot installs it")
 pytest.importorskip("lerobot_robot_q2r2", reason="make test-lerobot installs it")
 
-from lerobot.robots import RobotConfig, make_robot_from_config
+from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
-from lerobot.utils.feature_utils import hw_to_dataset_features
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.export.lerobot import write_shard
 from tests.export.files import record_step
+from tests.plants.fri.conftest import free_ports
+from tests.recording.runs import ROOT
 
 register_third_party_plugins()
-MOVED, NEAR, PATIENCE = 0.02, 0.004, 60.0  # [rad], [rad] or of an opening, [s]
+MOVED, NEAR, TRIES = 0.02, 0.004, 1800  # [rad], [rad] or of an opening, of a thirtieth of a second each at least
+
+
+def made(folder: Path, **options: Any) -> Robot:
+    return make_robot_from_config(RobotConfig.get_choice_class("q2r2_cell")(calibration_dir=folder / "none", **options))
+
+
+def assert_follows(robot: Robot) -> None:
+    """One joint and one gripper go where actions ask for them, however long the machine takes."""
+    start = robot.get_observation()
+    moved = {"left_A1.pos": start["left_A1.pos"] + MOVED, "right_gripper.pos": 0.5}
+    goal = start | moved
+    for _ in range(TRIES):
+        robot.send_action(goal)
+        seen = robot.get_observation()
+        if all(abs(seen[name] - goal[name]) < NEAR for name in moved):
+            return
+        time.sleep(1.0 / 30.0)
+    pytest.fail(str({name: seen[name] for name in moved}))
 
 
 def test_a_cell_has_the_features_of_its_datasets_and_follows_actions(tmp_path: Path) -> None:
-    config = RobotConfig.get_choice_class("q2r2_cell")(calibration_dir=tmp_path / "none")
-    robot = make_robot_from_config(config)
+    robot = made(tmp_path)
     write_shard(make_episode(record_step(tmp_path / "recording", 0.3).file, FrameSampling()), tmp_path / "dataset")
     features = json.loads((tmp_path / "dataset/meta/info.json").read_text())["features"]
-    for prefix, given in (("observation", robot.observation_features), ("action", robot.action_features)):
-        for name, feature in hw_to_dataset_features(given, prefix).items():
-            assert features[name]["names"] == feature["names"]
-            assert features[name]["dtype"] == feature["dtype"]
+    for name, given in (("observation.state", robot.observation_features), ("action", robot.action_features)):
+        assert features[name]["names"] == list(given)
+        assert set(given.values()) == {float}
     with pytest.raises(DeviceNotConnectedError):
         robot.get_observation()
     robot.connect()
     try:
-        start = robot.get_observation()
-        moved = {"left_A1.pos": start["left_A1.pos"] + MOVED, "right_gripper.pos": 0.5}
-        goal, until = start | moved, time.monotonic() + PATIENCE
-        while time.monotonic() < until:
-            robot.send_action(goal)
-            seen = robot.get_observation()
-            if all(abs(seen[name] - goal[name]) < NEAR for name in moved):
-                break
-            time.sleep(1.0 / 30.0)
-        else:
-            pytest.fail(str({name: seen[name] for name in moved}))
+        assert_follows(robot)
     finally:
         robot.disconnect()
     assert not robot.is_connected
+
+
+def test_arms_behind_cabinets_follow_actions_as_simulated_ones_do(tmp_path: Path) -> None:
+    data = yaml.safe_load((ROOT / "config/dual_iiwa7_fri.yaml").read_text())
+    for arm, port in zip(("left", "right"), free_ports(2), strict=True):
+        data["fri"][arm]["port"] = port
+    file = tmp_path / "cell.yaml"
+    file.write_text(yaml.safe_dump(data))
+    robot = made(tmp_path, cell=str(file))
+    assert list(robot.observation_features) == list(made(tmp_path).observation_features)
+    cabinets = subprocess.Popen([sys.executable, "-m", "q2r2_control", "fri-cabinet", str(file)], cwd=ROOT)
+    try:
+        for _ in range(TRIES):  # until the cabinets are there
+            with suppress(DeviceNotConnectedError):
+                robot.connect()
+                break
+        assert_follows(robot)
+    finally:
+        robot.disconnect()
+        cabinets.terminate()
+        assert cabinets.wait() == 0

@@ -76,7 +76,7 @@ def test_an_input_a_plant_and_a_task_written_as_the_page_says_run_in_one_pipelin
     [
         ({"input": "joystick"}, "input 'joystick': allowed are broken, headset, policy, scripted, swing"),
         ({"input": "broken"}, "broken = my_package:Nothing"),
-        ({"plant": "gazebo"}, "plant 'gazebo': allowed are fri, kinematic, lagging, mujoco"),
+        ({"plant": "gazebo"}, "plant 'gazebo': allowed are fri, kinematic, lagging, mujoco, ros"),
         (
             {"teleop": {"bindings": {"grip": "carry"}}},
             "grip = carry: this input has no press_middle; allowed: device.pedal",

@@ -62,9 +62,10 @@ class Q2R2Cell(Robot):
         self._robot = CellRobot.from_config(cell)
         self._plant = make_plant(config.plant or cell.plant, self._robot, cell)
         self.cameras = cell.simulated_cameras if isinstance(self._plant, MujocoPlant) else {}
-        self._grippers = tuple(arm for arm in self._robot.arms if arm in self._plant.gripper_openings())
-        grippers = (f"{arm}_gripper" for arm in self._grippers)
-        self._names = (*action_names(self._robot, ActionSpace.JOINTS), *grippers)
+        joints = action_names(self._robot, ActionSpace.JOINTS)
+        self._measured = tuple(arm for arm in self._robot.arms if arm in self._plant.gripper_openings())
+        self._seen = (*joints, *(f"{arm}_gripper" for arm in self._measured))
+        self._names = (*joints, *(f"{arm}_gripper" for arm in self._robot.arms))  # of an action
         self.hands = HandsDoor()
         self._policy = PolicyInput(rate=config.rate, operator=self.hands)
         self.pipeline = Pipeline(cell, self._robot, self._policy, self._plant)
@@ -83,11 +84,11 @@ class Q2R2Cell(Robot):
     @property
     def observation_features(self) -> dict[str, Any]:
         shapes = {name: (camera.height, camera.width, 3) for name, camera in self.cameras.items()}
-        return self.action_features | shapes
+        return _features(self._seen) | shapes
 
     @property
     def action_features(self) -> dict[str, Any]:
-        return {f"{name}{POSITION}": float for name in self._names}
+        return _features(self._names)
 
     @property
     def is_connected(self) -> bool:
@@ -146,16 +147,15 @@ class Q2R2Cell(Robot):
 
     def get_observation(self) -> dict[str, Any]:
         tick = self._check()
-        seen = self._named((*tick.state.q, *tick.openings.values()))
+        # A gripper that was not heard of for a while is taken to be where it was sent.
+        openings = [tick.openings.get(arm, tick.command.grippers[arm]) for arm in self._measured]
+        seen = _named(self._seen, (*tick.state.q, *openings))
         if self.cameras:
             assert isinstance(self._plant, MujocoPlant)
             self._pictures = self._pictures or CellPictures(self._plant.model, self.cameras)
             self._pictures.place(self._plant.observed_qpos)
             seen |= {name: self._pictures.take(name) for name in self.cameras}
         return seen
-
-    def _named(self, values: tuple[float, ...]) -> dict[str, Any]:
-        return dict(zip(self.action_features, map(float, values), strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """An action that is not the hands' own is the policy's, which takes the arms from them."""
@@ -181,7 +181,7 @@ class Q2R2Cell(Robot):
         """The reference, which the hands drive until an action comes that is not theirs."""
         tick = self._check()
         self._asked = self.hands.open = True
-        return self._named((*tick.reference.q, *(tick.command.grippers[arm] for arm in self._grippers)))
+        return _named(self._names, (*tick.reference.q, *map(tick.command.grippers.__getitem__, self._robot.arms)))
 
     def disconnect(self) -> None:
         if self._tick is None:
@@ -193,6 +193,14 @@ class Q2R2Cell(Robot):
         self.pipeline.end()
         self._recording.close()
         self._tick = None
+
+
+def _features(names: tuple[str, ...]) -> dict[str, Any]:
+    return {f"{name}{POSITION}": float for name in names}
+
+
+def _named(names: tuple[str, ...], values: tuple[float, ...]) -> dict[str, Any]:
+    return {f"{name}{POSITION}": float(value) for name, value in zip(names, values, strict=True)}
 
 
 def _allowed(config: Q2R2CellConfig) -> Config:

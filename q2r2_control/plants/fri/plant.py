@@ -148,6 +148,10 @@ class FriPlant:
         return self.cell.state()
 
     def gripper_openings(self) -> dict[str, float]:
+        """See :meth:`Plant.gripper_openings`. Before a run those that are going to be measured are open."""
+        if self._answering is None:
+            its = {arm: cabinet.gripper for arm, cabinet in self._cabinets.items()}
+            return {arm: 1.0 for arm, one in its.items() if one is not None and getattr(one, "input", True) is not None}
         by_modbus = {arm: gripper.opening for arm, gripper in self.grippers.items()}
         known = {arm: opening for arm, opening in by_modbus.items() if opening is not None}
         return {**self.cell.openings(), **known}

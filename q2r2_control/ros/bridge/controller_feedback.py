@@ -30,8 +30,8 @@ from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import LATCHED_QOS, RECORDED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers
 from q2r2_control.ros.bridge.gripper_client import wanted_topic
-from q2r2_control.ros.bridge.intakes import TargetIntake
-from q2r2_control.ros.bridge.messages import order_of, stamped_pose, time_message
+from q2r2_control.ros.bridge.intakes import Fingers, TargetIntake
+from q2r2_control.ros.bridge.messages import stamped_pose, time_message
 from q2r2_control.ros.monitoring import publish_in_time
 from q2r2_control.types import Array, Reference, RobotState, StepStatus
 
@@ -132,16 +132,12 @@ class GripperLimits:
         """``targets``: topic of the targets of each arm whose gripper may ask."""
         self._node, self._loop, self._began = node, loop, time.monotonic()
         robot = loop.controller.robot
-        self._grippers = {
-            str(arm): (robot.arms[arm].finger_joints, each.gripper.closed_position, each.gripper.open_position)
-            for arm, each in config.arms.items()
-            if robot.arms[arm].stroke > 0.0
-        }
+        self._fingers = Fingers(robot, config)
         self._measured: dict[str, tuple[float, float]] = {}  # arm -> opening, and when it was measured [s]
         self.wanted: dict[str, float] = {}  # arm -> opening, 0 closed .. 1 fully open
         self._answered: dict[str, tuple[float, float]] = {}
         self._answers: dict[str, Any] = {}
-        for arm in (arm for arm in targets if arm in self._grippers or arm in robot.objects.by_arm):
+        for arm in (arm for arm in targets if arm in self._fingers.arms or arm in robot.objects.by_arm):
             self._answers[arm] = node.create_publisher(Float64MultiArray, f"~/opening/{arm}", LATCHED_QOS)
             topic = wanted_topic(targets[arm])
             node.create_subscription(Float64MultiArray, topic, partial(self._on_wanted, arm, topic), LATCHED_QOS)
@@ -156,12 +152,9 @@ class GripperLimits:
 
     def take_joint_state(self, message: JointState) -> None:
         """Note what a message says of fingers; what it says of other joints is not looked at."""
-        if not self._answers or len(message.position) != len(message.name):
-            return
-        for arm, (joints, closed, opened) in self._grippers.items():
-            if not isinstance(order := order_of(tuple(message.name), tuple(joints)), str):
-                position = sum(message.position[place] for place in order) / len(joints)
-                self._measured[arm] = (position - closed) / (opened - closed), self._node.now
+        if self._answers:
+            now = self._node.now
+            self._measured |= {arm: (opening, now) for arm, opening in self._fingers.openings(message).items()}
 
     def openings(self, now: float) -> dict[str, float]:
         """Of the arms whose fingers were measured just now, 0 closed .. 1 fully open; a little beyond is possible."""

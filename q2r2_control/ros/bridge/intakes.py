@@ -14,6 +14,7 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Empty
 
+from q2r2_control.config.cell import Config
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
@@ -27,6 +28,7 @@ from q2r2_control.ros.bridge.messages import (
     delay,
     ended_topic,
     nanoseconds,
+    order_of,
     pose_of,
     robot_state,
 )
@@ -237,3 +239,30 @@ class JointIntake:
             self.take_external(torques)
         else:
             self._node.drop(self._external_topic, f"{list(message.effort)!s:.60}")
+
+
+class Fingers:
+    """The joints of the grippers of a cell, among joint states."""
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        self._grippers = {
+            str(arm): (tuple(robot.arms[arm].finger_joints), each.gripper.closed_position, each.gripper.open_position)
+            for arm, each in config.arms.items()
+            if robot.arms[arm].stroke > 0.0
+        }
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Those with a gripper."""
+        return tuple(self._grippers)
+
+    def openings(self, message: JointState) -> dict[str, float]:
+        """Of the arms whose fingers are in the message, 0 closed .. 1 fully open; a little beyond is possible."""
+        found: dict[str, float] = {}
+        if len(message.position) != len(message.name):
+            return found
+        for arm, (joints, closed, opened) in self._grippers.items():
+            if not isinstance(order := order_of(tuple(message.name), joints), str):
+                position = sum(message.position[place] for place in order) / len(joints)
+                found[arm] = (position - closed) / (opened - closed)
+        return found

@@ -1,0 +1,168 @@
+"""``--plant ros``: a robot behind ROS 2, whose joint states come in and whose setpoints go out, for a loop elsewhere.
+
+The loop takes the place of ``cartesian_controller``, with the usual topics: ``joint_states``, ``joint_trajectory`` and
+the actions of the grippers. It begins only where nobody else commands the arms.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+
+import numpy as np
+import rclpy
+from rclpy.context import Context
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from q2r2_control.config.cell import Config
+from q2r2_control.config.external import GripperSettings
+from q2r2_control.config.strict import STREAM_TIMEOUT
+from q2r2_control.errors import PlantError
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.plants.base import check_command
+from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.base_node import BaseNode
+from q2r2_control.ros.bridge.gripper_client import GripperClient
+from q2r2_control.ros.bridge.intakes import Fingers, JointIntake
+from q2r2_control.ros.bridge.joint_outputs import TrajectoryOutput
+from q2r2_control.ros.executor import TickExecutor
+from q2r2_control.ros.launch.middleware import set_up_middleware
+from q2r2_control.ros.monitoring import CommandWatch, WatchedPublisher
+from q2r2_control.types import Array, Command, CommandMode, RobotState
+from q2r2_control.wording import sentence
+
+_WAIT = 5.0  # for joint states and for whatever takes the commands [s]
+_QUIET = 0.3  # nobody else commands the arms for so long before [s]
+_AWAY = 0.02  # from the measured joints: to a receiver that is new such a command is a jump [rad]
+
+
+class _PlantNode(BaseNode):
+    ticks = True  # its messages are taken when the loop ticks
+
+
+class RosPlant:
+    """The arms start where they stand. Joint states that cease or are bad, and a new receiver, let them rest."""
+
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
+    realtime_only = True
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        self._robot, self._period = robot, 1.0 / config.loop_rate_hz
+        self._fingers, self._kind = Fingers(robot, config), TrajectoryOutput(self._period, robot)
+        self._openings = dict.fromkeys(self._fingers.arms, 1.0)  # none is measured before a run
+        self._context: Context | None = None
+
+    @classmethod
+    def from_config(cls, robot: Robot, config: Config) -> RosPlant:
+        return cls(robot, config)
+
+    def begin(self, mode: CommandMode) -> None:
+        """Commands of this ``mode`` are to come after the next :meth:`reset`; there is one."""
+
+    def reset(self, q: Array | None = None) -> None:
+        """Hear the robot. Raises :class:`PlantError` where it is not there, others command it, or for ``q``."""
+        if q is not None:
+            raise PlantError("reset q: a real arm starts where it stands")
+        self.close()
+        set_up_middleware(os.environ)
+        self._context = Context()
+        rclpy.init(args=[], context=self._context)
+        self._node = node = _PlantNode("q2r2_plant", context=self._context)
+        self._executor = TickExecutor(context=self._context)
+        self._executor.add_node(node)
+        self._publisher = WatchedPublisher(node, JointTrajectory, TrajectoryOutput.topic, STREAM_TIMEOUT)
+        self._grippers = {
+            arm: GripperClient(node, f"/q2r2/{arm}_gripper/gripper_cmd", GripperSettings())
+            for arm in self._fingers.arms
+        }
+        self._openings = {}
+        self._joints = JointIntake(node, self._robot)
+        self._bad: Reason | None = None  # what is wrong with the newest joint states
+        self._fault: Reason | None = None  # why nothing is commanded
+        self._joints.subscribe(self._take_state, self._take_fingers)
+        self._last = -math.inf  # tick [s]
+        self._command: Command | None = None  # the newest one
+        self._begins = True  # the next command has to be where the arms are
+        others = CommandWatch(node, JointTrajectory, [self._publisher.topic_name])
+        others.begin()
+        began = time.monotonic()
+        while (waits := time.monotonic() - began) < _WAIT:
+            self._executor.spin_once(timeout_sec=0.01)
+            if waits > _QUIET and self._joints.state is not None and self._publisher.listeners:
+                break
+        others.end()
+        if problem := others.commander(_WAIT) or self._problem():
+            self.close()
+            raise PlantError(sentence(problem))
+        self._listeners = self._publisher.listeners
+
+    def _problem(self) -> Reason | None:
+        if self._joints.state is None:
+            return self._bad or Reason.of(ReasonKind.NO_STATES_YET, source="")
+        if not self._publisher.listeners:
+            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=self._publisher.topic_name)
+        return self._bad
+
+    def _take_state(self, state: RobotState | Reason, now: float) -> None:
+        self._bad = state if isinstance(state, Reason) else None
+
+    def _take_fingers(self, message: JointState) -> None:
+        self._openings |= self._fingers.openings(message)
+
+    def due(self, now: float) -> tuple[float, float]:
+        """See :meth:`SessionPlant.due`. After a late tick the reference goes on by two periods at most."""
+        self._executor.spin_once(timeout_sec=0.0)
+        gap, self._last = now - self._last, now
+        before, self._listeners = self._listeners, self._publisher.listeners
+        new = self._listeners > before and self._command is not None and self._is_away(self._command)
+        self._fault = Reason(ReasonKind.NEW_RECEIVER) if new else self._problem()
+        return 0.0, min(gap, 2.0 * self._period)
+
+    def _is_away(self, command: Command) -> bool:
+        return bool(np.abs(self.state().q - command.q).max() > _AWAY)
+
+    def withdraws(self) -> bool:
+        return False
+
+    def delay(self) -> float:
+        """Drivers do not tell it."""
+        return 0.0
+
+    def fault(self) -> Reason | None:
+        return self._fault
+
+    def sessions(self) -> dict[str, str]:
+        return {}
+
+    def apply(self, command: Command) -> None:
+        check_command(command, self._robot, self.modes)
+        self._begins = self._fault is not None or (self._begins and self._is_away(command))
+        if self._begins:
+            return
+        decided, self._command = time.monotonic(), command
+        names, joints = list(self._robot.joint_names), np.arange(self._robot.model.nv)
+        self._publisher.publish(self._kind.encode(command, self.state(), decided, names, joints), decided)
+        for arm, gripper in self._grippers.items():
+            if arm in command.grippers:
+                gripper.move(float(command.grippers[arm]), decided)
+                gripper.check(decided)
+
+    def advance(self, dt: float) -> None:
+        """Time passes by itself."""
+
+    def state(self) -> RobotState:
+        state = self._joints.state
+        assert state is not None  # since reset
+        return state
+
+    def gripper_openings(self) -> dict[str, float]:
+        return dict(self._openings)
+
+    def close(self) -> None:
+        if self._context is not None:
+            self._executor.shutdown()
+            self._node.destroy_node()
+            self._context.try_shutdown()
+            self._context = None
