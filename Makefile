@@ -117,7 +117,7 @@ arena: $(ARENA)/.installed
 $(ARENA)/.installed: pyproject.toml setup.py
 	$(ARENA_PYTHON) -m venv $(ARENA)
 	$(ARENA)/bin/python -m pip install --quiet --upgrade pip
-	$(ARENA)/bin/python -m pip install --quiet 'robosuite==1.5.2' 'gym-aloha==0.1.5'
+	$(ARENA)/bin/python -m pip install --quiet 'robosuite==1.5.2'
 	$(ARENA)/bin/python -m pip install --quiet --editable '.[gym]'
 	touch $@
 

@@ -155,7 +155,10 @@ def _add_capsule(link: ET.Element, name: str, points: Array) -> None:
     _add_origin(collision, pose)
     size = {"radius": repr(float(capsule.radius)), "length": repr(float(2 * capsule.halfLength))}
     ET.SubElement(ET.SubElement(collision, "geometry"), "cylinder", size)
-    ET.SubElement(ET.SubElement(link, "collision_checking"), "capsule", name=name)
+    declared = link.find("collision_checking")  # one for all: readers know no second
+    if declared is None:
+        declared = ET.SubElement(link, "collision_checking")
+    ET.SubElement(declared, "capsule", name=name)
 
 
 def _add_origin(element: ET.Element, pose: pin.SE3) -> None:
