@@ -96,7 +96,7 @@ def backed(pose: pin.SE3, way: float) -> pin.SE3:
 
 @dataclass
 class Judge:
-    """What MuJoCo did with the arms of one episode."""
+    """Counts for one episode of contacts, distances and broken limits, in MuJoCo."""
 
     model: mujoco.MjModel
     arms: Mapping[str, ArmModel]

@@ -24,14 +24,14 @@ OURS, OSC = "q2r2", "OSC_POSE"
 CONTROLLERS = (OURS, OSC)
 PERIOD = 0.05  # of the hands, and of the stock controllers' actions, robosuite's own [s]
 _TICKS = 5  # of ours, each a command to robosuite's joint position controller
-_SETTINGS = ControllerSettings(min_distance=0.01)
+_SETTINGS = ControllerSettings(min_distance=0.003)
 # Stiff enough to follow the reference: a step is answered in 1/60 s, critically damped.
 _JOINTS = {"type": "JOINT_POSITION", "input_type": "absolute", "kp": 3600, "damping_ratio": 1, "interpolation": None}
 _JOINTS |= {"input_max": 7, "input_min": -7, "output_max": 7, "output_min": -7, "ramp_ratio": 0.2}
 _MEETING = np.array([0.0, -0.15, 1.12])  # of the hammer with the right hand [m]
 _NEAREST = -0.5  # y of a grasp of the left hand [m]
 _LEAN = 0.9  # of the right hand towards its own base [rad]
-_OPENINGS = (0.0, 0.33, 0.67, 1.0)
+_OPENINGS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
 
@@ -114,7 +114,7 @@ class RobosuiteCell:
         return np.clip(np.concatenate([base.T @ way / 0.05, base.T @ turn / 0.5]), -1.0, 1.0)
 
     def asks(self) -> Iterator[Ask]:
-        """What the hands ask for; poses are read off the simulation when they are due."""
+        """All that the hands ask for; poses are read off the simulation when they are due."""
         return self._lift() if self._task == "TwoArmLift" else self._handover()
 
     def _lift(self) -> Iterator[Ask]:
