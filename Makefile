@@ -106,7 +106,7 @@ $(VENV)/.installed-bench: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[bench]' && touch $@ || true
 
 # Public environments with two arms. robosuite pins mink 0.0.5 for other robots, which admits no numpy that pinocchio 4
-# runs on, and imports it only if it can: the second call of pip says so and goes on.
+# runs on, and imports it only if it can: the second call of pip says so and goes on. It calls MuJoCo as before 3.10.
 ARENA := .venv-arena
 ARENA_PYTHON ?= $(PYTHON)
 
@@ -117,7 +117,7 @@ arena: $(ARENA)/.installed
 $(ARENA)/.installed: pyproject.toml setup.py
 	$(ARENA_PYTHON) -m venv $(ARENA)
 	$(ARENA)/bin/python -m pip install --quiet --upgrade pip
-	$(ARENA)/bin/python -m pip install --quiet 'robosuite==1.5.2'
+	$(ARENA)/bin/python -m pip install --quiet 'robosuite==1.5.2' 'mujoco<3.10'
 	$(ARENA)/bin/python -m pip install --quiet --editable '.[gym]'
 	touch $@
 
