@@ -23,7 +23,7 @@ _ROUNDING = 1e-3  # of a limit, that counts as kept
 
 @dataclass(frozen=True)
 class Ask:
-    """What the hands ask for until the tools are there: poses in the world, and which grippers are closed."""
+    """Poses in the world, and which grippers are closed: the hands ask for that until the tools are there."""
 
     tools: Mapping[str, pin.SE3]  # arms left out stay where they were asked to be
     closed: tuple[str, ...] = ()

@@ -31,7 +31,6 @@ class ArmModel:
     joints: tuple[str, ...]  # hinges
     velocity_limit: Array  # of each joint [rad/s]
     tool: str  # site that is moved
-    mount: str | None = None  # body that the base stands on, where that is no part of the base
 
 
 def robot_of(model: mujoco.MjModel, arms: Mapping[str, ArmModel], closing: Sequence[Array]) -> Robot:
@@ -61,8 +60,8 @@ def bodies_of(model: mujoco.MjModel, base: str) -> list[int]:
 
 
 def geoms_of(model: mujoco.MjModel, arm: ArmModel) -> list[int]:
-    """Shapes of an arm and its mount that something can touch."""
-    bodies = {body for base in (arm.base, arm.mount) if base is not None for body in bodies_of(model, base)}
+    """Shapes of an arm, its mount included, that something can touch."""
+    bodies = bodies_of(model, arm.base)
     solid = (model.geom_contype | model.geom_conaffinity) > 0
     return [geom for geom in range(model.ngeom) if solid[geom] and model.geom_bodyid[geom] in bodies]
 
