@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot test-lerobot test-learning test-web chromium lint bench docs picture page-picture soak wheel release-check clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot test-lerobot test-learning test-web chromium lint bench docs picture page-picture soak wheel release-check arena clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -107,6 +107,22 @@ bench: $(VENV)/.installed-bench
 $(VENV)/.installed-bench: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[bench]' && touch $@ || true
 
+# Public environments with two arms. robosuite pins mink 0.0.5 for other robots, which admits no numpy that pinocchio 4
+# runs on, and imports it only if it can: the second call of pip says so and goes on. It calls MuJoCo as before 3.10.
+ARENA := .venv-arena
+ARENA_PYTHON ?= $(PYTHON)
+
+arena: $(ARENA)/.installed
+	$(ARENA)/bin/python benchmarks/gym_steps.py
+	$(ARENA)/bin/python benchmarks/arena.py
+
+$(ARENA)/.installed: pyproject.toml setup.py
+	$(ARENA_PYTHON) -m venv $(ARENA)
+	$(ARENA)/bin/python -m pip install --quiet --upgrade pip
+	$(ARENA)/bin/python -m pip install --quiet 'robosuite==1.5.2' 'mujoco<3.10'
+	$(ARENA)/bin/python -m pip install --quiet --editable '.[gym]'
+	touch $@
+
 # Pages under build/site, with the API's own docstrings.
 docs: setup
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'
@@ -145,4 +161,4 @@ soak: setup
 	$(BIN)/q2r2 soak
 
 clean:
-	rm -rf $(VENV) $(LEROBOT) $(FRESH) build dist install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(LEROBOT) $(ARENA) $(FRESH) build dist install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

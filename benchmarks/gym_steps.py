@@ -1,7 +1,6 @@
 """Steps per second of our environments, and of robosuite's two-arm environments with the same arms, in one run.
 
-    pip install robosuite "mujoco<3.4"  # in an environment of its own: it wants an older numpy and MuJoCo
-    python benchmarks/gym_steps.py
+    make arena  # an environment of its own with robosuite, where it runs this
 
 An environment is stepped by one process, with random actions and without pictures.
 """
@@ -38,8 +37,8 @@ def of_ours() -> Iterator[Environment]:
 def of_robosuite() -> Iterator[Environment]:
     try:
         import robosuite
-    except ImportError:
-        print("robosuite is not installed: without it", file=sys.stderr)
+    except ImportError as error:
+        print(f"robosuite is left out: {error}", file=sys.stderr)
         return
     for name in ("TwoArmLift", "TwoArmHandover"):
         env = robosuite.make(

@@ -14,7 +14,10 @@ import pytest
 from tests.support.modules import ROOT, load_script
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
-SHARED = ("ros_processes.py", "work_hands.py")
+SHARED = (
+    *("arena_hands.py", "arena_robosuite.py", "arena_robot.py"),
+    *("ros_processes.py", "work_hands.py"),
+)
 SCRIPTS = sorted(file.name for file in FOLDER.glob("*.py") if file.name not in SHARED)
 
 

@@ -198,9 +198,9 @@ class MujocoPlant:
 
         Damping is for each joint's effective inertia at home, 1 / (M^-1)_ii: what it feels while the others give way.
         """
-        inertia = np.zeros((self.model.nv, self.model.nv))
-        mujoco.mj_fullM(self.model, self.data, inertia)
-        effective = 1 / np.diag(np.linalg.inv(inertia))[self._v_index]
+        inverse = np.empty((self.model.nv, self.model.nv))
+        mujoco.mj_solveM(self.model, self.data, inverse, np.eye(self.model.nv))
+        effective = 1 / np.diag(inverse)[self._v_index]
         armature, dt = self.model.dof_armature[self._v_index], self._timestep
         stiffness = np.minimum(config.mujoco.position_stiffness, _MAX_STIFFNESS_STEP * armature / dt**2)
         damping = 2 * config.mujoco.position_damping_ratio * np.sqrt(stiffness * effective)

@@ -1,0 +1,164 @@
+"""Scripted hands of the arena, and what counts there: by MuJoCo, whichever controller moves the arms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import coal
+import mujoco
+import numpy as np
+import pinocchio as pin
+
+from arena_robot import ArmModel, corners_of, geoms_of
+from q2r2_control.types import Array
+
+SPEED, TURN = 0.3, 1.5  # of the targets [m/s], [rad/s]
+NEAR = 0.01  # a tool has arrived this near its target [m] ...
+PATIENCE = 0.5  # ... or its target waits no longer for it [s]
+_LOOKED_FAR = 0.05  # nearest distances between arms are measured below this [m]
+_EACH = 20  # physics steps between two of these measurements
+_ROUNDING = 1e-3  # of a limit, that counts as kept
+
+
+@dataclass(frozen=True)
+class Ask:
+    """Poses in the world, and which grippers are closed: the hands ask for that until the tools are there."""
+
+    tools: Mapping[str, pin.SE3]  # arms left out stay where they were asked to be
+    closed: tuple[str, ...] = ()
+    pause: float = 0.0  # after arrival [s]
+
+
+class ScriptedHands:
+    """Targets that go from one thing asked for to the next at :data:`SPEED`, in straight lines.
+
+    ``asks`` are drawn when they are due, by whoever reads there what is true in the simulation at that time.
+    """
+
+    def __init__(self, asks: Iterator[Ask], tools: Mapping[str, pin.SE3]) -> None:
+        self._asks = asks
+        self.targets = dict(tools)
+        self._ask: Ask | None = next(asks)
+        self._waited = self._paused = 0.0
+
+    @property
+    def done(self) -> bool:
+        return self._ask is None
+
+    @property
+    def closed(self) -> tuple[str, ...]:
+        return () if self._ask is None else self._ask.closed
+
+    def advance(self, tools: Mapping[str, pin.SE3], dt: float) -> None:
+        """The next targets, ``dt`` [s] later; the ``tools`` are where the simulation has them."""
+        if self._ask is None:
+            return
+        goals = {arm: self._ask.tools.get(arm, target) for arm, target in self.targets.items()}
+        if all(_moved(self.targets[arm], goals[arm], dt) == 1.0 for arm in goals):
+            off = max(float(np.linalg.norm(goals[arm].translation - tools[arm].translation)) for arm in goals)
+            self._waited += dt
+            if off < NEAR or self._waited > PATIENCE:
+                self._paused += dt
+            if self._paused > self._ask.pause:
+                self._ask, self._waited, self._paused = next(self._asks, None), 0.0, 0.0
+        for arm, goal in goals.items():
+            share = _moved(self.targets[arm], goal, dt)
+            self.targets[arm] = goal if share == 1.0 else pin.SE3.Interpolate(self.targets[arm], goal, share)
+
+
+def _moved(start: pin.SE3, goal: pin.SE3, dt: float) -> float:
+    """Which share of the way to ``goal`` a target goes in ``dt``."""
+    difference = start.actInv(goal)
+    time = max(
+        float(np.linalg.norm(difference.translation)) / SPEED,
+        float(np.linalg.norm(pin.log3(difference.rotation))) / TURN,
+    )
+    return min(1.0, dt / max(time, 1e-9))
+
+
+def looking_down(closing: Array, lean: float = 0.0) -> Array:
+    """A tool's rotation (3, 3): z down, x in the horizontal direction ``closing``, turned about that by ``lean``."""
+    x = np.array([closing[0], closing[1], 0.0]) / np.hypot(closing[0], closing[1])
+    z = np.array([0.0, 0.0, -1.0])
+    return pin.exp3(lean * x) @ np.column_stack([x, np.cross(z, x), z])
+
+
+def shifted(pose: pin.SE3, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> pin.SE3:
+    """A pose moved along the world's axes [m]."""
+    return pin.SE3(pose.rotation, pose.translation + np.array([x, y, z]))
+
+
+def backed(pose: pin.SE3, way: float) -> pin.SE3:
+    """A pose from which the hand goes ``way`` [m] ahead, along its z, to ``pose``."""
+    return pose * pin.SE3(np.eye(3), np.array([0.0, 0.0, -way]))
+
+
+@dataclass
+class Judge:
+    """Counts for one episode of contacts, distances and broken limits, in MuJoCo."""
+
+    model: mujoco.MjModel
+    arms: Mapping[str, ArmModel]
+    contacts: int = 0  # begun between geoms of both arms
+    nearest: float = _LOOKED_FAR  # distance of both arms, at most that [m]
+    beyond_position: float = 0.0  # [rad]
+    velocity_ratio: float = 0.0  # of a joint's velocity to its limit
+    _touching: bool = field(default=False, init=False)
+    _looks: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        sides = np.zeros(self.model.ngeom, dtype=np.int64)
+        first, second = (geoms_of(self.model, arm) for arm in self.arms.values())
+        sides[first], sides[second] = 1, -1
+        self._sides = sides
+        self._pairs = np.array([(a, b) for a in first for b in second])
+        self._reach = self.model.geom_rbound[self._pairs].sum(axis=1)
+        self._hulls = {geom: _hull(corners_of(self.model, geom)) for geom in [*first, *second]}
+        joints = [self.model.joint(name) for arm in self.arms.values() for name in arm.joints]
+        self._q = [int(joint.qposadr[0]) for joint in joints]
+        self._v = [int(joint.dofadr[0]) for joint in joints]
+        self._lower, self._upper = np.array([joint.range for joint in joints]).T
+        self._velocity = np.concatenate([arm.velocity_limit for arm in self.arms.values()])
+
+    def look(self, data: mujoco.MjData) -> None:
+        """Take a step of the physics into account."""
+        sides = self._sides[data.contact.geom[: data.ncon]]
+        touching = bool((sides[:, 0] * sides[:, 1] < 0).any())
+        self.contacts += touching and not self._touching
+        self._touching = touching
+        q, v = data.qpos[self._q], data.qvel[self._v]
+        self.beyond_position = max(self.beyond_position, float(np.maximum(self._lower - q, q - self._upper).max()))
+        self.velocity_ratio = max(self.velocity_ratio, float((np.abs(v) / self._velocity).max()))
+        if self._looks % _EACH == 0:
+            self._measure(data)
+        self._looks += 1
+
+    def _measure(self, data: mujoco.MjData) -> None:
+        """Coal's distances of what MuJoCo has placed; those of MuJoCo 3.8 are 0 for some boxes that are far apart."""
+        apart = np.linalg.norm(np.subtract(*data.geom_xpos[self._pairs.T]), axis=1) - self._reach
+        for pair in np.argsort(apart):
+            if apart[pair] >= self.nearest:
+                break
+            shapes: list[object] = []
+            for geom in self._pairs[pair].tolist():
+                pose = coal.Transform3s(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom])
+                shapes += [self._hulls[geom], pose]
+            self.nearest = min(self.nearest, coal.distance(*shapes, coal.DistanceRequest(), coal.DistanceResult()))
+
+    @property
+    def breaks_position(self) -> bool:
+        return self.beyond_position > _ROUNDING
+
+    @property
+    def breaks_velocity(self) -> bool:
+        return self.velocity_ratio > 1.0 + _ROUNDING
+
+
+def _hull(points: Array) -> coal.ConvexBase:
+    mesh = coal.BVHModelOBBRSS()
+    mesh.beginModel(0, 0)
+    mesh.addVertices(points)
+    mesh.endModel()
+    mesh.buildConvexHull(True, "Qt")
+    return mesh.convex

@@ -1,0 +1,193 @@
+"""robosuite's two-arm tasks with its own IIWA, for the arena."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Iterator, Mapping
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import robosuite
+
+from arena_hands import Ask, Judge, backed, looking_down, shifted
+from arena_robot import ArmModel, robot_of, tool_pose
+from q2r2_control.config.cell import load_config
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+TASKS = ("TwoArmLift", "TwoArmHandover")
+OURS, OSC = "q2r2", "OSC_POSE"
+CONTROLLERS = (OURS, OSC)
+PERIOD = 0.05  # of the hands, and of the stock controllers' actions, robosuite's own [s]
+_TICKS = 5  # of ours, each a command to robosuite's joint position controller
+_SETTINGS = ControllerSettings(min_distance=0.003)
+# Stiff enough to follow the reference: a step is answered in 1/60 s, critically damped.
+_JOINTS = {"type": "JOINT_POSITION", "input_type": "absolute", "kp": 3600, "damping_ratio": 1, "interpolation": None}
+_JOINTS |= {"input_max": 7, "input_min": -7, "output_max": 7, "output_min": -7, "ramp_ratio": 0.2}
+_MEETING = np.array([0.0, -0.15, 1.12])  # of the hammer with the right hand [m]
+_NEAREST = -0.5  # y of a grasp of the left hand [m]
+_LEAN = 0.9  # of the right hand towards its own base [rad]
+_OPENINGS = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
+
+
+class RobosuiteCell:
+    """One of the tasks with one of the controllers, an episode at a time."""
+
+    PERIOD = PERIOD
+
+    def __init__(self, task: str, controller: str) -> None:
+        self._task, self._kind = task, controller
+        self._follower: CartesianController | None = None
+        # KUKA's, of which robosuite's model says nothing.
+        limits = Robot.from_config(load_config("config/iiwa7.yaml")).velocity_limit
+        self.arms = {side: _arm_model(number, limits) for number, side in enumerate(("left", "right"))}
+
+    def reset(self, seed: int) -> None:
+        """Begin another episode."""
+        config = robosuite.load_composite_controller_config(robot="IIWA")
+        if self._kind == OURS:
+            config["body_parts"]["right"] = {**_JOINTS, "gripper": config["body_parts"]["right"]["gripper"]}
+        self._env = robosuite.make(
+            self._task,
+            robots=["IIWA", "IIWA"],
+            controller_configs=[config, copy.deepcopy(config)],
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            use_camera_obs=False,
+            use_object_obs=False,
+            control_freq=round((_TICKS if self._kind == OURS else 1) / PERIOD),
+            ignore_done=True,
+            seed=seed,
+        )
+        self._env.sim.forward()  # for what was placed last
+        self.model, self._data = self._env.sim.model._model, self._env.sim.data._data
+        self.judge = Judge(self.model, self.arms)
+        step = self._env.sim.step2
+
+        def watched() -> None:
+            step()
+            self.judge.look(self._data)
+
+        self._env.sim.step2 = watched
+        if self._kind == OURS:
+            if self._follower is None:
+                robot = robot_of(self.model, self.arms, _closing(self.model, self._data.qpos, self.arms))
+                self._follower = CartesianController(robot, _SETTINGS)
+            names = self._follower.robot.joint_names
+            self._follower.reset(np.array([self._data.joint(name).qpos[0] for name in names]))
+
+    def tools(self) -> dict[str, pin.SE3]:
+        return {side: tool_pose(self._data, arm) for side, arm in self.arms.items()}
+
+    def succeeded(self) -> bool:
+        """By the environment's own judge."""
+        return bool(self._env._check_success())
+
+    def step(self, before: Mapping[str, pin.SE3], targets: Mapping[str, pin.SE3], closed: tuple[str, ...]) -> None:
+        """One period, in which the hands go from ``before`` to ``targets``."""
+        grip = {side: 1.0 if side in closed else -1.0 for side in self.arms}
+        if self._follower is None:
+            tools = self.tools()
+            action = [np.append(self._delta(side, tools[side], targets[side]), grip[side]) for side in self.arms]
+            self._env.step(np.concatenate(action))
+            return
+        for tick in range(_TICKS):
+            share = (tick + 1) / _TICKS
+            on_the_way = {side: pin.SE3.Interpolate(before[side], targets[side], share) for side in self.arms}
+            q = self._follower.step(on_the_way, PERIOD / _TICKS).q
+            # The gripper moves by each action that has a sign: as far as with the others in a period.
+            action = [
+                np.append(q[self._follower.robot.arms[side].joints], grip[side] * (tick == 0)) for side in self.arms
+            ]
+            self._env.step(np.concatenate(action))
+
+    def _delta(self, side: str, tool: pin.SE3, target: pin.SE3) -> Array:
+        """The action that asks for ``target``: of OSC in the arm's base and in shares of its largest step."""
+        way, turn = target.translation - tool.translation, pin.log3(target.rotation @ tool.rotation.T)
+        base = self._env.robots[list(self.arms).index(side)].base_ori
+        return np.clip(np.concatenate([base.T @ way / 0.05, base.T @ turn / 0.5]), -1.0, 1.0)
+
+    def asks(self) -> Iterator[Ask]:
+        """All that the hands ask for; poses are read off the simulation when they are due."""
+        return self._lift() if self._task == "TwoArmLift" else self._handover()
+
+    def _lift(self) -> Iterator[Ask]:
+        """Each hand grasps a handle from above, across its width, and lifts."""
+        tools = self.tools()
+        yield Ask({side: shifted(tool, z=0.13) for side, tool in tools.items()})
+        pot = self._data.body("pot_root").xmat.reshape(3, 3)
+        grasps = {}
+        for number, (side, tool) in enumerate(tools.items()):
+            closing = pot[:, 0] * np.sign(pot[:, 0] @ tool.rotation[:, 0])
+            grasps[side] = pin.SE3(looking_down(closing), self._data.site(f"pot_handle{number}").xpos.copy())
+        yield Ask({side: shifted(grasp, z=0.13) for side, grasp in grasps.items()})
+        yield Ask(grasps)
+        yield Ask(grasps, closed=("left", "right"), pause=0.8)
+        yield Ask({side: shifted(grasp, z=0.2) for side, grasp in grasps.items()}, closed=("left", "right"), pause=1.0)
+
+    def _handover(self) -> Iterator[Ask]:
+        """The left hand brings the hammer by one end of its handle, and the right hand takes it by the other."""
+        tools, handle = self.tools(), self._data.geom("hammer_handle")
+        half = float(self.model.geom("hammer_handle").size[2]) - 0.02  # of the way between the grasps
+        axis = _towards_right(handle.xmat)
+        closing = np.cross(axis, [0.0, 0.0, 1.0])
+        closing *= np.sign(closing @ tools["left"].rotation[:, 0])
+        # Nearer to its base the left hand cannot look down.
+        way = min(half, max((handle.xpos[1] - _NEAREST) / max(axis[1], 1e-6), 0.0))
+        grasp = pin.SE3(looking_down(closing), handle.xpos - way * axis)
+        brought = pin.SE3(looking_down(np.array([np.sign(closing[0]) or 1.0, 0.0])), _MEETING - [0.0, way, 0.0])
+        facing = float(np.sign(tools["right"].rotation[0, 0]))
+        ready = pin.SE3(looking_down(np.array([facing, 0.0])), _MEETING)
+        yield Ask({"left": shifted(grasp, z=0.12), "right": shifted(ready, y=0.3, z=0.15)})
+        yield Ask({"left": grasp})
+        yield Ask({"left": grasp}, closed=("left",), pause=0.8)
+        yield Ask({"left": shifted(grasp, z=0.15)}, closed=("left",))
+        yield Ask({"left": brought}, closed=("left",), pause=0.5)
+        place = handle.xpos + half * _towards_right(handle.xmat)
+        take = pin.SE3(looking_down(ready.rotation[:, 0], -_LEAN * facing), place)
+        yield Ask({"right": backed(take, 0.12)}, closed=("left",))
+        yield Ask({"right": take}, closed=("left",))
+        yield Ask({"right": take}, closed=("left", "right"), pause=0.8)
+        yield Ask({}, closed=("right",), pause=0.8)
+        yield Ask({"left": backed(brought, 0.15)}, closed=("right",), pause=0.5)
+
+
+def _towards_right(rotation: Array) -> Array:
+    """The axis (3,) of the hammer's handle, in its direction to the right arm."""
+    axis = rotation.reshape(3, 3)[:, 2]
+    return axis * (np.sign(axis[1]) or 1.0)
+
+
+def _arm_model(number: int, velocity_limit: Array) -> ArmModel:
+    return ArmModel(
+        base=f"robot{number}_base",
+        joints=tuple(f"robot{number}_joint_{joint}" for joint in range(1, 8)),
+        velocity_limit=velocity_limit,
+        tool=f"gripper{number}_right_grip_site",
+    )
+
+
+def _closing(model: mujoco.MjModel, q: Array, arms: Mapping[str, ArmModel]) -> list[Array]:
+    """Positions of the whole cell with grippers from open to closed, as their actuators move them in free air."""
+    held = [int(model.joint(name).qposadr[0]) for arm in arms.values() for name in arm.joints]
+    scratch, found = mujoco.MjData(model), []
+    flags, model.opt.disableflags = model.opt.disableflags, model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    scratch.qpos[:] = q
+    for opening in _OPENINGS:
+        for actuator in range(model.nu):
+            if "finger" in model.actuator(actuator).name:
+                least, greatest = model.actuator_ctrlrange[actuator]
+                closes = opening if least == 0.0 else 1.0 - opening
+                scratch.ctrl[actuator] = least + closes * (greatest - least)
+        for _ in range(500):
+            mujoco.mj_step(model, scratch)
+            scratch.qpos[held], scratch.qvel[:] = q[held], 0.8 * scratch.qvel
+        found.append(scratch.qpos.copy())
+    model.opt.disableflags = flags
+    return found
