@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.config.bindings import Action
+from q2r2_control.config.control import LIVE_IMPEDANCE
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Event, Reason, ReasonKind
@@ -37,18 +39,19 @@ class PendingRequests:
     home: bool = False
     pause: bool = False
     give_back: bool = False
+    engage: bool = False
     mark: Action | None = None  # of the recording
     settings: TeleopSettings | None = None
-    control: Mapping[str, float] | None = None  # of the controller, by name
+    control: Mapping[str, float] | None = None  # of the controller and the impedance, by name
     of_recording: list[Reason] = field(default_factory=list)  # verdicts on episodes, and why it ended
 
     def __bool__(self) -> bool:
-        asked = self.home or self.pause or self.give_back or self.settings is not None or self.control is not None
-        return asked or self.mark is not None or bool(self.of_recording)
+        asked = self.home or self.pause or self.give_back or self.engage or self.settings is not None
+        return asked or self.control is not None or self.mark is not None or bool(self.of_recording)
 
     def clear(self) -> None:
         """Ask for nothing any more."""
-        self.home, self.pause, self.give_back = False, False, False
+        self.home, self.pause, self.give_back, self.engage = False, False, False, False
         self.mark, self.settings, self.control = None, None, None
         self.of_recording.clear()
 
@@ -60,6 +63,8 @@ class PendingRequests:
             yield Reason(ReasonKind.PAUSE_REQUESTED)
         if self.give_back:
             yield Reason(ReasonKind.POLICY_REQUESTED)
+        if self.engage:
+            yield Reason(ReasonKind.ENGAGE_REQUESTED)
         if self.mark is not None:
             yield Reason.of(ReasonKind.RECORDING_REQUESTED, action=str(self.mark))
         if self.settings is not None:
@@ -77,6 +82,8 @@ class PendingRequests:
             self.pause = True
         elif reason.kind is ReasonKind.POLICY_REQUESTED:
             self.give_back = True
+        elif reason.kind is ReasonKind.ENGAGE_REQUESTED:
+            self.engage = True
         elif reason.kind is ReasonKind.RECORDING_REQUESTED:
             self.mark = Action(reason.detail["action"])
         elif reason.kind is ReasonKind.CONTROL_REQUESTED:
@@ -119,11 +126,12 @@ class OperatorSide:
         supervisor: Supervisor,
         controller: CartesianController,
         requests: PendingRequests,
+        impedance: ImpedanceController | None = None,
     ) -> None:
         self._teleop, self._input, self._supervisor = teleop, source, supervisor
         self._policy = source if isinstance(source, PolicySource) else None
         self.chunks: list[ActionChunk] = []  # of a policy, since the last poll
-        self._controller, self._requests = controller, requests
+        self._controller, self._requests, self._impedance = controller, requests, impedance
         self._homing = False  # supervision is on the way home
         self.connected = False
         arms = controller.robot.arms
@@ -199,6 +207,8 @@ class OperatorSide:
             self._teleop.pause(now, Reason(ReasonKind.PAUSE_REQUESTED))
         if requests.give_back:
             self._teleop.give_back(now)
+        if requests.engage:
+            self._teleop.press_to_engage()
         if requests.mark is not None:
             self._teleop.mark(now, requests.mark)
         if (settings := requests.settings) is not None:
@@ -207,7 +217,10 @@ class OperatorSide:
             for pulses in self._pulses.values() if problem is None else ():
                 pulses.strength = settings.haptics.strength
         if requests.control is not None:
-            refused = self._controller.change(requests.control)
+            springs = {name: value for name, value in requests.control.items() if name in LIVE_IMPEDANCE}
+            if springs and self._impedance is not None:
+                self._impedance.change(springs)
+            refused = self._controller.change({k: v for k, v in requests.control.items() if k not in springs})
             problem = None if refused is None else Reason.of(ReasonKind.CONTROL_REFUSED, text=refused)
             self._record_change(ReasonKind.CONTROL_CHANGED, problem, now)
 

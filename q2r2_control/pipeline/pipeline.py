@@ -11,11 +11,13 @@ from contextlib import suppress
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.compliance.impedance import ImpedanceController, check_springs
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
+from q2r2_control.config.control import LIVE_IMPEDANCE
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives.base import make_drive, permitted
+from q2r2_control.drives.base import TorqueDrive, make_drive, permitted
 from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input, PolicySource, make_input
@@ -89,6 +91,11 @@ class Pipeline:
         return cls(config, robot, source, make_plant(config.plant if plant is None else plant, robot, config), mode)
 
     @property
+    def _impedance(self) -> ImpedanceController | None:
+        """Of torque mode."""
+        return self.drive.impedance if isinstance(self.drive, TorqueDrive) else None
+
+    @property
     def supervisor(self) -> Supervisor:
         return self.loop.supervisor
 
@@ -103,6 +110,10 @@ class Pipeline:
     def pause(self) -> None:
         """Let both arms hold until a new press; from any thread."""
         self.requests.pause = True
+
+    def engage(self) -> None:
+        """Press for both hands what engages their arms, with all that a press needs and does; from any thread."""
+        self.requests.engage = True
 
     def give_back(self) -> None:
         """Take the arms from the hands and give them to the policy, which goes on where they are; from any thread."""
@@ -129,10 +140,13 @@ class Pipeline:
     def change_control(self, values: Mapping[str, float]) -> None:
         """Other settings of the controller, by name, for the rest of this run, without a jump; from any thread.
 
-        :meth:`CartesianController.change` says how they come to count, and an event whether they did. Raises
+        In torque mode those of ``LIVE_IMPEDANCE`` too. :meth:`CartesianController.change` and
+        :meth:`ImpedanceController.change` say how they come to count, and an event whether they did. Raises
         :class:`ConfigError` for a name or a value that is never allowed.
         """
-        self.config.control.changed(values)
+        springs = {} if self._impedance is None else {k: v for k, v in values.items() if k in LIVE_IMPEDANCE}
+        check_springs(springs)
+        self.config.control.changed({name: value for name, value in values.items() if name not in springs})
         self.requests.control = dict(values)
 
     def run(self, duration: float | None = None, realtime: bool = True) -> RunSummary:
@@ -237,7 +251,9 @@ class Pipeline:
         is_torque = self.drive.mode is CommandMode.TORQUE
         self._longest_advance = max(_LONGEST_TORQUE, self._clock.period) if is_torque else LONGEST_DT
         self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop)
-        self._operator = OperatorSide(self.teleop, self.input, self.supervisor, self.controller, self.requests)
+        self._operator = OperatorSide(
+            self.teleop, self.input, self.supervisor, self.controller, self.requests, self._impedance
+        )
         self.teleop.marks.recorded = self._recorder.keeps_episodes
 
     def _run_until(self, duration: float) -> RunSummary:
