@@ -24,7 +24,6 @@ def test_keys_and_a_gamepad_engage_an_arm_move_it_and_leave_it_when_the_page_is_
 ) -> None:
     run = start(*RUN)
     page = open_page(run.url, emulated())
-    page.set_viewport_size({"width": 320, "height": 220})
     wait_until(lambda: said(page) is not None)
     page.click("#fly")
     wait_until(lambda: count(pixels(page), ORANGE) > 5)

@@ -80,6 +80,7 @@ function fly() {
   const begun = (flying = new Flying());
   element("fly").blur();
   element("advice").textContent = HELP;
+  document.body.classList.add("flying"); // which leaves the arms to be seen
   const onFrame = () => {
     if (flying !== begun) return;
     requestAnimationFrame(onFrame);
@@ -96,6 +97,7 @@ function land() {
   link.send(flying.lost(), true);
   flying.end();
   flying = null;
+  document.body.classList.remove("flying");
   element("advice").textContent = "";
 }
 
@@ -104,6 +106,7 @@ function show() {
   element("link").textContent = `${link.text}${age}, ${(100 * link.loss).toFixed(0)} % left out`;
   element("leave").hidden = session === null;
   element("fly").hidden = session !== null;
+  element("stand").hidden = flying !== null;
   element("fly").textContent = flying ? `Land; the ${flying.hand} hand moves` : "Fly by keyboard or gamepad";
   const rows = Object.entries(state?.arms ?? {}).map(([name, arm]) => {
     const row = document.createElement("tr");
