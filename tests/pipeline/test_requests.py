@@ -38,7 +38,9 @@ def test_a_press_of_a_program_engages_arms_whose_hands_are_there_and_pauses_none
     loop.listeners.append(press)
     summary = loop.run(3.5, realtime=False)
     for arm in ("left", "right"):
-        assert changes(list(summary.events), arm)[-1][:2] == ("lost", "engaged")
+        moved = [change for change in changes(list(summary.events), arm) if change[0] != change[1]]
+        assert [before for before, *_ in moved[-2:]] == ["engaged", "lost"]
+        assert moved[-1][1] == "engaged"
 
 
 def test_a_press_of_a_program_holds_no_dead_man() -> None:

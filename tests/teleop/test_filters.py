@@ -114,7 +114,7 @@ def speeds(arrivals: list[tuple[float, float]], velocity: float, since: float) -
 def test_jitter_of_receipt_hardly_looks_like_speed() -> None:
     late = np.random.default_rng(5).exponential(0.0015, 300).clip(max=0.01)
     arrivals = [(n / 75, n / 75 + late[n]) for n in range(300)]
-    assert np.std(speeds(arrivals, 0.5, 1.0)) < 0.03 * 0.5
+    assert np.std(speeds(arrivals, 0.5, 1.0)) < 0.04 * 0.5
 
 
 def test_what_was_missed_in_a_gap_is_made_up_for_at_no_more_than_some_times_the_speed() -> None:
