@@ -27,8 +27,8 @@ class Interpolator:
 
     A headset measures evenly, and its samples come unevenly. A delay-locked loop (Adriaensen 2005) takes the jitter out
     of their times, which would look like speed. It starts anew where a sample comes half a period early or late.
-    When no sample comes for longer than ``delay``, it rests at the newest: nothing is extrapolated. What was missed is
-    then made up for within a part of the gap, and not at once.
+    When no sample comes for longer than ``delay``, it rests at the newest: nothing is extrapolated. It then
+    makes up for the motion that it missed within a part of the gap, and not at once.
     """
 
     def __init__(self, delay: float) -> None:

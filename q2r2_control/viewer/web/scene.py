@@ -156,7 +156,7 @@ class CellScene:
             line.points = np.array([[tool.translation, tool.translation + way]])
 
     def _force(self, arm: str, state: RobotState) -> Array | None:
-        """What pushes a tool, as a way (3,) [m]; None: the plant does not tell."""
+        """The force on a tool, drawn as a way (3,) [m]; None: the plant does not tell."""
         if state.tau_external is None:
             return None
         frame, joints = self._setup.tools[arm], self._setup.joints[arm]
