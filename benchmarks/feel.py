@@ -22,7 +22,7 @@ from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_rep
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.inputs.assembly import minimum_jerk
-from q2r2_control.inputs.played import HeadsetSampling, PlayedInput
+from q2r2_control.inputs.played import HandButtons, HeadsetSampling, PlayedInput
 from q2r2_control.inputs.scripted import HANDS_AT_REST
 from q2r2_control.judging.motion import Track, delays_behind
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -35,8 +35,17 @@ from q2r2_control.viewer.tables import record_table
 Way = Callable[[float], float]  # of a hand along one axis [m], over time [s]
 
 # Filters to compare with the cell's own: one that lets little through, and one that is late by little.
-PRECISION = FilterSettings(smoothing_delay=0.06, min_cutoff=0.8, beta=3.0, rotation_beta=1.0)
-SPEED = FilterSettings(interpolation_delay=0.015, smoothing_delay=0.005, min_cutoff=5.0, beta=30.0, rotation_beta=10.0)
+PRECISION = FilterSettings(
+    interpolation_delay=0.02, smoothing_delay=0.06, min_cutoff=0.8, beta=3.0, rotation_beta=1.0, derivative_cutoff=2.0
+)
+SPEED = FilterSettings(
+    interpolation_delay=0.015,
+    smoothing_delay=0.005,
+    min_cutoff=5.0,
+    beta=30.0,
+    rotation_beta=10.0,
+    derivative_cutoff=2.0,
+)
 OTHERS = {"precision": PRECISION, "speed": SPEED}
 
 SETTLES = 0.7  # of every tone and tremor, before it is measured [s]
@@ -46,6 +55,7 @@ TREMORS = (8.0, 10.0, 12.0)  # [Hz]
 TREMOR = 0.5e-3  # amplitude [m]
 SLOWLY = 0.03  # of a hand that moves and trembles [m/s]
 NOISE = 2e-4  # of the sensor, standard deviation along each axis [m]
+RESTING_NOISES, PAUSES = (0.2, 0.6, 1.0), 100  # of the same, engaged and paused so often [mm]
 STOP_SPEED, STOP_TIME = 0.3, 0.1  # of a hand that moves on and stops [m/s], and from that speed to rest [s]
 # Reaches, to and fro, each followed by a rest: peaks of 0.16 to 0.63 m/s, which the arm can follow sidewards [m], [s].
 REACHES, REACH_RESTS = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
@@ -55,8 +65,10 @@ _PRESSED, _BEGINS = (0.2, 0.35), 0.8  # [s]
 _MEASURED = 2.0  # of every tone [s]
 _RESTS, _CRUISES = 3.0, 0.4  # [s]
 _SIDEWARDS, _UP = 1, 2  # axes
+_CYCLE = 0.6  # from one engagement to the next, half of it engaged [s]
 _A_TICK = 0.05  # the longest that there is [s]
 NOTES = (
+    f"pauses: of a hand at rest, noise of {RESTING_NOISES} mm; from the tool's place to that after {PAUSES} pauses",
     "all from the hand to the measured tool, from samples at 72 to 76 Hz to an arm in MuJoCo, position mode",
     "filter delay: as its settings say; delays and gains: of a hand that moves at "
     + ", ".join(f"{frequency:g} Hz, {1e3 * amplitude:g} mm" for frequency, amplitude in MOTIONS),
@@ -85,6 +97,8 @@ class FeelFigures:
     noise_um: float  # RMS of the tool in the worst axis, of a hand that rests
     stop_delay_ms: float  # from the hand's rest to the tool within 2 mm of its own for good
     overshoot_mm: float  # of the tool, beyond where it comes to rest
+    overshoot_percent: float  # of the way of the hand that stops
+    pauses_mm: tuple[float, ...]  # how far the tool is from where it was, for each of :data:`RESTING_NOISES`
 
 
 def run_feel(config: Config) -> list[FeelFigures]:
@@ -104,8 +118,8 @@ def _measure(name: str, config: Config, robot: Robot, plant: MujocoPlant, settin
     teleop = config.teleop.model_copy(update={"filter": settings})
     config = config.model_copy(update={"teleop": teleop})
 
-    def run(way: Way, lasts: float, noise: float = 0.0, axis: int = _UP) -> _Log:
-        log = _Log(way, noise, axis)
+    def run(way: Way, lasts: float, noise: float = 0.0, axis: int = _UP, presses: HandButtons = _buttons) -> _Log:
+        log = _Log(way, noise, axis, presses)
         pipeline = Pipeline(config, robot, log.hands, plant)
         pipeline.listeners.append(log.take)
         pipeline.run(_BEGINS + lasts, realtime=False)
@@ -124,6 +138,10 @@ def _measure(name: str, config: Config, robot: Robot, plant: MujocoPlant, settin
     ends = np.cumsum([0.0, *(2.0 * (time + REACH_RESTS) for _, time in REACHES)])
     reached = run(reaches(REACHES, REACH_RESTS), ends[-1], axis=_SIDEWARDS)
     noise = run(lambda t: 0.0, _RESTS, NOISE).noise()
+    pauses = [
+        run(lambda t: 0.0, (PAUSES + 1) * _CYCLE, 1e-3 * each, presses=_again_and_again).moved()
+        for each in RESTING_NOISES
+    ]
     stop_delay, overshoot = run(stop(STOP_SPEED, STOP_TIME, _CRUISES), _CRUISES + STOP_TIME + 1.5).stop()
     return FeelFigures(
         name=name,
@@ -139,16 +157,18 @@ def _measure(name: str, config: Config, robot: Robot, plant: MujocoPlant, settin
         noise_um=1e6 * noise,
         stop_delay_ms=1e3 * stop_delay,
         overshoot_mm=1e3 * overshoot,
+        overshoot_percent=1e2 * overshoot / (STOP_SPEED * _CRUISES),
+        pauses_mm=tuple(1e3 * moved for moved in pauses),
     )
 
 
 class _Log:
     """A run in which one hand goes a way along an axis, sampled at a headset's rate, and what the tool does."""
 
-    def __init__(self, way: Way, noise: float, axis: int) -> None:
+    def __init__(self, way: Way, noise: float, axis: int, presses: HandButtons) -> None:
         self._way, self._axis = way, axis
         samplings = {hand: HeadsetSampling(hand, 0, position_noise=noise) for hand in HANDS_AT_REST}
-        self.hands = PlayedInput(self._pose, _buttons, samplings)
+        self.hands = PlayedInput(self._pose, presses, samplings)
         self._t: list[float] = []
         self._tool: list[Array] = []
         self._asked: list[float] = []
@@ -205,6 +225,10 @@ class _Log:
         late = t[np.abs(ahead) > 2e-3]
         return float(late[-1]) - (_CRUISES + STOP_TIME), max(float(ahead.max()), 0.0)
 
+    def moved(self) -> float:
+        """From the tool's first place to its last [m]."""
+        return float(np.linalg.norm(self._tool[-1] - self._tool[0]))
+
     def _from(self, begin: float) -> tuple[Array, Array, Array]:
         """Times, and the ways of hand and tool along the axis, each (n,)."""
         t = np.array(self._t)
@@ -219,6 +243,10 @@ class _Log:
 
 def _buttons(hand: str, t: float) -> HandInputs:
     return HandInputs(button_lower=_PRESSED[0] <= t < _PRESSED[1])
+
+
+def _again_and_again(hand: str, t: float) -> HandInputs:
+    return HandInputs(button_lower=t > _PRESSED[0] and (t - _PRESSED[0]) % (_CYCLE / 2.0) < _CYCLE / 4.0)
 
 
 def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:

@@ -36,6 +36,10 @@ EMULATED = """
 const device = new IWER.XRDevice(IWER.metaQuest3);
 device.installRuntime({ forceInstall: true });
 device.stereoEnabled = false;
+// A headset has a graphics card. Here a processor would draw, for 200 ms a frame, and every hand would wait for that.
+for (const name of ["clear", "drawElements", "texImage2D", "generateMipmap"])
+  WebGL2RenderingContext.prototype[name] = () => {};
+for (const name of ["fillRect", "fillText", "drawImage"]) CanvasRenderingContext2D.prototype[name] = () => {};
 Object.defineProperty(XRPose.prototype, "emulatedPosition", { get: () => false });
 const frame = () => new Promise(requestAnimationFrame);
 const pause = (time) => new Promise((done) => setTimeout(done, time));

@@ -51,6 +51,7 @@ class ReasonKind(StrEnum):
     VERDICT = "verdict", "verdict on episode {episode}: {line}"
     # Requests of a program.
     HOME_REQUESTED = "home_requested", "a program asks for the way home"
+    ENGAGE_REQUESTED = "engage_requested", "a program presses for both hands"
     PAUSE_REQUESTED = "pause_requested", "a program asks for a pause"
     POLICY_REQUESTED = "policy_requested", "a program gives the arms to the policy"
     RECORDING_REQUESTED = "recording_requested", "a program asks for {action}"

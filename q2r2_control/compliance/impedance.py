@@ -149,14 +149,7 @@ class ImpedanceController:
         """
         if arm is not None and arm not in self._arms:
             raise ConfigError(f"impedance: no arm {arm!r:.40}; arms: {', '.join(self._arms)}")
-        for name in values.keys() - set(LIVE_IMPEDANCE):
-            allowed = ", ".join(LIVE_IMPEDANCE)
-            raise ConfigError(f"impedance: {name} = {values[name]!r:.40}: while a controller runs: {allowed}")
-        try:
-            ImpedanceSettings.model_validate(dict(values), strict=True)
-        except ValidationError as error:
-            fault = error.errors()[0]
-            raise ConfigError(f"{fault['loc'][0]} = {fault['input']!r:.40}: {fault['msg']}") from error
+        check_springs(values)
         changed = slice(None) if arm is None else self._arms.index(arm)
         for name, value in values.items():
             column = LIVE_IMPEDANCE.index(name)
@@ -205,6 +198,18 @@ class ImpedanceController:
         if held_back:
             report.saturated, report.rate_limited = _those(joints, data.saturated), _those(joints, data.late)
         return TorqueCommand(data.commanded.copy(), report)
+
+
+def check_springs(values: Mapping[str, float]) -> None:
+    """Raises :class:`ConfigError` for what is none of ``LIVE_IMPEDANCE``, and for a value out of range."""
+    for name in values.keys() - set(LIVE_IMPEDANCE):
+        allowed = ", ".join(LIVE_IMPEDANCE)
+        raise ConfigError(f"impedance: {name} = {values[name]!r:.40}: while a controller runs: {allowed}")
+    try:
+        ImpedanceSettings.model_validate(dict(values), strict=True)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        raise ConfigError(f"{fault['loc'][0]} = {fault['input']!r:.40}: {fault['msg']}") from error
 
 
 def _those(names: tuple[str, ...], which: BoolArray | Array) -> tuple[str, ...]:

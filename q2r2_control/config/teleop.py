@@ -50,12 +50,12 @@ class RotationFrame(StrEnum):
 class FilterSettings(StrictModel):
     """Interpolation between samples, then a One-Euro filter (Casiez, Roussel, Vogel, CHI 2012)."""
 
-    interpolation_delay: float = Field(0.02, ge=0.005, le=0.2, description="1.5 periods of a 75 Hz headset [s]")
-    smoothing_delay: float = Field(0.025, ge=0, le=0.2, description="of a motion at constant speed [s]")
-    min_cutoff: float = Field(1.5, gt=0, le=100, description="cutoff frequency at rest; tremor is 8-12 Hz [Hz]")
-    beta: float = Field(10.0, ge=0, le=1000, description="cutoff added per speed [Hz s/m]")
-    rotation_beta: float = Field(3.0, ge=0, le=1000, description="cutoff added per speed [Hz s/rad]")
-    derivative_cutoff: float = Field(2.0, gt=0, le=100, description="cutoff of the speed estimate [Hz]")
+    interpolation_delay: float = Field(0.0165, ge=0.005, le=0.2, description="1.25 periods of a 75 Hz headset [s]")
+    smoothing_delay: float = Field(0.0185, ge=0, le=0.2, description="of a motion at constant speed [s]")
+    min_cutoff: float = Field(1.2, gt=0, le=100, description="cutoff frequency at rest; tremor is 8-12 Hz [Hz]")
+    beta: float = Field(38.0, ge=0, le=1000, description="cutoff added per speed [Hz s/m]")
+    rotation_beta: float = Field(9.0, ge=0, le=1000, description="cutoff added per speed [Hz s/rad]")
+    derivative_cutoff: float = Field(1.45, gt=0, le=100, description="cutoff of the speed estimate [Hz]")
 
     @property
     def delay(self) -> float:

@@ -110,7 +110,7 @@ class HandsWatch:
         hand, message = reception.hand, reception.message
         if isinstance(message, HandInputs) and self._frame is not None:
             self._frame.take_inputs(hand, message, now)
-        if not isinstance(message, HandPose) or reception.fault is not None:
+        if not isinstance(message, HandPose) or reception.fault is not None or reception.virtual:
             return [Watched(reception, now, reception.fault)]
         numbers = message.position.tobytes() + message.quaternion.tobytes()
         if numbers != self._numbers.get(hand):

@@ -55,6 +55,7 @@ class Reception(NamedTuple):
     hand: str
     message: HandMessage
     fault: HandFault | None = None  # of a pose, that the headset itself tells of
+    virtual: bool = False  # no hand, but what keys move: it rests without noise
 
 
 def log_frame(level: str, text: str) -> bytes:

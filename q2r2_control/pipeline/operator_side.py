@@ -11,7 +11,9 @@ from itertools import cycle
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.config.bindings import Action
+from q2r2_control.config.control import LIVE_IMPEDANCE
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Event, Reason, ReasonKind
@@ -41,11 +43,12 @@ class OperatorSide:
         supervisor: Supervisor,
         controller: CartesianController,
         requests: deque[Reason | TeleopSettings],
+        impedance: ImpedanceController | None = None,
     ) -> None:
         self._teleop, self._input, self._supervisor = teleop, source, supervisor
         self._policy = source if isinstance(source, PolicySource) else None
         self.chunks: list[ActionChunk] = []  # of a policy, since the last poll
-        self._controller, self._requests = controller, requests
+        self._controller, self._requests, self._impedance = controller, requests, impedance
         self._homing = False  # supervision is on the way home
         self.connected = False
         arms = controller.robot.arms
@@ -127,6 +130,8 @@ class OperatorSide:
                 self._teleop.pause(now, request)
             case ReasonKind.POLICY_REQUESTED:
                 self._teleop.give_back(now)
+            case ReasonKind.ENGAGE_REQUESTED:
+                self._teleop.press_to_engage()
             case ReasonKind.RECORDING_REQUESTED:
                 self._teleop.mark(now, Action(request.detail["action"]))
             case ReasonKind.SETTINGS_REQUESTED:
@@ -136,7 +141,11 @@ class OperatorSide:
                 for pulses in self._pulses.values() if problem is None else ():
                     pulses.strength = settings.haptics.strength
             case ReasonKind.CONTROL_REQUESTED:
-                refused = self._controller.change(request.detail["changes"])
+                values = request.detail["changes"]
+                springs = {name: value for name, value in values.items() if name in LIVE_IMPEDANCE}
+                if springs and self._impedance is not None:
+                    self._impedance.change(springs)
+                refused = self._controller.change({k: v for k, v in values.items() if k not in springs})
                 problem = None if refused is None else Reason.of(ReasonKind.CONTROL_REFUSED, text=refused)
                 self._record_change(ReasonKind.CONTROL_CHANGED, problem, now)
 

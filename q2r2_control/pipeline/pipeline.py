@@ -197,7 +197,9 @@ class Pipeline(RequestedRun):
         is_torque = self.drive.mode is CommandMode.TORQUE
         self._longest_advance = max(_LONGEST_TORQUE, self._clock.period) if is_torque else LONGEST_DT
         self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop)
-        self._operator = OperatorSide(self.teleop, self.input, self.supervisor, self.controller, self.requests)
+        self._operator = OperatorSide(
+            self.teleop, self.input, self.supervisor, self.controller, self.requests, self.impedance
+        )
         self.teleop.marks.recorded = self._recorder.keeps_episodes
 
     def _run_until(self, duration: float) -> RunSummary:

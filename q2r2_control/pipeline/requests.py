@@ -6,9 +6,12 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+from q2r2_control.compliance.impedance import ImpedanceController, check_springs
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
+from q2r2_control.config.control import LIVE_IMPEDANCE
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.drives.base import Drive, TorqueDrive
 from q2r2_control.errors import check_kind
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input
@@ -19,9 +22,15 @@ class RequestedRun:
 
     config: Config
     input: Input
+    drive: Drive
 
     def __init__(self) -> None:
         self.requests: deque[Reason | TeleopSettings] = deque()
+
+    @property
+    def impedance(self) -> ImpedanceController | None:
+        """Of torque mode."""
+        return self.drive.impedance if isinstance(self.drive, TorqueDrive) else None
 
     def go_home(self) -> None:
         """Bring both arms home, as an operator may; from any thread. Any press ends it; events say how it went."""
@@ -30,6 +39,10 @@ class RequestedRun:
     def pause(self) -> None:
         """Let both arms hold until a new press; from any thread."""
         self.requests.append(Reason(ReasonKind.PAUSE_REQUESTED))
+
+    def engage(self) -> None:
+        """Press for both hands what engages their arms, with all that a press needs and does; from any thread."""
+        self.requests.append(Reason(ReasonKind.ENGAGE_REQUESTED))
 
     def give_back(self) -> None:
         """Take the arms from the hands and give them to the policy, which goes on where they are; from any thread."""
@@ -52,10 +65,13 @@ class RequestedRun:
     def change_control(self, values: Mapping[str, float]) -> None:
         """Other settings of the controller, by name, for the rest of this run, without a jump; from any thread.
 
-        :meth:`CartesianController.change` says how they come to count, and an event whether they did. Raises
+        In torque mode those of ``LIVE_IMPEDANCE`` too. :meth:`CartesianController.change` and
+        :meth:`ImpedanceController.change` say how they come to count, and an event whether they did. Raises
         :class:`ConfigError` for a name or a value that is never allowed.
         """
-        self.config.control.changed(values)
+        springs = {} if self.impedance is None else {k: v for k, v in values.items() if k in LIVE_IMPEDANCE}
+        check_springs(springs)
+        self.config.control.changed({name: value for name, value in values.items() if name not in springs})
         self.requests.append(Reason.of(ReasonKind.CONTROL_REQUESTED, changes=dict(values)))
 
     def record_outcome(self, reason: Reason) -> None:
@@ -65,7 +81,7 @@ class RequestedRun:
 
 # Kinds of requests, which a replay asks for again; a recording that ended does not end again.
 REPEATED = {
-    *(ReasonKind.HOME_REQUESTED, ReasonKind.PAUSE_REQUESTED, ReasonKind.POLICY_REQUESTED),
+    *(ReasonKind.HOME_REQUESTED, ReasonKind.PAUSE_REQUESTED, ReasonKind.POLICY_REQUESTED, ReasonKind.ENGAGE_REQUESTED),
     *(ReasonKind.RECORDING_REQUESTED, ReasonKind.SETTINGS_REQUESTED, ReasonKind.CONTROL_REQUESTED, ReasonKind.VERDICT),
 }
 

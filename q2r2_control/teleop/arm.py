@@ -152,6 +152,11 @@ class ArmTeleop:
             self.record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=stuck))
         return presses
 
+    def press_to_engage(self) -> None:
+        """As if the hand had pressed; nothing happens where no press engages."""
+        bound = self._settings.bindings.bound()
+        self._presses += [Press(one.control, one.gesture) for one in bound if one.action is Action.PAUSE_TOGGLE][:1]
+
     def forget(self) -> None:
         """Drop everything received; controls count as held until they are seen released."""
         self._gate.reset()

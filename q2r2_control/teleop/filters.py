@@ -17,12 +17,18 @@ from q2r2_control.quaternions import IDENTITY, Quaternion, Vector, normalized, t
 from q2r2_control.types import Pose
 
 _MIN_SPACING = 0.005  # closer samples are merged: over so short a time receipt jitter would look like speed [s]
+_USUAL_PERIOD = 1.0 / 75.0  # of a headset's samples, until they are known [s]
+_PHASE_SHARE, _PERIOD_SHARE = 0.2, 0.02  # of a sample's jitter that its time, and the period, follow
+_CATCH_UP = 0.5  # of a gap in the stream, the part in which what was missed is made up for
 
 
 class Interpolator:
     """Plays samples back ``delay`` seconds after their receipt, straight from each to the next.
 
-    When no sample comes for longer than ``delay``, it rests at the newest: nothing is extrapolated.
+    A headset measures evenly, and its samples come unevenly. A delay-locked loop (Adriaensen 2005) takes the jitter out
+    of their times, which would look like speed. It starts anew where a sample comes half a period early or late.
+    When no sample comes for longer than ``delay``, it rests at the newest: nothing is extrapolated. It then
+    makes up for the motion that it missed within a part of the gap, and not at once.
     """
 
     def __init__(self, delay: float) -> None:
@@ -32,14 +38,24 @@ class Interpolator:
 
     def reset(self, position: Vector, rotation: Quaternion, now: float) -> None:
         self._knots, self._velocity = deque([(now - self.delay, position, rotation)]), None
+        self._stamp, self._caught_up = now, -math.inf  # of the last sample, and the end of the way after a gap [s]
+        self._even, self._period = -math.inf, _USUAL_PERIOD  # when the last sample was measured, but for a constant [s]
 
     def add(self, position: Vector, rotation: Quaternion, stamp: float, now: float) -> None:
         """Append a sample received at ``stamp`` <= ``now`` [s]; ``reset`` has to come first."""
         knots, self._velocity = self._knots, None
+        gap, self._stamp = stamp - self._stamp, stamp
+        if gap > 2.0 * self.delay:
+            self._caught_up = knots[0][0] + _CATCH_UP * gap
+        jitter = stamp - self._even - self._period
+        if abs(jitter) < self._period / 2.0:
+            self._period += _PERIOD_SHARE * jitter
+            stamp += (_PHASE_SHARE - 1.0) * jitter
+        self._even = stamp
         while len(knots) > 1 and stamp - knots[-1][0] < _MIN_SPACING:
             knots.pop()
         # A sample in time is reached after the whole delay; so is a late one, without a faster motion.
-        earliest = knots[0][0] + max(self.delay / 2.0, _MIN_SPACING)
+        earliest = max(self._caught_up, knots[0][0] + max(self.delay / 2.0, _MIN_SPACING))
         knots.append((max(stamp, earliest), position, rotation))
 
     def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
@@ -145,8 +161,9 @@ class PoseFilter:
 
 
 # A hand rests while the mean of its newest samples is this near to that of all since it came to rest. In addition no
-# sample is farther from it than a headset's noise makes one in thousands [m], [rad].
+# sample is farther from it than a headset's noise makes one in thousands [m], [rad]. With more noise both bounds grow.
 _NEWEST, _DRIFTED, _FAR = 8, (0.35e-3, 2e-3), (1.0e-3, 5e-3)
+_NOISE, _NOISE_SAMPLES = (0.2e-3, 1.0e-3), (4, 50)  # per axis [m], [rad]; and for how many it counts, at first and most
 _LONGEST = 150  # samples of the mean: two seconds of a 75 Hz headset
 _TRUSTED = 10, 50  # the mean begins to count from so many samples on, and is all that counts from so many
 _LEAVING = 0.05  # the mean of a hand that moves again counts for so long, less and less [s]
@@ -169,6 +186,8 @@ class RestingPose:
         self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # the mean that is drawn to
         self._leaving = False  # that mean is of a rest that is over
         self._share, self._now = 0.0, 0.0
+        self._last: deque[_Sample] = deque(maxlen=2)
+        self._noise, self._noise_count = [one**2 for one in _NOISE], _NOISE_SAMPLES[0]  # variance of an axis
 
     def add(self, pose: Pose) -> None:
         position, rotation = pose
@@ -176,7 +195,9 @@ class RestingPose:
         known = self._count > 0 and math.hypot(*turn) <= _TURNED
         if not known:
             self._origin, turn = rotation, (0.0, 0.0, 0.0)
+            self._last.clear()
         sample = (*position, *turn)
+        self._measure_noise(sample)
         if not known or self._away(sample, _FAR):
             self._newest.clear()
             self._newest.append(sample)
@@ -223,10 +244,20 @@ class RestingPose:
         x, y, z, a, b, c = self._mean
         return (x, y, z), turned_by(self._origin, (a, b, c))
 
+    def _measure_noise(self, sample: _Sample) -> None:
+        """From second differences, which steady motion has none of, and white noise six times its variance."""
+        if len(self._last) == 2:
+            self._noise_count = min(self._noise_count + 1, _NOISE_SAMPLES[1])
+            bends = [new - 2.0 * last + before for before, last, new in zip(*self._last, sample, strict=True)]
+            for index, part in enumerate((bends[:3], bends[3:])):
+                self._noise[index] += (math.hypot(*part) ** 2 / 18.0 - self._noise[index]) / self._noise_count
+        self._last.append(sample)
+
     def _away(self, sample: _Sample, bounds: tuple[float, float]) -> bool:
-        (x, y, z, a, b, c), (to_x, to_y, to_z, to_a, to_b, to_c) = self._mean, sample
-        return (
-            math.hypot(to_x - x, to_y - y, to_z - z) > bounds[0] or math.hypot(to_a - a, to_b - b, to_c - c) > bounds[1]
+        off = [new - mean for mean, new in zip(self._mean, sample, strict=True)]
+        return any(
+            math.hypot(*part) > bound * max(1.0, math.sqrt(variance) / usual)
+            for part, bound, variance, usual in zip((off[:3], off[3:]), bounds, self._noise, _NOISE, strict=True)
         )
 
     def _leave(self, mean: _Sample, count: int) -> None:

@@ -217,6 +217,11 @@ class Teleop:
         elif self._arms[arm].state not in HOLDING:
             self._stop({arm: reason}, now)
 
+    def press_to_engage(self) -> None:
+        """As if both hands had pressed what engages their arms; where a dead man does, nothing happens."""
+        for arm in self._arms.values():
+            arm.press_to_engage()
+
     def give_back(self, now: float) -> None:
         """No hand drives an arm or is waited for: the policy may go on, until a hand is heard of again."""
         now, _ = self._clock(now)

@@ -125,6 +125,15 @@ def test_a_pose_that_stays_the_same_to_the_last_bit_is_frozen_whatever_its_stamp
     assert faults(handed_on(TwoHands(rest, 1, (0.0, 0.0), tremor=False, noise=1e-7).samples(2.0))) == set()
 
 
+def test_a_hand_that_keys_move_may_rest_without_noise() -> None:
+    (_, _, pose), *_ = resting()
+    watch = HandsWatch()
+    virtual = Reception("q2r_left_hand_pose", "left", pose, virtual=True)
+    for index in range(200):
+        (watched,) = watch.receive(virtual, index * PERIOD)
+        assert watched.fault is None
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(("shift", "degrees"), [(0.015, 0.0), (0.0, 3.0), (0.4, 120.0)], ids=str)
 def test_a_frame_that_steps_is_a_fault_of_both_hands_from_its_first_pose(

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from q2r2_control.config.bindings import Action
+import numpy as np
+import pytest
+
+from q2r2_control.config.bindings import Action, BindingSettings
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.drives.base import TorqueDrive
+from q2r2_control.errors import ConfigError
 from q2r2_control.events import ReasonKind
+from q2r2_control.summary.tick import Tick
 from tests.pipeline.loops import pipeline, when_moving
 from tests.support.processes import changes
 
@@ -15,6 +22,51 @@ def test_a_pause_holds_both_arms_until_a_new_press() -> None:
     for arm in ("left", "right"):
         assert changes(list(summary.events), arm)[-1] == ("engaged", "lost", "pause_requested")
     assert summary.at_rest
+
+
+def test_a_press_of_a_program_engages_arms_whose_hands_are_there_and_pauses_none() -> None:
+    loop = pipeline()
+    loop.listeners.append(when_moving(loop.pause))
+    pressed: list[Tick] = []
+
+    def press(tick: Tick) -> None:
+        if tick.t > 2.5 + 0.3 * len(pressed) and len(pressed) < 2:
+            pressed.append(tick)
+            loop.engage()
+
+    loop.listeners.append(press)
+    summary = loop.run(3.5, realtime=False)
+    for arm in ("left", "right"):
+        moved = [change for change in changes(list(summary.events), arm) if change[0] != change[1]]
+        assert [before for before, *_ in moved[-2:]] == ["engaged", "lost"]
+        assert moved[-1][1] == "engaged"
+
+
+def test_a_press_of_a_program_holds_no_dead_man() -> None:
+    bindings = BindingSettings(lower=Action.NONE, grip=Action.DEAD_MAN)
+    loop = pipeline(teleop=TeleopSettings(bindings=bindings))
+    loop.listeners.append(lambda tick: loop.engage())
+    assert not any(event.destination == "engaged" for event in loop.run(1.0, realtime=False).events)
+
+
+def test_springs_of_torque_mode_change_on_a_ramp_and_no_others() -> None:
+    loop = pipeline(plant="mujoco", mode="torque")
+    seen: list[float] = []
+
+    def look(tick: Tick) -> None:
+        if len(seen) == 0:
+            loop.change_control({"translational_stiffness": 500.0, "position_gain": 5.0})
+        assert isinstance(loop.drive, TorqueDrive)
+        seen.append(loop.drive.impedance.in_force("left")["translational_stiffness"])
+
+    loop.listeners.append(look)
+    loop.run(1.0, realtime=False)
+    assert seen[-1] == 500.0
+    assert np.abs(np.diff(seen)).max() < 10.0
+    with pytest.raises(ConfigError, match="translational_stiffness"):
+        loop.change_control({"translational_stiffness": -1.0})
+    with pytest.raises(ConfigError, match="translational_stiffness"):
+        pipeline().change_control({"translational_stiffness": 500.0})
 
 
 def test_a_mark_without_a_recording_is_refused() -> None:

@@ -97,6 +97,31 @@ def test_the_output_is_continuous_when_the_stream_has(arrivals: list[tuple[float
     assert largest_step(arrivals) < 0.006
 
 
+def speeds(arrivals: list[tuple[float, float]], velocity: float, since: float) -> np.ndarray:
+    """Of the output after a time, for samples of a steady hand, each with when it is measured and received [s]."""
+    pose_filter = PoseFilter(FilterSettings())
+    pose_filter.reset(floats_of(pose()), 0.0)
+    outputs, queue = [], list(arrivals)
+    for tick in range(3000):
+        now = tick * 0.001
+        while queue and queue[0][1] <= now:
+            measured, received = queue.pop(0)
+            pose_filter.add(floats_of(pose(velocity * measured)), received, now)
+        outputs.append(pose_filter.at(now)[0][0])
+    return np.diff(outputs)[round(since / 0.001) :] / 0.001
+
+
+def test_jitter_of_receipt_hardly_looks_like_speed() -> None:
+    late = np.random.default_rng(5).exponential(0.0015, 300).clip(max=0.01)
+    arrivals = [(n / 75, n / 75 + late[n]) for n in range(300)]
+    assert np.std(speeds(arrivals, 0.5, 1.0)) < 0.04 * 0.5
+
+
+def test_what_was_missed_in_a_gap_is_made_up_for_at_no_more_than_some_times_the_speed() -> None:
+    arrivals = [(n / 75, n / 75) for n in range(300) if not 1.5 < n / 75 < 1.6]
+    assert speeds(arrivals, 0.5, 1.0).max() < 3.5 * 0.5
+
+
 def test_a_rotation_that_is_filtered_for_long_stays_one() -> None:
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(STILL), 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -82,9 +82,9 @@ def test_a_hand_that_sets_off_is_followed_without_a_jump_and_at_once(speed: floa
     filtered.run(1.0, speed)
     filtered.run(3.0)
     drawn, plain = places(filtered.drawn), places(filtered.plain)
-    assert np.linalg.norm(drawn - plain, axis=1).max() < max(0.45e-3, 2e-3 * min(speed, 0.6))
+    assert np.linalg.norm(drawn - plain, axis=1).max() < max(0.45e-3, 2e-3 * speed)
     steps = np.linalg.norm(np.diff(drawn[round(0.5 / TICK) :], axis=0), axis=1) / TICK
-    assert steps.max() < 1.05 * speed + 0.025
+    assert steps.max() < 1.2 * speed + 0.025
     # Once it moves, and faster than the noise, it is the filter's alone.
     if speed >= 0.03:
         moving = slice(round(2.3 / TICK), round(2.95 / TICK))
@@ -92,8 +92,11 @@ def test_a_hand_that_sets_off_is_followed_without_a_jump_and_at_once(speed: floa
     assert np.linalg.norm(drawn[-1] - filtered.hand.translation) < 0.1e-3
 
 
+@dataclass
 class NoisyOperator(Operator):
     """Its headset is noisy; its tools are where their targets are."""
+
+    noise: float = NOISE
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -103,7 +106,7 @@ class NoisyOperator(Operator):
     def _noisy(self, received: HandSample) -> HandSample:
         turn = pin.exp3(self._random.normal(0.0, TURN_NOISE, 3))
         rotation = turn @ pin.Quaternion(*received.quaternion[[3, 0, 1, 2]]).toRotationMatrix()
-        position = received.position + self._random.normal(0.0, NOISE, 3)
+        position = received.position + self._random.normal(0.0, self.noise, 3)
         return replace(received, position=position, quaternion=pin.Quaternion(rotation).coeffs())
 
     def follow(self, seconds: float) -> None:
@@ -112,8 +115,9 @@ class NoisyOperator(Operator):
 
 
 @pytest.mark.slow
-def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool() -> None:
-    driver = NoisyOperator()
+@pytest.mark.parametrize(("noise", "within"), [(NOISE, 0.5e-3), (3.0 * NOISE, 1e-3), (5.0 * NOISE, 2e-3)])
+def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool(noise: float, within: float) -> None:
+    driver = NoisyOperator(noise=noise)
     start = dict(driver.tools)
     after_engaging = []
     for _ in range(100):
@@ -125,9 +129,9 @@ def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool(
         driver.press(*SIDES)
         assert driver.states == PAUSED
     for arm in SIDES:
-        assert np.linalg.norm(driver.tools[arm].translation - start[arm].translation) < 0.5e-3
+        assert np.linalg.norm(driver.tools[arm].translation - start[arm].translation) < within, noise
         assert angle(driver.tools[arm], start[arm]) < 1e-3
-    assert np.mean(after_engaging) < 0.05e-3
+    assert np.mean(after_engaging) < within / 10.0
 
 
 @pytest.mark.parametrize("turning", [0.1, 6.0])

@@ -65,7 +65,7 @@ def test_no_more_pages_than_a_few_connect(door: Door) -> None:
     origin, headers = Origin(f"http://127.0.0.1:{door.port}"), {"Cookie": f"q2r2_page={query}"}
     pages = [
         connect(f"ws://127.0.0.1:{door.port}", origin=origin, subprotocols=protocol, additional_headers=headers)
-        for _ in range(8)
+        for _ in range(12)
     ]
     assert not admitted(door, origin, headers["Cookie"])
     for page in pages:

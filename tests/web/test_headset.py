@@ -22,14 +22,18 @@ UPPER = {"left": "y-button", "right": "b-button"}
 ORANGE = (255.0, 107.0, 13.0)  # of the arms' rings
 
 
+def emulated() -> str:
+    """The script of a headset that is not there, and of what the tests ask it."""
+    assert EMULATOR.exists(), f"{EMULATOR} is missing: make test-web fetches it with npm"
+    return f"{EMULATOR.read_text()};{Path(__file__).with_name('emulator.js').read_text()}"
+
+
 @pytest.fixture
 def enter(open_page: Open) -> Any:
     """Open a page in an emulated headset, and enter VR or AR."""
-    assert EMULATOR.exists(), f"{EMULATOR} is missing: make test-web fetches it with npm"
-    script = f"{EMULATOR.read_text()};{Path(__file__).with_name('emulator.js').read_text()}"
 
     def enter_one(url: str, mode: str = "vr") -> Page:
-        page = open_page(url, script)
+        page = open_page(url, emulated())
         page.set_viewport_size({"width": 320, "height": 220})
         begin(page, mode)
         return page

@@ -73,7 +73,7 @@ def test_watchers_garbage_and_a_page_that_stands_still_change_nothing(
     with ExitStack() as stack:
 
         def crowd() -> None:
-            for _ in range(6):  # which read nothing
+            for _ in range(10):  # which read nothing
                 stack.callback(joined(url).close)
 
         def garbage() -> None:

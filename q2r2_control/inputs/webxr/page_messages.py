@@ -41,6 +41,7 @@ class PageMessage(_PageModel):
 
     seq: int = Field(ge=0, le=1 << 53)
     hands: dict[_Hand, PageHand] = Field(default_factory=dict)
+    virtual: bool = False  # keys or a gamepad move the hands, which rest without noise
 
     @property
     def controls(self) -> dict[str, tuple[bool, ...]]:
@@ -59,7 +60,7 @@ class PageMessage(_PageModel):
                 fault = fault or HandFault.UNTRACKED
             else:
                 pose = HandPose(np.array(hand.pose[:3]), np.array(hand.pose[3:]), 0.0, "")
-            found.append(_reception(name, MessageType.POSE, pose, fault))
+            found.append(_reception(name, MessageType.POSE, pose, fault)._replace(virtual=self.virtual))
             found.append(_reception(name, MessageType.INPUTS, inputs))
         return found
 

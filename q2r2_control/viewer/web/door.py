@@ -17,7 +17,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.page_door import PageDoor, text_response
 
 _COOKIE = "q2r2_page"
-_MOST_CLIENTS = 8
+_MOST_CLIENTS = 12
 _LONGEST_MESSAGE = 1 << 20  # from a browser [bytes]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ class PageSetup:
     joint_names: tuple[str, ...]
     joints: Mapping[str, Array]  # of each arm, indices of ``joint_names``
     fingers: Mapping[str, tuple[str, ...]]  # of each arm, joints of its gripper
+    tools: Mapping[str, int]  # of each arm, the frame of its tool in ``model``
     home: Array  # (nv,) [rad]
     lower: Array  # (nv,) position limits [rad]
     upper: Array
@@ -36,6 +37,7 @@ class PageSetup:
     recorded: bool  # whether a recorder runs
     driven: bool  # whether the page is the run's input
     replayed: bool  # whether the run is a recorded one
+    yields: bool  # whether springs hold the arms, as in torque mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,7 @@ class Frame:
     slowest: float  # tick among them [s]
     moved: Array | None  # MuJoCo's positions of all that moves
     end: float = 0.0  # of what can be shown of a replay, by its time [s]
+    ages: Mapping[str, float] = field(default_factory=dict)  # of the newest pose of each arm's hand [s]
 
 
 class Ready(NamedTuple):
@@ -75,6 +78,8 @@ class PageSetting(StrEnum):
     """The settings that a page's sliders change."""
 
     SPEED = "speed"  # part of the cell's speeds of a tool
+    STIFFNESS = "stiffness"  # part of the cell's, of torque mode
+    DAMPING = "damping"  # ratio, of torque mode
     SCALE = "scale"  # teleop.position_scale
 
 
@@ -99,6 +104,7 @@ class PageRequest(StrEnum):
     """The requests of the page's buttons."""
 
     STOP = "stop"
+    ENGAGE = "engage"
     PAUSE = "pause"
     HOME = "home"
     RECORD = "record"

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 import viser
 
-from q2r2_control.events import Event
+from q2r2_control.config.bindings import Action
+from q2r2_control.events import Event, ReasonKind
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.live import next_press, why
 from q2r2_control.viewer.state_colours import AMBER, GREEN, RED, state_colour
@@ -25,10 +26,16 @@ from q2r2_control.viewer.web.exchange import (
     PageSetting,
     PageSetup,
 )
+from q2r2_control.wording import sentence
 
 _PERIOD = 0.2  # of the table [s]
 _HISTORY = 150  # values of the plots
 _NEAR_LIMIT = 0.05  # of a joint's range
+_EPISODES = 12  # lines of them
+_OF_EPISODES = (
+    *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
+    *(ReasonKind.EPISODE_DISCARDED, ReasonKind.MARK, ReasonKind.VERDICT),
+)
 _STYLE = "font-size:12px;line-height:1.35;padding:0 0.6em 0.4em"
 
 
@@ -43,6 +50,7 @@ class Panel:
         self._names = {arm: [setup.joint_names[index] for index in joints] for arm, joints in setup.joints.items()}
         self._last: dict[str, Event] = {}  # of each arm
         self._binding: dict[ActiveLimit, None] = {}
+        self._told: list[tuple[str, str]] = []  # of episodes, and when
         self._ticks, self._slowest = 0, 0.0
         self._rates, self._times = deque[float](maxlen=_HISTORY), deque[float](maxlen=_HISTORY)  # [Hz], [us]
         self._moved: dict[PageSetting, float] = {}  # sliders
@@ -57,15 +65,22 @@ class Panel:
         else:
             self._add_buttons(gui)
         self._table = gui.add_html("")
+        self._episodes = gui.add_html("", visible=False)
         if driving is not None:
             with gui.add_folder("Grippers", expand_by_default=False):
                 driving.add_buttons(gui)
         if not setup.replayed:
             self._add_settings(gui)
+            with gui.add_folder("Controls of a hand", expand_by_default=False):
+                gui.add_html(_table(self._bindings.meanings().items()))
 
     def _add_settings(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Settings", expand_by_default=False):
             self._add_slider(gui, "speed [%]", PageSetting.SPEED, (5.0, 100.0, 5.0, 100.0), 0.01)
+            if self._setup.yields:
+                ratio = self._setup.config.impedance.damping_ratio
+                self._add_slider(gui, "stiffness [%]", PageSetting.STIFFNESS, (10.0, 100.0, 5.0, 100.0), 0.01)
+                self._add_slider(gui, "damping ratio", PageSetting.DAMPING, (0.3, 2.0, 0.05, ratio))
             if self._driving is None:
                 scale = self._setup.config.teleop.position_scale
                 self._add_slider(gui, "hand scale", PageSetting.SCALE, (0.1, max(2.0, scale), 0.05, scale))
@@ -73,6 +88,7 @@ class Panel:
     def _add_buttons(self, gui: viser.GuiApi) -> None:
         buttons = [
             ("Stop: rest, and end the run", PageRequest.STOP, "red"),
+            *([("Engage both arms", PageRequest.ENGAGE, "green")] if self._engages_by_press else []),
             ("Pause both arms", PageRequest.PAUSE, "orange"),
             ("Bring both arms home", PageRequest.HOME, "blue"),
         ]
@@ -87,6 +103,10 @@ class Panel:
                 self._answer(request)
 
             gui.add_button(label, color=colour).on_click(ask)
+
+    @property
+    def _engages_by_press(self) -> bool:
+        return any(one.action is Action.PAUSE_TOGGLE for one in self._bindings.bound())
 
     def _add_time_line(self, gui: viser.GuiApi) -> None:
         gui.add_button("Play, or stand still", color="blue").on_click(lambda _: self._answer(PagePlay()))
@@ -118,6 +138,8 @@ class Panel:
     def follow(self, frame: Frame) -> None:
         """Keep what a frame says that may be shown later."""
         self._last |= {event.arm: event for event in frame.events}
+        told = {(event.t, event.kind): event for event in frame.events if event.kind in _OF_EPISODES}  # by both arms
+        self._told += [(f"{event.t:.1f} s", sentence(event.reason)) for event in told.values()]
         self._binding |= dict.fromkeys(frame.binding)
         self._ticks += frame.ticks
         self._slowest = max(self._slowest, frame.slowest)
@@ -133,6 +155,8 @@ class Panel:
             self._times.append(1e6 * slowest)
             binding, self._binding = list(self._binding), {}
             self._table.content = self._drawn(frame, binding)
+            if self._told and not self._setup.replayed:  # of a replay, each frame has the last events
+                self._episodes.content, self._episodes.visible = _table(self._told[-_EPISODES:]), True
             if (line := self._time_line) is not None and frame.tick.t != line.value:
                 line.max = max(frame.end, line.max)
                 line.value = frame.tick.t
@@ -148,6 +172,7 @@ class Panel:
             ("why", [escape(why(tick, arm, self._names[arm], binding, self._last.get(arm))) for arm in arms]),
             ("next press", [escape(next_press(tick, arm, self._bindings)) for arm in arms]),
             ("off its target", [_distance(tick.tracking_error(arm)[0]) for arm in arms]),
+            ("hand's age", [_milliseconds(frame.ages.get(arm)) for arm in arms]),
             ("tool [m]", ["{:.3f} {:.3f} {:.3f}".format(*tick.tools[arm].translation) for arm in arms]),
             ("gripper", [_share(tick.grippers.get(arm)) for arm in arms]),
             ("joints", [self._bars(frame, arm) for arm in arms]),
@@ -195,6 +220,15 @@ def _coloured(text: str, colour: tuple[int, int, int]) -> str:
 
 def _distance(metres: float) -> str:
     return f"{1e3 * metres:.1f} mm" if np.isfinite(metres) else "-"
+
+
+def _milliseconds(age: float | None) -> str:
+    return "-" if age is None else f"{1e3 * age:.0f} ms"
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> str:
+    cells = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in rows)
+    return f"<div style='{_STYLE}'><table>{cells}</table></div>"
 
 
 def _share(opening: float | None) -> str:

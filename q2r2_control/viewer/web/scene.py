@@ -9,9 +9,9 @@ import pinocchio as pin
 import viser
 
 from q2r2_control.robot.pairs import pair_names
-from q2r2_control.types import Array
+from q2r2_control.types import Array, RobotState
 from q2r2_control.viewer.joint_tree import Colour, JointTree, colour_of
-from q2r2_control.viewer.state_colours import GREEN, GREY, RED, state_colour
+from q2r2_control.viewer.state_colours import AMBER, GREEN, GREY, RED, state_colour
 from q2r2_control.viewer.web.exchange import Frame, PageSetup
 from q2r2_control.viewer.web.figure import CapsuleFigure, RobotFigure, place
 
@@ -20,6 +20,9 @@ _TRAIL = 90  # points
 _TRAIL_PERIOD = 0.05  # between them, by the run's time [s]
 _BREAK = 1.0  # a trail begins anew after a longer time [s]
 _AWAY = 0.01  # the ghost shows where a joint is farther from its reference than this [rad]
+_SHORT = 0.01  # lines that are not drawn [m]
+_PER_NEWTON = 0.005  # length of a force [m/N]
+_SINGULAR = 0.05  # directions that the joints feel by less do not count
 _NEAR = 0.1  # a pair with more to spare is calm [m]
 _CAMERA = np.array([2.0, 1.0, 1.1])  # from the middle of the arms [m]
 FIELD_OF_VIEW = math.radians(40.0)  # of the camera, upwards
@@ -75,11 +78,18 @@ class CellScene:
             first = self._data.oMi[self._model.getJointId(setup.joint_names[joints[0]])].translation
             scene.add_label(f"/names/{arm}", arm, position=first, anchor="top-center")
         nothing = np.zeros((_TRAIL - 1, 2, 3), dtype=np.float32)
+        # The way of each tool, and thinner that of its target, which is the hand's.
         self._trails = {
-            arm: scene.add_line_segments(f"/trails/{arm}", nothing, _faded(colour), line_width=2.5)
+            (arm, kind): scene.add_line_segments(f"/trails/{arm}_{kind}", nothing, _faded(colour), line_width=width)
             for arm, colour in zip(arms, _TRAIL_COLOURS, strict=False)
+            for kind, width in (("tool", 2.5), ("hand", 1.0))
         }
-        self._trail_points: dict[str, Array] = {}
+        self._trail_points: dict[tuple[str, str], Array] = {}
+        no_line = np.zeros((1, 2, 3))
+        self._leashes = {
+            arm: scene.add_line_segments(f"/leashes/{arm}", no_line, AMBER, line_width=2.0) for arm in arms
+        }
+        self._forces = {arm: scene.add_line_segments(f"/forces/{arm}", no_line, RED, line_width=5.0) for arm in arms}
         self._trail_time = -math.inf
         self._pair = scene.add_line_segments("/tightest_pair", np.zeros((1, 2, 3)), GREY, line_width=4.0)
         self._pair_label = scene.add_label("/tightest_pair_distance", "", anchor="bottom-center", visible=False)
@@ -129,6 +139,8 @@ class CellScene:
             if target is not None:
                 node.origin_color = state_colour(tick.states[arm])
                 place(node, target)
+            self._show_line(self._leashes[arm], tool, None if target is None else target.translation - tool.translation)
+            self._show_line(self._forces[arm], tool, self._force(arm, tick.state))
         self._show_trails(frame)
         self._show_pair(frame)
         for name, box in self._parts.items():
@@ -137,6 +149,22 @@ class CellScene:
                 box.position, box.wxyz = frame.moved[at : at + 3], frame.moved[at + 3 : at + 7]
                 box.visible = True
 
+    def _show_line(self, line: viser.LineSegmentsHandle, tool: pin.SE3, way: Array | None) -> None:
+        """A line from a ``tool`` along ``way`` (3,) [m], if that is long enough to be seen."""
+        line.visible = way is not None and float(np.linalg.norm(way)) > _SHORT
+        if line.visible:
+            line.points = np.array([[tool.translation, tool.translation + way]])
+
+    def _force(self, arm: str, state: RobotState) -> Array | None:
+        """The force on a tool, drawn as a way (3,) [m]; None: the plant does not tell."""
+        if state.tau_external is None:
+            return None
+        frame, joints = self._setup.tools[arm], self._setup.joints[arm]
+        world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        jacobian = pin.computeFrameJacobian(self._model, self._data, state.q, frame, world)[:, joints]
+        wrench = np.linalg.lstsq(jacobian.T, state.tau_external[joints], rcond=_SINGULAR)[0]
+        return _PER_NEWTON * wrench[:3]
+
     def _show_trails(self, frame: Frame) -> None:
         tick = frame.tick
         if 0.0 <= tick.t - self._trail_time < _TRAIL_PERIOD:
@@ -144,11 +172,17 @@ class CellScene:
         if not 0.0 <= tick.t - self._trail_time < _BREAK:
             self._trail_points.clear()  # a replay's time line was moved
         self._trail_time = tick.t
-        for arm, trail in self._trails.items():
-            here = tick.tools[arm].translation.astype(np.float32)
-            points = self._trail_points.get(arm)
+        for (arm, kind), trail in self._trails.items():
+            target = tick.targets[arm].pose
+            trail.visible = kind == "tool" or target is not None
+            if kind == "hand" and target is None:
+                self._trail_points.pop((arm, kind), None)
+                continue
+            pose = tick.tools[arm] if kind == "tool" or target is None else target
+            here = pose.translation.astype(np.float32)
+            points = self._trail_points.get((arm, kind))
             points = np.tile(here, (_TRAIL, 1)) if points is None else np.vstack([points[1:], here])
-            self._trail_points[arm] = points
+            self._trail_points[arm, kind] = points
             trail.points = np.stack([points[:-1], points[1:]], axis=1)
 
     def _show_pair(self, frame: Frame) -> None:

@@ -59,11 +59,13 @@ class PageView(AbstractContextManager["PageView"]):
         self._events: list[Event] = []
         self._binding: dict[ActiveLimit, None] = {}
         self._ticks, self._slowest = 0, 0.0
+        self._heard: dict[str, float] = {}  # hand -> when its newest pose came, by the loop's clock [s]
         self._plant: MujocoPlant | None = None  # whose loose objects are shown
         self._input: WebInput | None = None  # that the page drives
         self._requests: dict[PageRequest, Callable[[], None]] = {}
         self._on_request: Callable[[Any], None] | None = None  # instead of the run
         self._changes: dict[PageSetting, Callable[[float], None]] = {}
+        self._hand_of: Callable[[str], str]  # that drives an arm
         try:
             # Room for one frame: a newer one is better than a queue.
             self._process = HelperProcess("serves the page", "q2r2_control.viewer.web.server", self._on_answer, room=1)
@@ -99,12 +101,13 @@ class PageView(AbstractContextManager["PageView"]):
             parts = {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in names}
         self._requests = {
             PageRequest.STOP: pipeline.stop,
+            PageRequest.ENGAGE: pipeline.engage,
             PageRequest.PAUSE: pipeline.pause,
             PageRequest.HOME: pipeline.go_home,
             PageRequest.RECORD: partial(pipeline.mark, Action.RECORD_TOGGLE),
             PageRequest.MARK: partial(pipeline.mark, Action.RECORD_MARK),
         }
-        self._changes = _changes_of(pipeline)
+        self._changes, self._hand_of = _changes_of(pipeline), lambda arm: pipeline.teleop.hand_of(arm)
         setup = PageSetup(
             host=self._host,
             port=self._port,
@@ -114,6 +117,7 @@ class PageView(AbstractContextManager["PageView"]):
             joint_names=robot.joint_names,
             joints={arm: its.joints for arm, its in robot.arms.items()},
             fingers={arm: its.finger_joints for arm, its in robot.arms.items()},
+            tools={arm: its.frame_id for arm, its in robot.arms.items()},
             home=robot.home,
             lower=robot.position_lower,
             upper=robot.position_upper,
@@ -123,6 +127,7 @@ class PageView(AbstractContextManager["PageView"]):
             recorded=recorded,
             driven=self._input is not None,
             replayed=replayed,
+            yields=pipeline.drive.yields,
         )
         self._process.send(setup)
         waited = 0.0
@@ -144,6 +149,8 @@ class PageView(AbstractContextManager["PageView"]):
         """Store one tick, and send it where a frame is due."""
         self._ticks += 1
         self._slowest = max(self._slowest, tick.compute_time)
+        for sample in tick.samples:
+            self._heard[sample.hand] = sample.pose_stamp
         if tick.events:
             self._events += tick.events
         if tick.reference.report.binding:
@@ -156,7 +163,9 @@ class PageView(AbstractContextManager["PageView"]):
             _logger.warning("the page is gone, the run goes on: %s", self._process.fault)
             return
         moved = None if self._plant is None else self._plant.observed_qpos
-        frame = Frame(tick, tuple(self._events), tuple(self._binding), self._ticks, self._slowest, moved)
+        stamps = {arm: self._heard.get(self._hand_of(arm)) for arm in tick.tools}
+        ages = {arm: tick.now - stamp for arm, stamp in stamps.items() if stamp is not None}
+        frame = Frame(tick, tuple(self._events), tuple(self._binding), self._ticks, self._slowest, moved, ages=ages)
         if self.send(frame):
             self._due = now + _PERIOD
             self._events, self._binding, self._ticks, self._slowest = [], {}, 0, 0.0
@@ -185,15 +194,27 @@ class PageView(AbstractContextManager["PageView"]):
 
 def _changes_of(pipeline: Pipeline) -> dict[PageSetting, Callable[[float], None]]:
     """The effect of each slider: speeds stay below the cell's, and a number that is not allowed changes nothing."""
-    control, teleop = pipeline.config.control, pipeline.config.teleop
+    control, teleop, impedance = pipeline.config.control, pipeline.config.teleop, pipeline.config.impedance
 
     def limit_speed(part: float) -> None:
         part = min(part, 1.0)
         names = ("max_linear_speed", "max_angular_speed")
         pipeline.change_control({name: part * getattr(control, name) for name in names})
 
+    def stiffen(part: float) -> None:
+        names = ("translational_stiffness", "rotational_stiffness")
+        pipeline.change_control({name: part * getattr(impedance, name) for name in names})
+
+    def damp(ratio: float) -> None:
+        pipeline.change_control({"damping_ratio": ratio})
+
     def scale(factor: float) -> None:
         with suppress(ValidationError):
             pipeline.change_teleop(TeleopSettings.model_validate(teleop.model_dump() | {"position_scale": factor}))
 
-    return {PageSetting.SPEED: limit_speed, PageSetting.SCALE: scale}
+    return {
+        PageSetting.SPEED: limit_speed,
+        PageSetting.STIFFNESS: stiffen,
+        PageSetting.DAMPING: damp,
+        PageSetting.SCALE: scale,
+    }

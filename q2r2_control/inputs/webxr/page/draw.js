@@ -5,6 +5,12 @@ const WORLD = new Float32Array([0, 0, -1, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -0.7
 const BOARD = new Float32Array([0.6, 0, 0, 0, 0, 0.375, 0, 0, 0, 0, 1, 0, 0, 1.75, -2.0, 1]); // 1.2 m wide
 const AXES = [[0.9, 0.2, 0.2], [0.2, 0.75, 0.3], [0.25, 0.45, 0.95]];
 const [LENGTH, THICKNESS, KNOB] = [0.1, 0.004, 0.02]; // of a target's axes, and its middle [m]
+const FIELD_OF_VIEW = 0.9; // of the page, upwards [rad]
+const [DOWN, ACROSS] = [Math.sin(0.25), Math.cos(0.25)]; // of a look from 1.6 m up and 1.2 m behind
+const BEHIND = new Float32Array([
+  1, 0, 0, 0, 0, ACROSS, DOWN, 0, 0, -DOWN, ACROSS, 0,
+  0, -1.6 * ACROSS + 1.2 * DOWN, -1.6 * DOWN - 1.2 * ACROSS, 1,
+]);
 const GHOST = 0.45; // opacity in the operator's own room
 
 const SHAPES = {
@@ -52,6 +58,24 @@ function boxOf(low, high) {
     for (let axis = 0; axis < 3; axis++) vertices.push((corner >> axis) & 1 ? high[axis] : low[axis]);
   const faces = [0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4, 2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5];
   return { vertices, faces };
+}
+
+// Where each eye of a headset's frame is drawn, and how it sees; none where the head is not tracked.
+export function eyesOf(frame, space) {
+  const layer = frame.session.renderState.baseLayer;
+  return (frame.getViewerPose(space)?.views ?? [])
+    .map((eye) => {
+      const { x, y, width, height } = layer.getViewport(eye);
+      return { x, y, width, height, view: times(eye.projectionMatrix, eye.transform.inverse.matrix) };
+    })
+    .filter(({ width }) => width > 0);
+}
+
+// Of a screen so many times as wide as high.
+function projection(aspect) {
+  const [near, far, scale] = [0.1, 20, 1 / Math.tan(FIELD_OF_VIEW / 2)];
+  const depth = [(far + near) / (near - far), (2 * far * near) / (near - far)];
+  return new Float32Array([scale / aspect, 0, 0, 0, 0, scale, 0, 0, 0, 0, depth[0], -1, 0, 0, depth[1], 0]);
 }
 
 export class Drawing {
@@ -114,12 +138,19 @@ export class Drawing {
     session.updateRenderState({ baseLayer: new XRWebGLLayer(session, gl) });
   }
 
-  draw(frame, space, state, panel, transparent) {
+  // On the page itself, as seen from behind the robot.
+  drawOnPage(state, panel) {
+    if (!this.gl) return;
+    const { canvas } = this.gl;
+    [canvas.width, canvas.height] = [canvas.clientWidth, canvas.clientHeight];
+    const [width, height] = [canvas.width, canvas.height];
+    const view = times(projection(width / height), BEHIND);
+    this.draw(null, [{ x: 0, y: 0, width, height, view }], state, panel, false);
+  }
+
+  draw(framebuffer, eyes, state, panel, transparent) {
     const { gl } = this;
-    const pose = frame.getViewerPose(space);
-    const layer = frame.session.renderState.baseLayer;
-    if (!pose) return;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, layer.framebuffer);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.clearColor(...(transparent ? [0, 0, 0, 0] : [0.93, 0.945, 0.957, 1]));
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
@@ -131,11 +162,8 @@ export class Drawing {
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, panel.canvas);
       gl.generateMipmap(gl.TEXTURE_2D);
     }
-    for (const eye of pose.views) {
-      const { x, y, width, height } = layer.getViewport(eye);
-      if (width === 0) continue; // an eye that is not shown
+    for (const { x, y, width, height, view } of eyes) {
       gl.viewport(x, y, width, height);
-      const view = times(eye.projectionMatrix, eye.transform.inverse.matrix);
       gl.useProgram(this.boards.program);
       gl.uniformMatrix4fv(this.boards.view, false, view);
       this.show(this.boards, this.board, BOARD);

@@ -49,14 +49,14 @@ export class Link {
     this.socket = socket;
   }
 
-  // Send the hands, unless earlier ones still wait here.
-  send(hands) {
+  // Send the hands, unless earlier ones still wait here. `virtual` ones are moved by keys.
+  send(hands, virtual = false) {
     const now = performance.now();
     const waits = !this.open || this.socket.bufferedAmount > 0;
     this.loss += 0.02 * ((waits ? 1 : 0) - this.loss);
     if (waits) return;
     this.sequence += 1;
-    this.socket.send(JSON.stringify({ seq: this.sequence, hands }));
+    this.socket.send(JSON.stringify({ seq: this.sequence, hands, virtual }));
     this.last = now;
     this.sent.set(this.sequence, now);
     this.sent.delete(this.sequence - REMEMBERED);

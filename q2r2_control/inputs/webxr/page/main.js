@@ -1,6 +1,7 @@
 // The page: enters VR or AR, sends the hands once a frame, shows what the run says.
 
-import { Drawing } from "./draw.js";
+import { Drawing, eyesOf } from "./draw.js";
+import { Flying, HELP } from "./fly.js";
 import { Hands } from "./hands.js";
 import { Link } from "./link.js";
 import { Panel } from "./panel.js";
@@ -13,6 +14,7 @@ const drawing = new Drawing(element("scene"));
 const panel = new Panel();
 let hands = new Hands();
 let session = null;
+let flying = null; // hands that keys or a gamepad move
 let state = null; // of the run, as it came last
 let movedUntil = 0;
 
@@ -39,6 +41,7 @@ function facing(frame, floor) {
 }
 
 async function enter(mode) {
+  land();
   const entered = await navigator.xr.requestSession(mode, {
     requiredFeatures: ["local-floor"],
     optionalFeatures: ["hand-tracking"],
@@ -66,16 +69,45 @@ async function enter(mode) {
     if (space === null || entered.visibilityState !== "visible") return;
     link.send(hands.read(frame, space, performance.now() < movedUntil));
     panel.draw(state, link);
-    drawing.draw(frame, space, state, panel, mode === "immersive-ar");
+    drawing.draw(entered.renderState.baseLayer.framebuffer, eyesOf(frame, space), state, panel, mode === "immersive-ar");
   };
   entered.requestAnimationFrame(onFrame);
   show();
+}
+
+function fly() {
+  if (flying) return land();
+  const begun = (flying = new Flying());
+  element("fly").blur();
+  element("advice").textContent = HELP;
+  document.body.classList.add("flying"); // which leaves the arms to be seen
+  const onFrame = () => {
+    if (flying !== begun) return;
+    requestAnimationFrame(onFrame);
+    link.send(begun.read(), true);
+    panel.draw(state, link);
+    drawing.drawOnPage(state, panel);
+  };
+  requestAnimationFrame(onFrame);
+}
+
+// No hand is flown any more, which stops the arms.
+function land() {
+  if (!flying) return;
+  link.send(flying.lost(), true);
+  flying.end();
+  flying = null;
+  document.body.classList.remove("flying");
+  element("advice").textContent = "";
 }
 
 function show() {
   const age = Number.isFinite(link.age) ? `, ${link.age.toFixed(0)} ms` : "";
   element("link").textContent = `${link.text}${age}, ${(100 * link.loss).toFixed(0)} % left out`;
   element("leave").hidden = session === null;
+  element("fly").hidden = session !== null;
+  element("stand").hidden = flying !== null;
+  element("fly").textContent = flying ? `Land; the ${flying.hand} hand moves` : "Fly by keyboard or gamepad";
   const rows = Object.entries(state?.arms ?? {}).map(([name, arm]) => {
     const row = document.createElement("tr");
     for (const text of [name, arm.state, arm.why, arm.next]) row.insertCell().textContent = text;
@@ -102,5 +134,7 @@ async function offer() {
 }
 
 element("leave").onclick = () => session?.end();
+element("fly").onclick = fly;
+document.addEventListener("visibilitychange", () => document.hidden && land());
 setInterval(show, 200);
 offer();

@@ -1,0 +1,130 @@
+"""Does a crowd on the page cost the loop anything: ten watchers, and a client that sends garbage without a pause?
+
+Two runs of q2r2 run --web in real time, in which scripted hands lead both arms round circles. In the second one
+watchers read all that the page sends, and a hostile client sends what no browser does, and connects anew whenever it is
+thrown out. They share this machine with the run, which those of another computer do not.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Annotated
+from urllib.parse import urlsplit
+
+import numpy as np
+import viser
+from typer import Option, run
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin, Subprotocol
+
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
+from q2r2_control.viewer.tables import record_table
+
+WATCHERS = 10
+_RUN = ("run", DEMO_CONFIG, "--input", "scripted", "--trajectory", "circle", "--plant", "kinematic")
+_PAGE = ("--headless", "--web", "--web-port", "0", "--json")
+NOTES = ("tracking: RMS of the worse tool behind its target", "logged: lines, and the most of them within one second")
+
+
+@dataclass(frozen=True)
+class RunFigures:
+    """One run; ticks in [us], from the inputs until the command is applied."""
+
+    name: str
+    loop_rate_hz: float
+    tick_p50: float
+    tick_p99: float
+    tracking_mm: float
+    fallback_ticks: int
+    garbage: int  # messages that were sent
+    logged: tuple[int, int]
+
+
+def joined(url: str) -> ClientConnection:
+    """A client as the page's own."""
+    host = urlsplit(url).netloc
+    protocol = [Subprotocol(f"viser-v{viser.__version__}")]
+    return connect(f"ws://{host}", origin=Origin(f"http://{host}"), subprotocols=protocol, max_size=None)
+
+
+class Crowd:
+    """Watchers, and one that is hostile."""
+
+    def __init__(self, url: str) -> None:
+        self._url, self._ended = url, threading.Event()
+        self.garbage = 0
+        self._threads = [threading.Thread(target=self._watch) for _ in range(WATCHERS)]
+        self._threads.append(threading.Thread(target=self._disturb))
+        for thread in self._threads:
+            thread.start()
+
+    def end(self) -> None:
+        self._ended.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _watch(self) -> None:
+        with suppress(ConnectionClosed, OSError), joined(self._url) as page:
+            while not self._ended.is_set():
+                with suppress(TimeoutError):
+                    page.recv(timeout=0.5)
+
+    def _disturb(self) -> None:
+        random = np.random.default_rng(0)
+        while not self._ended.is_set():
+            with suppress(ConnectionClosed, InvalidHandshake, OSError), joined(self._url) as page:
+                while not self._ended.is_set():
+                    page.send(random.bytes(int(random.integers(0, 4096))))
+                    self.garbage += 1
+
+
+def measure(name: str, duration: float, crowd: bool) -> RunFigures:
+    """Figures of one run of ``duration`` [s]."""
+    print_progress(name)
+    command = [sys.executable, "-m", "q2r2_control", *_RUN, *_PAGE, "--duration", f"{duration:g}"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    lines: list[float] = []  # when each came [s]
+    disturbers: list[Crowd] = []
+    for line in process.stderr:
+        if (found := re.search(r"page: (http\S+)", line)) is None:
+            lines.append(time.monotonic())
+        elif crowd:
+            disturbers.append(Crowd(found[1]))
+    for each in disturbers:
+        each.end()
+    summary = json_module.loads(process.stdout.read())
+    if process.wait():
+        sys.exit(f"the run has failed: {summary}")
+    most = max(Counter(int(at - lines[0]) for at in lines).values(), default=0)
+    return RunFigures(
+        name=name,
+        loop_rate_hz=summary["loop_rate_hz"],
+        tick_p50=summary["tick_us"]["p50"],
+        tick_p99=summary["tick_us"]["p99"],
+        tracking_mm=max(arm["position_error_mm_rms"] for arm in summary["arms"].values()),
+        fallback_ticks=summary["fallback_ticks"],
+        garbage=sum(each.garbage for each in disturbers),
+        logged=(len(lines), most),
+    )
+
+
+def main(duration: Annotated[float, Option(min=5.0, help="Of each run [s].")] = 60.0, json: Json = False) -> None:
+    """Measure a run alone, and one with a crowd on its page."""
+    figures = [measure("alone", duration, False), measure("with the crowd", duration, True)]
+    table = record_table(f"{WATCHERS} watchers and a hostile client on the page of a run", figures, NOTES)
+    print_report({"duration_s": duration, "runs": [asdict(each) for each in figures]}, (table,), json)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,84 @@
+// Hands without a headset: keys or a gamepad move them, one at a time. They go the way of a headset's from here on.
+
+const [SPEED, TURNING] = [0.15, 0.6]; // of a hand [m/s], [rad/s]
+const SLOWLY = 0.25; // with Shift
+const LONGEST = 0.05; // of a frame that a hand moves for [s]
+const DEAD = 0.12; // of a stick
+const START = { left: [0.3, 0.2, 1.1], right: [0.3, -0.2, 1.1] }; // x forward, y left, z up [m]
+// Each moves along or turns about an axis: 0 to 2 x y z, 3 to 5 about x y z.
+const KEYS = {
+  KeyW: [0, 1], KeyS: [0, -1], KeyA: [1, 1], KeyD: [1, -1], KeyE: [2, 1], KeyQ: [2, -1],
+  KeyO: [3, 1], KeyU: [3, -1], KeyK: [4, 1], KeyI: [4, -1], KeyJ: [5, 1], KeyL: [5, -1],
+};
+const LOWER = "Space", UPPER = "KeyG", HANDS = { Digit1: "left", Digit2: "right" };
+const PAD = { a: 0, b: 1, bumpers: { left: 4, right: 5 }, tilt: [[12, 4, 1], [13, 4, -1], [14, 3, -1], [15, 3, 1]] };
+
+export const HELP =
+  "1, 2: left or right hand. Space: engage or pause. W S A D E Q: move. I K J L U O: turn. G: gripper. Shift: slowly. " +
+  "Gamepad: sticks move, and turn about the vertical; cross tilts; bumpers choose the hand; A engages, B is the gripper.";
+
+// q after a turn by a small rotation vector, in the room's axes; x y z w.
+function turned([x, y, z, w], [a, b, c]) {
+  const [p, q, r] = [a / 2, b / 2, c / 2];
+  const next = [x + p * w + q * z - r * y, y + q * w + r * x - p * z, z + r * w + p * y - q * x, w - p * x - q * y - r * z];
+  const length = Math.hypot(...next);
+  return next.map((part) => part / length);
+}
+
+export class Flying {
+  constructor() {
+    this.hand = "left"; // that moves
+    this.keys = new Set(); // that are held
+    this.poses = Object.fromEntries(Object.entries(START).map(([hand, place]) => [hand, [...place, 0, 0, 0, 1]]));
+    this.then = performance.now();
+    this.listening = new AbortController();
+    const { signal } = this.listening;
+    addEventListener("keydown", (event) => {
+      if (!(event.code in KEYS || event.code in HANDS || [LOWER, UPPER].includes(event.code))) return;
+      event.preventDefault(); // Space would press the button that began this
+      this.keys.add(event.code);
+      this.hand = HANDS[event.code] ?? this.hand;
+    }, { signal });
+    addEventListener("keyup", (event) => this.keys.delete(event.code), { signal });
+    addEventListener("blur", () => this.keys.clear(), { signal });
+    for (const type of ["keydown", "keyup"]) addEventListener(type, (event) => (this.slow = event.shiftKey), { signal });
+  }
+
+  // Both hands, of which one has moved since the last frame.
+  read() {
+    const now = performance.now();
+    const dt = Math.min((now - this.then) / 1000, LONGEST);
+    this.then = now;
+    const pad = [...navigator.getGamepads()].find((one) => one?.mapping === "standard");
+    const pressed = (button) => Boolean(pad?.buttons[button].pressed);
+    for (const [hand, bumper] of Object.entries(PAD.bumpers)) if (pressed(bumper)) this.hand = hand;
+    const rates = [0, 0, 0, 0, 0, 0];
+    for (const key of this.keys) if (key in KEYS) rates[KEYS[key][0]] += KEYS[key][1];
+    for (const [button, axis, sign] of PAD.tilt) if (pressed(button)) rates[axis] += sign;
+    [1, 0, 3].forEach((stick, axis) => (rates[axis] -= this.stick(pad, stick)));
+    rates[5] -= this.stick(pad, 2);
+    const step = rates.map((rate, axis) => (this.slow ? SLOWLY : 1) * dt * (axis < 3 ? SPEED : TURNING) * rate);
+    const pose = this.poses[this.hand];
+    const place = pose.slice(0, 3).map((value, axis) => value + step[axis]);
+    this.poses[this.hand] = [...place, ...turned(pose.slice(3), step.slice(3))];
+    const buttons = [this.keys.has(UPPER) || pressed(PAD.b), this.keys.has(LOWER) || pressed(PAD.a), false];
+    const none = [false, false, false];
+    return Object.fromEntries(
+      Object.entries(this.poses).map(([hand, pose]) => [hand, { pose, buttons: hand === this.hand ? buttons : none }]),
+    );
+  }
+
+  stick(pad, index) {
+    const value = pad?.axes[index] ?? 0;
+    return Math.abs(value) < DEAD ? 0 : value;
+  }
+
+  // Both hands as untracked.
+  lost() {
+    return { left: { pose: null }, right: { pose: null } };
+  }
+
+  end() {
+    this.listening.abort();
+  }
+}
