@@ -19,6 +19,7 @@ SHARED = (
     *("ros_processes.py", "work_hands.py"),
 )
 SCRIPTS = sorted(file.name for file in FOLDER.glob("*.py") if file.name not in SHARED)
+NEEDED = {"ros": ("rclpy", "quest2ros"), "page": ("viser", "websockets")}  # by what a script's name begins with
 
 
 def run(script: str, *options: str) -> str:
@@ -29,8 +30,9 @@ def run(script: str, *options: str) -> str:
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_every_benchmark_says_what_it_asks(script: str) -> None:
-    if script.startswith("ros_") and any(find_spec(name) is None for name in ("rclpy", "quest2ros")):
-        pytest.skip("ROS 2 or quest2ros is not installed")
+    needed = NEEDED.get(script.split("_")[0], ())
+    if absent := [name for name in needed if find_spec(name) is None]:
+        pytest.skip(f"not installed: {', '.join(absent)}")
     text = (FOLDER / script).read_text(encoding="utf-8")
     assert "json" in inspect.signature(load_script(f"benchmarks/{script}").main).parameters or '"--json"' in text
     assert f"`{script}`" in (FOLDER / "README.md").read_text(encoding="utf-8")

@@ -69,6 +69,7 @@ class RequestedRun:
         :meth:`ImpedanceController.change` say how they come to count, and an event whether they did. Raises
         :class:`ConfigError` for a name or a value that is never allowed.
         """
+        check_kind("control", values, Mapping, "new values by name")
         springs = {} if self.impedance is None else {k: v for k, v in values.items() if k in LIVE_IMPEDANCE}
         check_springs(springs)
         self.config.control.changed({name: value for name, value in values.items() if name not in springs})

@@ -59,9 +59,9 @@ def test_clean_work_is_kept(seed: int, folder: Path) -> None:
     found = judged(record_episode(folder / str(seed), hands(seed)))
     assert found.verdict.line == "keep"
     for arm in found.figures.arms.values():
-        # Filters of 45 ms, and a controller that lets a motion that begins lag.
-        assert arm.hand_to_target_ms == pytest.approx(42.0, abs=6.0)
-        assert arm.hand_to_tool_ms == pytest.approx(58.0, abs=8.0)
+        # Filters of 35 ms, and a controller that lets a motion that begins lag.
+        assert arm.hand_to_target_ms == pytest.approx(33.0, abs=6.0)
+        assert arm.hand_to_tool_ms == pytest.approx(49.0, abs=8.0)
         assert arm.gripper_changes == 1
 
 
@@ -142,7 +142,8 @@ def test_a_damaged_recording_is_judged_by_what_is_before_the_damage(clean: Path,
     damaged.write_bytes(data)
     found = judged(damaged)
     assert found.verdict.reasons[0].name == "damaged"
-    assert found.figures.timing.ticks == 1000  # of 1017
+    lost = judged(clean).figures.timing.ticks - found.figures.timing.ticks
+    assert 0 < lost <= 50, "the ticks of the last chunk"
     (tmp_path / "cut.mcap").write_bytes(clean.read_bytes()[:-5000])
     assert "needs_end" in {reason.name for reason in judged(tmp_path / "cut.mcap").verdict.reasons}
 

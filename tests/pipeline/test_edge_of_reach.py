@@ -21,7 +21,7 @@ SECONDS, RATE = 110.0, 72.0  # of the hands [s], [Hz]
 LET_THROUGH = 1.0  # by the network, between two hold-ups [s]
 HELD_UP = 0.13, 0.165  # nine are ten samples long, the tenth is longer than the gate waits [s]
 FROM, BEYOND = -0.15, 0.15  # of the edge that tools are asked to be at [m]
-STALL = 0.15  # the longest in which a target moves and its tool does not [s]
+STALL = 0.16  # the longest in which a target moves and its tool does not: where that turns at its farthest [s]
 SLOW, STEP = 0.05, 9.0  # of a target that moves; a faster one was put elsewhere [m/s]
 _WAITS = 0.4  # an operator whose arm does not follow presses after this time [s]
 

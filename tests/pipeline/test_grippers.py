@@ -101,7 +101,7 @@ def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
     assert summary.fallback_ticks == summary.uncertified_ticks == 0
     jumps = [np.abs(second.reference.v - first.reference.v).max() for first, second in pairwise(watch.ticks)]
     gripped = next(i for i, tick in enumerate(watch.ticks) if tick.holding["right"])
-    assert max(jumps[gripped - 1 : gripped + 20]) < 4e-4  # [rad/s]; a hand that rests is averaged meanwhile
+    assert max(jumps[gripped - 1 : gripped + 20]) < 5e-4  # [rad/s]; a hand that rests is averaged meanwhile
 
 
 def test_a_run_after_one_that_ended_while_something_was_held_bears_no_weight_that_is_not_there() -> None:

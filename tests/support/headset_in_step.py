@@ -30,6 +30,7 @@ PRESS = 0.12  # longer than a chord's window [s]
 NOISE = 2e-5  # of a position [m]
 _PATIENCE = 60.0  # of the machine's time [s]
 _AT_REST = 0.5  # after an arm was let go, it has braked [s]
+_CREEP = 1e-5  # of an arm that is held where it stopped [m]
 _FASTEST, _FASTEST_TURN = 2.0, 8.0  # of a target [m/s], [rad/s]
 
 Script = Callable[["Operator"], Iterator[float]]
@@ -246,7 +247,7 @@ class NoCatchUp:
             self._before.pop(name, None)
             if tick.t - self._let_go[name] > _AT_REST:
                 rest = self._rests.setdefault(name, place)
-                assert math.dist(place, rest) < 1e-6, f"{name} moves without being engaged, at {tick.t:.3f} s"
+                assert math.dist(place, rest) < _CREEP, f"{name} moves without being engaged, at {tick.t:.3f} s"
 
     def _check_target(self, name: str, target: pin.SE3, tick: Tick) -> None:
         before = self._before.get(name)
