@@ -79,9 +79,8 @@ class FriCell:
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            stop = (
-                (1.0,) * JOINTS if deceleration is None else joints_of(deceleration[joints])
-            )  # one at rest needs none
+            # A reference at rest comes without a stop.
+            stop = (1.0,) * JOINTS if deceleration is None else joints_of(deceleration[joints])
             q, v = joints_of(command.q[joints]), joints_of(command.v[joints])
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)
             gripper, opening = self._grippers.get(arm), command.grippers.get(arm)
