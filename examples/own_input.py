@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from q2r2_control import Pipeline, load_config
-from q2r2_control.types import DeviceControls, HandInputs, HandSample, HapticFeedback
+from q2r2_control import DeviceControls, HandInputs, HandSample, HapticFeedback, Pipeline, load_config
 
 
 class SwingingHands:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from q2r2_control import Pipeline, Robot, load_config
-from q2r2_control.types import Array, Command, CommandMode, RobotState
+from q2r2_control import Command, CommandMode, Pipeline, Robot, RobotState, load_config
+from q2r2_control.types import Array
 
 
 class LaggingPlant:

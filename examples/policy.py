@@ -3,9 +3,8 @@
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control import Pipeline, load_config
-from q2r2_control.inputs.policy import PolicyInput
-from q2r2_control.types import Array, Observation
+from q2r2_control import Observation, Pipeline, PolicyInput, load_config
+from q2r2_control.types import Array
 
 
 class Circles:

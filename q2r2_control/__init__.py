@@ -16,20 +16,46 @@ if TYPE_CHECKING:  # "as" says to type checkers that a name is public
     from q2r2_control.control.controller import CartesianController as CartesianController
     from q2r2_control.errors import ConfigError as ConfigError
     from q2r2_control.errors import Q2R2Error as Q2R2Error
+    from q2r2_control.inputs.base import Input as Input
+    from q2r2_control.inputs.policy import PolicyInput as PolicyInput
     from q2r2_control.pipeline.pipeline import Pipeline as Pipeline
+    from q2r2_control.plants.base import Plant as Plant
     from q2r2_control.robot.robot import Robot as Robot
     from q2r2_control.summary.run_summary import RunSummary as RunSummary
     from q2r2_control.teleop.relative import RelativeMotion as RelativeMotion
+    from q2r2_control.types import Command as Command
+    from q2r2_control.types import CommandMode as CommandMode
+    from q2r2_control.types import DeviceControls as DeviceControls
+    from q2r2_control.types import HandInputs as HandInputs
+    from q2r2_control.types import HandSample as HandSample
+    from q2r2_control.types import HapticFeedback as HapticFeedback
+    from q2r2_control.types import Observation as Observation
+    from q2r2_control.types import Reference as Reference
+    from q2r2_control.types import RobotState as RobotState
+    from q2r2_control.types import StepReport as StepReport
 
 _MODULES = {
     "CartesianController": "control.controller",
+    "Command": "types",
+    "CommandMode": "types",
     "ConfigError": "errors",
     "ControllerSettings": "config.control",
+    "DeviceControls": "types",
+    "HandInputs": "types",
+    "HandSample": "types",
+    "HapticFeedback": "types",
+    "Input": "inputs.base",
+    "Observation": "types",
     "Pipeline": "pipeline.pipeline",
+    "Plant": "plants.base",
+    "PolicyInput": "inputs.policy",
     "Q2R2Error": "errors",
+    "Reference": "types",
     "RelativeMotion": "teleop.relative",
     "Robot": "robot.robot",
+    "RobotState": "types",
     "RunSummary": "summary.run_summary",
+    "StepReport": "types",
     "load_config": "config.cell",
 }
 __all__ = list(_MODULES)
