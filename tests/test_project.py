@@ -140,6 +140,11 @@ def test_the_configuration_reference_is_made_from_the_settings_of_now() -> None:
     assert made.FILE.read_text(encoding="utf-8") == made.reference(), "python docs/make_reference.py"
 
 
+def test_no_two_public_classes_share_a_name() -> None:
+    found = [name for path in NODES | OTHERS for name in re.findall(r"^class ([A-Z]\w*)", path.read_text(), re.M)]
+    assert {name for name in found if found.count(name) > 1} == set()
+
+
 @cache
 def anchors(page: Path) -> set[str]:
     """Those of its headings."""

@@ -21,7 +21,7 @@ class Display(Protocol):
 
 
 @dataclass(frozen=True)
-class PageSetup:
+class HeadsetPageSetup:
     """The first message to the process."""
 
     host: str
@@ -33,7 +33,7 @@ class PageSetup:
     display: Display | None
 
 
-class Ready(NamedTuple):
+class Listening(NamedTuple):
     """The first answer: it listens."""
 
     port: int
@@ -71,7 +71,7 @@ class Shown(NamedTuple):
     content: Any
 
 
-class Picture(NamedTuple):
+class CameraPicture(NamedTuple):
     """The newest picture of a camera."""
 
     jpeg: bytes

@@ -27,7 +27,7 @@ class _PageModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
-class PageHand(_PageModel):
+class HeadsetHand(_PageModel):
     """One hand. Its numbers may be anything, NaN included: the gate judges them, as those of every headset."""
 
     pose: _Seven | None  # position [m] and quaternion x y z w in the room: x forward, y left, z up; None: not known
@@ -40,7 +40,7 @@ class PageMessage(_PageModel):
     """One frame; one without hands says only that the page is alive."""
 
     seq: int = Field(ge=0, le=1 << 53)
-    hands: dict[_Hand, PageHand] = Field(default_factory=dict)
+    hands: dict[_Hand, HeadsetHand] = Field(default_factory=dict)
     virtual: bool = False  # keys or a gamepad move the hands, which rest without noise
 
     @property

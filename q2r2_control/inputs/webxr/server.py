@@ -32,7 +32,16 @@ from q2r2_control.inputs.listener import (
     written,
 )
 from q2r2_control.inputs.page_door import PageDoor, text_response
-from q2r2_control.inputs.webxr.exchange import Admitted, Logged, Lost, PageSetup, Picture, Ready, Received, Shown
+from q2r2_control.inputs.webxr.exchange import (
+    Admitted,
+    CameraPicture,
+    HeadsetPageSetup,
+    Listening,
+    Logged,
+    Lost,
+    Received,
+    Shown,
+)
 from q2r2_control.inputs.webxr.page_messages import LONGEST, PageMessage, read
 from q2r2_control.types import HapticFeedback
 
@@ -72,7 +81,7 @@ class PageClient(Peer):
 class PageServer:
     """Decides on pages as the TCP server does on headsets, by the same rules."""
 
-    def __init__(self, setup: PageSetup, door: PageDoor, answer: Callable[[Any], None]) -> None:
+    def __init__(self, setup: HeadsetPageSetup, door: PageDoor, answer: Callable[[Any], None]) -> None:
         self._setup, self._door, self._answer = setup, door, answer
         self._clock = time.monotonic
         self._log = HostLog(_logger_of(answer))
@@ -116,7 +125,7 @@ class PageServer:
             open_timeout=5.0,
             logger=quiet,
         ):
-            self._answer(Ready(self._door.port, self._door.url))
+            self._answer(Listening(self._door.port, self._door.url))
             Thread(target=pass_on, daemon=True).start()
             watch = asyncio.create_task(self._watch())
             await ended.wait()
@@ -206,7 +215,7 @@ class PageServer:
                 driver.vibrations[request.hand] = request
             case Shown():
                 driver.shown = request.content
-            case Picture():
+            case CameraPicture():
                 driver.picture = request.jpeg
                 return  # it goes after the next pose has come
         driver.due.set()
@@ -300,8 +309,8 @@ def _peer_of(connection: ServerConnection) -> tuple[str, str]:
 
 
 def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
-    """Answer :class:`Ready`, then what the page that drives sends. Raises :class:`ConfigError`."""
-    setup: PageSetup | None = next(requests, None)
+    """Answer :class:`Listening`, then what the page that drives sends. Raises :class:`ConfigError`."""
+    setup: HeadsetPageSetup | None = next(requests, None)
     if setup is not None:
         scheme = "http" if setup.certificate is None else "https"
         door = PageDoor(setup.host, setup.port, "--input webxr", setup.token, scheme)

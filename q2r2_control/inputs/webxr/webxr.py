@@ -27,12 +27,12 @@ from q2r2_control.inputs.webxr import usb
 from q2r2_control.inputs.webxr.certificate import installation_folder, installation_token, own_certificate
 from q2r2_control.inputs.webxr.exchange import (
     Admitted,
+    CameraPicture,
     Display,
+    HeadsetPageSetup,
+    Listening,
     Logged,
     Lost,
-    PageSetup,
-    Picture,
-    Ready,
     Received,
     Shown,
 )
@@ -115,7 +115,7 @@ class WebXrInput:
 
     def show_picture(self, jpeg: bytes) -> bool:
         """Show the newest picture of a camera, as :meth:`show`; from any thread."""
-        return self._process is not None and self._process.send(Picture(jpeg), 1)
+        return self._process is not None and self._process.send(CameraPicture(jpeg), 1)
 
     def start(self) -> None:
         """Serve the page. Raises :class:`InputError` or :class:`ConfigError` where that is not possible."""
@@ -133,7 +133,7 @@ class WebXrInput:
                 if line is not None:
                     self._say(f"webxr: {line}")
         pem = None if certificate is None else str(certificate)
-        setup = PageSetup(host, port, self._allow, pem, token, self._silence, self._display)
+        setup = HeadsetPageSetup(host, port, self._allow, pem, token, self._silence, self._display)
         try:
             self._process = HelperProcess("serves the page", "q2r2_control.inputs.webxr.server", self._take, _ROOM)
         except OSError as error:
@@ -203,7 +203,7 @@ class WebXrInput:
                 self._stream.lose(reason)
             case Logged(level, text):
                 _LOG.log(level, "%s", text)
-            case Ready(port, url):
+            case Listening(port, url):
                 self.address, self.url = (self.address[0], port), url
                 self._ready.set()
 

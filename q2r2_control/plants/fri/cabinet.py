@@ -14,9 +14,9 @@ from typing import Protocol
 from q2r2_control.errors import ProtocolError
 from q2r2_control.plants.fri.wire import (
     JOINTS,
-    Command,
     CommandKind,
     Drives,
+    FriCommand,
     IoValue,
     Joints,
     Monitoring,
@@ -52,7 +52,7 @@ class Trip(StrEnum):
     STOPPED = "stopped at the pendant"
 
 
-class Arm(Protocol):
+class CabinetArm(Protocol):
     """The arm of a cabinet."""
 
     @property
@@ -113,7 +113,7 @@ class CabinetSettings:
 class Cabinet:
     """In each period: :meth:`send`, and :meth:`receive` for each datagram that comes before the next."""
 
-    def __init__(self, settings: CabinetSettings, arm: Arm) -> None:
+    def __init__(self, settings: CabinetSettings, arm: CabinetArm) -> None:
         self.settings, self.arm = settings, arm
         self.session, self.safety, self.operation = Session.MONITORING_WAIT, Safety.NORMAL, Operation.AUTOMATIC
         self.load_fits = True  # the load data are those of the tool, without which no client may command
@@ -122,7 +122,7 @@ class Cabinet:
         self.trips: list[Trip] = []  # of all sessions, in order
         self._sent = 0  # messages so far
         self._heard: int | None = None  # counter of the client's newest message
-        self._answer: Command | None = None  # to the newest message that asked for one
+        self._answer: FriCommand | None = None  # to the newest message that asked for one
         self._in_time: deque[bool] = deque(maxlen=_WINDOW)
         self._misses = 0  # in a row
         self.missed = 0  # of a client that commanded and answered again: not those of one that has ended
@@ -230,7 +230,7 @@ class Cabinet:
             if good and self._overlay and self.safety is Safety.NORMAL:
                 self.session = Session.COMMANDING_WAIT
 
-    def _follow(self, answer: Command) -> None:
+    def _follow(self, answer: FriCommand) -> None:
         trip = self._guard(answer)
         if trip is not None:
             self.stop(trip)
@@ -240,7 +240,7 @@ class Cabinet:
         self._velocity = tuple(way / self.settings.answer_period for way in moved)
         self._commanded, self._tau = answer.q, answer.tau
 
-    def _guard(self, answer: Command) -> Trip | None:
+    def _guard(self, answer: FriCommand) -> Trip | None:
         """The reason why an answer cannot be followed; a missed one before it gives no more time."""
         limits, period = self.settings, self.settings.answer_period
         if answer.q is None:

@@ -12,8 +12,8 @@ from q2r2_control.plants.fri.answers import AnswerTimes, MessageClock, Reference
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import (
     JOINTS,
-    Command,
     CommandKind,
+    FriCommand,
     IoValue,
     Monitoring,
     Session,
@@ -166,12 +166,12 @@ class ArmSession:
         self.state.ended += self.state.following
         self.state.following = False
 
-    def _command(self, message: Monitoring, now: float) -> Command | None:
+    def _command(self, message: Monitoring, now: float) -> FriCommand | None:
         counter, reflected = self._answers, message.counter
         if message.session < Session.COMMANDING_WAIT:
             self._begin_anew()
             mirrored = message.commanded_q or message.q  # which FRI 1 expects, and FRI 2 does without
-            return Command(counter, reflected, mirrored if message.version == 1 else None, io=self._outputs)
+            return FriCommand(counter, reflected, mirrored if message.version == 1 else None, io=self._outputs)
         if self._times is None:
             self._times = AnswerTimes(message.period * message.multiplier, DELAY)
         if message.session is Session.COMMANDING_WAIT or not self._begun:
@@ -190,9 +190,9 @@ class ArmSession:
         there = self.path.at(time)
         if abs(state.lag) > message.period and np.abs(there - self.path.rest).max() <= _AT_REST:
             self._times.restart()  # where nothing moves, the next answer may be for any time
-        return Command(counter, reflected, joints_of(there), io=self._outputs)
+        return FriCommand(counter, reflected, joints_of(there), io=self._outputs)
 
-    def _torque(self, message: Monitoring, now: float) -> Command | None:
+    def _torque(self, message: Monitoring, now: float) -> FriCommand | None:
         """The newest overlay, or one that brakes, with the cabinet's own position as KUKA's example clients have it."""
         age = now - self._tau_came
         if self.state.is_too_slow or (message.session is Session.COMMANDING_ACTIVE and age > _TORQUE_GONE):
@@ -203,7 +203,7 @@ class ArmSession:
             else -self._damping * np.array(self.state.velocity)
         )
         tau = joints_of(np.clip(wanted, -self._torque_limit, self._torque_limit))
-        return Command(self._answers, message.counter, message.ipo_q or message.q, tau, self._outputs)
+        return FriCommand(self._answers, message.counter, message.ipo_q or message.q, tau, self._outputs)
 
 
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:

@@ -1,7 +1,7 @@
 """KUKA's Fast Robot Interface on the wire: datagrams in, messages out, and the other way round.
 
-A cabinet sends a :class:`Monitoring` datagram every period, its client answers with a :class:`Command`. FRI 1 sends the
-protobuf message itself; FRI 2 puts its length before it and a CRC-32 behind it, both uint32, little endian.
+A cabinet sends a :class:`Monitoring` datagram every period, its client answers with a :class:`FriCommand`. FRI 1 sends
+the protobuf message itself; FRI 2 puts its length before it and a CRC-32 behind it, both uint32, little endian.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Monitoring:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class FriCommand:
     """One answer of a client."""
 
     counter: int  # of the client's messages, from 0
@@ -176,14 +176,16 @@ def write_monitoring(monitoring: Monitoring) -> bytes:
     return _datagram(message, monitoring.version)
 
 
-def read_command(datagram: bytes) -> tuple[int, Command]:
+def read_command(datagram: bytes) -> tuple[int, FriCommand]:
     """Version and answer of a client. Raises :class:`ProtocolError` for bytes that are none."""
     version, message = _parsed(datagram, CommandMessage, _COMMAND)
     data, header = message.data, message.header
-    return version, Command(header.counter, header.reflected, _joints(data, "q"), _joints(data, "tau"), _io_of(data.io))
+    return version, FriCommand(
+        header.counter, header.reflected, _joints(data, "q"), _joints(data, "tau"), _io_of(data.io)
+    )
 
 
-def write_command(command: Command, version: int) -> bytes:
+def write_command(command: FriCommand, version: int) -> bytes:
     """The datagram of an answer in FRI ``version`` 1 or 2."""
     message = CommandMessage()
     _set_header(message, _COMMAND, command.counter, command.reflected)

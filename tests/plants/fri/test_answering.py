@@ -14,7 +14,7 @@ from q2r2_control.errors import PlantError
 from q2r2_control.plants.fri.answering import AnsweringProcess, Line, open_socket
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
-from q2r2_control.plants.fri.wire import Command, Monitoring, Quality, Session, read_command, write_monitoring
+from q2r2_control.plants.fri.wire import FriCommand, Monitoring, Quality, Session, read_command, write_monitoring
 from tests.support.headset_server import eventually
 
 Q = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
@@ -38,7 +38,7 @@ class Between:
         eventually(self.is_answered)  # messages that come before it has begun are dropped
         self.cabinet.settimeout(20.0)
 
-    def ask(self) -> Command:
+    def ask(self) -> FriCommand:
         self.sent += 1
         self.cabinet.sendto(write_monitoring(replace(MONITORING, counter=self.sent)), self.address)
         return read_command(self.cabinet.recv(2000))[1]

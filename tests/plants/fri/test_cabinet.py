@@ -10,8 +10,8 @@ import pytest
 
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm, Trip
 from q2r2_control.plants.fri.wire import (
-    Command,
     CommandKind,
+    FriCommand,
     Joints,
     Monitoring,
     Operation,
@@ -25,7 +25,7 @@ HOME = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
 SETTINGS = CabinetSettings(
     lower=(-2.0,) * 7, upper=(2.0,) * 7, velocity=(1.7,) * 7, acceleration=(10.0,) * 7, torque=(20.0,) * 7
 )
-Answer = Callable[[Monitoring], Command | None]
+Answer = Callable[[Monitoring], FriCommand | None]
 
 
 class Client:
@@ -34,9 +34,9 @@ class Client:
     def __init__(self, version: int = 2) -> None:
         self.version, self.counter = version, -1
 
-    def answer(self, message: Monitoring, q: Joints | None = None, tau: Joints | None = None) -> Command:
+    def answer(self, message: Monitoring, q: Joints | None = None, tau: Joints | None = None) -> FriCommand:
         self.counter += 1
-        return Command(self.counter, message.counter, q or message.ipo_q or message.q, tau)
+        return FriCommand(self.counter, message.counter, q or message.ipo_q or message.q, tau)
 
 
 def run(cabinet: Cabinet, periods: int, answer: Answer, version: int = 2) -> Monitoring:
@@ -86,7 +86,7 @@ def test_in_t1_a_tool_that_is_commanded_faster_than_250_mm_s_ends_the_command(sp
     cabinet, client = commanding(replace(SETTINGS, acceleration=(1e3,) * 7))
     cabinet.operation = Operation.T1
 
-    def answer(message: Monitoring) -> Command:
+    def answer(message: Monitoring) -> FriCommand:
         assert message.ipo_q is not None
         return client.answer(message, tuple(q + speed * SETTINGS.period for q in message.ipo_q))
 
@@ -110,7 +110,7 @@ def test_the_arm_goes_where_the_client_commands(version: int, multiplier: int) -
     cabinet, client = commanding(settings)
     period = settings.answer_period
 
-    def swing(message: Monitoring) -> Command | None:
+    def swing(message: Monitoring) -> FriCommand | None:
         if message.counter % multiplier:
             return None
         t = (message.counter // multiplier) * period - begin
@@ -127,11 +127,11 @@ def moved(by: float) -> Joints:
 
 
 TORQUE = replace(SETTINGS, command=CommandKind.TORQUE)
-GUARDS: dict[Trip, tuple[CabinetSettings, Callable[[Client, Monitoring], Command | None]]] = {
+GUARDS: dict[Trip, tuple[CabinetSettings, Callable[[Client, Monitoring], FriCommand | None]]] = {
     Trip.VELOCITY: (replace(SETTINGS, acceleration=(1e4,) * 7), lambda c, m: c.answer(m, moved(0.01))),
     Trip.ACCELERATION: (SETTINGS, lambda c, m: c.answer(m, moved(0.001))),
     Trip.POSITION: (replace(SETTINGS, upper=moved(1e-4)), lambda c, m: c.answer(m, moved(2e-4))),
-    Trip.NO_POSITION: (SETTINGS, lambda c, m: Command(c.answer(m).counter, m.counter)),
+    Trip.NO_POSITION: (SETTINGS, lambda c, m: FriCommand(c.answer(m).counter, m.counter)),
     Trip.NO_TORQUE: (TORQUE, lambda c, m: c.answer(m)),
     Trip.TORQUE: (TORQUE, lambda c, m: c.answer(m, tau=(21.0,) * 7)),
     Trip.LATE: (SETTINGS, lambda c, m: None),
@@ -151,7 +151,7 @@ def test_an_answer_that_no_cabinet_would_follow_ends_the_command_and_the_arm_hol
 
 
 def test_other_bytes_and_another_version_end_the_command_and_a_late_answer_counts_as_none() -> None:
-    for datagram, trip in ((b"hello", Trip.MALFORMED), (write_command(Command(1, 1, q=HOME), 1), Trip.VERSION)):
+    for datagram, trip in ((b"hello", Trip.MALFORMED), (write_command(FriCommand(1, 1, q=HOME), 1), Trip.VERSION)):
         cabinet, _ = commanding()
         cabinet.receive(datagram)
         assert cabinet.trips == [trip]

@@ -11,8 +11,8 @@ from q2r2_control.events import ReasonKind
 from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand
 from q2r2_control.plants.fri.wire import (
-    Command,
     CommandKind,
+    FriCommand,
     Monitoring,
     Quality,
     Session,
@@ -38,7 +38,7 @@ class Cabinet:
     def now(self) -> float:
         return 0.005 * self.sent
 
-    def ask(self, message: Monitoring) -> Command | None:
+    def ask(self, message: Monitoring) -> FriCommand | None:
         self.sent += 1
         message = replace(message, counter=self.sent, reflected=self.heard)
         answer = self.session.answer(write_monitoring(message), self.now)
@@ -52,7 +52,7 @@ class Cabinet:
 def test_an_idle_cabinet_gets_no_answer_and_one_that_monitors_gets_no_position() -> None:
     cabinet = Cabinet()
     assert cabinet.ask(replace(MONITORING, session=Session.IDLE)) is None
-    assert cabinet.ask(MONITORING) == Command(0, 2)
+    assert cabinet.ask(MONITORING) == FriCommand(0, 2)
 
 
 def test_fri_1_gets_the_commanded_position_mirrored() -> None:

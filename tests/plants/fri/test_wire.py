@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from q2r2_control.errors import ProtocolError
 from q2r2_control.plants.fri.wire import (
-    Command,
     CommandKind,
     Drives,
+    FriCommand,
     Monitoring,
     Operation,
     Quality,
@@ -86,18 +86,18 @@ def test_what_is_written_is_read_again(version: int) -> None:
     datagram = write_monitoring(sent)
     assert version_of(datagram) == version
     assert read_monitoring(datagram) == sent
-    command = Command(4, 7, q=Q, tau=(1.0,) * 7, io={"gripper_close": False, "force": 0.5})
+    command = FriCommand(4, 7, q=Q, tau=(1.0,) * 7, io={"gripper_close": False, "force": 0.5})
     assert read_command(write_command(command, version)) == (version, command)
 
 
 def test_the_frame_of_fri_2_is_a_length_and_the_crc_of_zlib() -> None:
-    command = Command(0, 1, q=Q)
+    command = FriCommand(0, 1, q=Q)
     body = write_command(command, 1)
     assert write_command(command, 2) == struct.pack("<I", len(body)) + body + struct.pack("<I", zlib.crc32(body))
 
 
 def test_an_answer_without_positions_has_no_command_data() -> None:
-    assert read_command(write_command(Command(0, 1), 1)) == (1, Command(0, 1))
+    assert read_command(write_command(FriCommand(0, 1), 1)) == (1, FriCommand(0, 1))
 
 
 def _with_joints(*values: float) -> bytes:
@@ -108,7 +108,7 @@ REFUSED = {
     "nothing": (b"", "neither of FRI 1"),
     "too long": (b"\x0a" * 1501, "at most 1500"),
     "a wrong checksum": (write_monitoring(MONITORING)[:-1] + b"\x00", "checksum"),
-    "an answer instead": (write_command(Command(0, 1, q=Q), 2), "allowed: 0x245142"),
+    "an answer instead": (write_command(FriCommand(0, 1, q=Q), 2), "allowed: 0x245142"),
     "six joints": (_with_joints(*Q[:6]), "7 finite numbers"),
     "a joint that is no number": (_with_joints(*Q[:6], float("nan")), "7 finite numbers"),
     "no joints": (HEADER + CONNECTION, "without measured joint positions"),
