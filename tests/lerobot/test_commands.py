@@ -125,6 +125,11 @@ def trained(exported: Path) -> Path:
     return exported.with_name("act") / "checkpoints/last/pretrained_model"
 
 
+def default_interrupt() -> None:
+    """A shell lets what it starts in the background ignore Ctrl-C, and Python then does so too."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 class Terminal:
     """A program in a terminal of its own, whose lines are read one by one and whose keys are pressed."""
 
@@ -132,7 +137,13 @@ class Terminal:
         self._controller, terminal = pty.openpty()
         out, told = os.pipe()
         self._process = subprocess.Popen(
-            arguments, cwd=folder, env=environment(folder), stdin=terminal, stdout=told, stderr=told
+            arguments,
+            cwd=folder,
+            env=environment(folder),
+            stdin=terminal,
+            stdout=told,
+            stderr=told,
+            preexec_fn=default_interrupt,
         )
         os.close(told)
         os.close(terminal)
