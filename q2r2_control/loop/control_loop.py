@@ -73,7 +73,6 @@ class ControlLoop:
         self.holding: dict[str, bool] = {}  # of each arm that has an object, whether its gripper holds it
         self.granted_openings: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and granted
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
-        self._is_measured = False  # although supervision has a fault for a state
 
     @property
     def held_grippers(self) -> dict[str, tuple[str, str]]:
@@ -87,10 +86,10 @@ class ControlLoop:
     def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0, lost: Reason | None = None) -> None:
         """Let supervision see a measured state, or the reason why there is none; see :meth:`JointWatch.take`.
 
-        ``lost``: why the arms cannot be commanded although they are measured. Those that still can brake by the state.
+        ``lost``: why the arms cannot be commanded although they are measured. Those that still can brake by the state,
+        until they rest.
         """
-        self._is_measured = lost is not None and isinstance(state, RobotState)
-        self.supervisor.update_state(lost or state, now, passed)
+        self.supervisor.update_state(state, now, passed, lost)
 
     def activate(self, state: RobotState, now: float) -> None:
         """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`Q2R2Error`."""
@@ -146,9 +145,7 @@ class ControlLoop:
         if self.controller.kept_distances is not self._kept:  # the step may have taken up others
             self._kept = self.controller.kept_distances
             self.drive.set_kept_distances(self._kept)
-        trusted = supervisor.trusted
-        if self._owns_plant:
-            trusted = supervisor.state_fault is None or self._is_measured
+        trusted = supervisor.measured if self._owns_plant else supervisor.trusted
         command = None
         if reference is not None and state is not None:
             self._velocity = reference.v

@@ -63,6 +63,7 @@ class JointWatch:
         self._source = source  # where states come from, as " from /node", or ""
         self.state: RobotState | None = None  # the newest that was good
         self.fault: Reason | None = Reason.of(ReasonKind.NO_STATES_YET, source="")
+        self._lost = False  # the fault is that arms could not be commanded, and all states since were good
         self._q: list[float] = []  # of that state [rad]
         self._still_since, self._still_at = math.inf, self._q
         self._near_at: float | None = None
@@ -89,6 +90,17 @@ class JointWatch:
             self._fail(fault)
         elif not _all_within(q, self._still_at, _REST):
             self._still_since, self._still_at = now, q
+
+    def lose(self, why: Reason) -> None:
+        """Arms cannot be commanded, although they are measured."""
+        believed = self.believed
+        self._fail(why)
+        self._lost = believed
+
+    @property
+    def believed(self) -> bool:
+        """Whether arms may brake by the newest state, also while there is a fault."""
+        return self.fault is None or self._lost
 
     def settled(self, now: float) -> bool:
         """Whether states have been good and at rest for the settle time."""
@@ -127,7 +139,7 @@ class JointWatch:
 
     def accept(self) -> None:
         """Believe from now on what :meth:`settled` found good."""
-        self.fault, self._near_at = None, None
+        self.fault, self._near_at, self._lost = None, None, False
 
     def accept_at_once(self, state: RobotState, now: float) -> None:
         """Believe ``state`` without waiting: the arms are known to be at rest there."""
@@ -157,7 +169,7 @@ class JointWatch:
         return Reason.of(ReasonKind.STATE_JUMPED, joint=self._names[worst], distance=float(moved[worst]))
 
     def _fail(self, fault: Reason) -> None:
-        self._still_since = math.inf
+        self._still_since, self._lost = math.inf, False
         # The first fault tells most; before the first good state the newest does.
         if self.fault is None or self.state is None:
             self.fault = fault

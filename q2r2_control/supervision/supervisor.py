@@ -98,10 +98,23 @@ class Supervisor:
     def follows(self, arm: str) -> bool:
         return self.phase is Phase.ACTIVE and self.targets.follows(arm)
 
-    def update_state(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
-        """A joint state, or what is wrong with it; ``passed`` [s]: see :meth:`JointWatch.observe`."""
+    @property
+    def measured(self) -> bool:
+        """Whether the arms can brake by the newest state, also those that lost their session or have it again."""
+        return self._watch.believed
+
+    def update_state(
+        self, state: RobotState | Reason, now: float, passed: float = 0.0, lost: Reason | None = None
+    ) -> None:
+        """A joint state, or what is wrong with it; ``passed`` [s]: see :meth:`JointWatch.observe`.
+
+        ``lost``: why arms cannot be commanded although they are measured.
+        """
         before = self._watch.fault
-        self._watch.observe(state, now, passed)
+        if lost is None or isinstance(state, Reason):
+            self._watch.observe(state, now, passed)
+        else:
+            self._watch.lose(lost)
         fault = self._watch.fault
         if self.phase is Phase.INACTIVE and fault is not None and fault != before:
             self.events.append(Reason(ReasonKind.JOINT_STATES, cause=fault))

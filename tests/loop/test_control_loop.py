@@ -88,6 +88,16 @@ def test_a_state_that_cannot_be_believed_is_no_state_to_push_by() -> None:
     assert not step.trusted
 
 
+def test_arms_that_lost_their_session_brake_by_their_state_also_once_it_is_back() -> None:
+    arms = Arms(owns_plant=True)
+    arms.loop.activate(arms.state, arms.now)
+    arms.loop.observe(arms.state, arms.now, DT, lost=Reason.of(ReasonKind.FRI_DROPPED, arm="left"))
+    assert arms.tick().trusted
+    assert arms.loop.supervisor.state_fault is not None
+    arms.home = arms.home + 0.5  # no arm can be there
+    assert not arms.tick().trusted
+
+
 @pytest.mark.parametrize(
     ("before", "wanted", "granted"),
     [

@@ -26,7 +26,7 @@ ACCELERATION = 4.0  # of the reference [rad/s^2]
 # After the braking time, in which arms that get torques settle [s], and what counts as rest: a held joint may creep.
 _ALLOWANCE = {CommandMode.POSITION: 0.05, CommandMode.TORQUE: 0.4}
 _REST = {CommandMode.POSITION: 1e-3, CommandMode.TORQUE: 0.02}  # [rad/s]
-_ENDS = ("pendant", "safety stop", "loop freezes", "computer freezes", "garbage")
+_ENDS = ("pendant", "back at once", "safety stop", "loop freezes", "computer freezes", "garbage")
 _ASKED = {Trip.STOPPED, Trip.SAFETY}
 _MUTATED = 250  # datagrams with wrong bytes before a session ends so
 
@@ -148,8 +148,10 @@ class Soak:
         self._end = str(self.random.choice(_ENDS))
         cabinet = self.plant.cabinets[str(self.random.choice(SIDES))]
         pause = float(self.random.uniform(0.02, 0.5))
-        if self._end == "pendant":
+        if self._end in ("pendant", "back at once"):
             cabinet.stop()
+            if self._end == "back at once":  # before the arms rest
+                cabinet.start_overlay()
         elif self._end == "safety stop":
             cabinet.safety_stop(Safety.STOP_1_ON_PATH)
         elif self._end == "loop freezes":
