@@ -76,14 +76,14 @@ def test_a_hand_that_a_program_reports_in_front_of_an_arm_is_named_once_and_brak
 
     def report(tick: Tick) -> None:
         ticks.append(tick)
-        if tick.t > 1.5:
+        if tick.t > 2.0:
             place = tuple(loop.robot.tool_pose(loop.robot.home, "left").translation.tolist())
             hand = MovingObstacle(shape="sphere", size=(0.1,), position=place, speed=0.1)
             loop.move_obstacle("hand", hand)
 
     loop.listeners.append(report)
-    summary = loop.run(2.5, realtime=False)
-    assert max(np.abs(tick.reference.v).max() for tick in ticks if tick.t < 1.5) > 0.1
+    summary = loop.run(3.0, realtime=False)
+    assert max(np.abs(tick.reference.v).max() for tick in ticks if tick.t < 2.0) > 0.1
     named = [event for event in summary.events if event.kind is ReasonKind.OBSTACLE_IN_THE_WAY and event.arm == "left"]
     assert 1 <= len(named) < 20
     assert "hand_0" in named[0].reason.detail["pair"]

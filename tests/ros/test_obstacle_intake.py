@@ -33,7 +33,7 @@ def marker(**changes: Any) -> Marker:
 
 
 class Taken:
-    """What an intake makes of messages, and what its node logs."""
+    """An intake that messages come to, and the lines that its node logs."""
 
     def __init__(self, context: Any, controller: CartesianController, monkeypatch: pytest.MonkeyPatch) -> None:
         self.node = BaseNode("intake", context=context)
