@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 SAFETY = "q2r2_control/control/safety/"
-TESTS = ("tests/control/safety", "tests/control/test_contract.py")
+TESTS = ("tests/control/safety", "tests/control/test_contract.py", "tests/control/test_moving_obstacles.py")
 _LONGEST = 1800.0  # of a soak or the tests [s]
 
 
@@ -184,6 +184,18 @@ MUTATIONS = (
         "safety_data.py",
         "np.asarray(data.distance - way)",
         "np.asarray(data.distance - 0.0 * way)",
+    ),
+    Mutation(
+        "a moving obstacle may move until the arms rest",
+        "protective_distance.py",
+        "way = reach(obstacles, o, max(obstacles.age[o], REPORT_AGE) + time)",
+        "way = reach(obstacles, o, 0.0 * time)",
+    ),
+    Mutation(
+        "a moving obstacle may have moved since it was reported",
+        "protective_distance.py",
+        "obstacles.age[o] += h",
+        "obstacles.age[o] += 0.0",
     ),
 )
 

@@ -57,6 +57,8 @@ class ReasonKind(StrEnum):
     RECORDING_REQUESTED = "recording_requested", "a program asks for {action}"
     SETTINGS_REQUESTED = "settings_requested", "a program changes settings: {changes}"
     CONTROL_REQUESTED = "control_requested", "a program changes control: {changes}"
+    OBSTACLE_REPORTED = "obstacle_reported", "a program reports {name}"
+    OBSTACLE_IN_THE_WAY = "obstacle_in_the_way", "{name} is in the way: {pair}"
     SETTINGS_CHANGED = "settings_changed", "settings changed"
     CONTROL_CHANGED = "control_changed", "control changed"
     # Refusals: nothing changed. Those of the first group have a cause.

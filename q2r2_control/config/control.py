@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from q2r2_control.config.strict import StrictModel, first_fault
 from q2r2_control.errors import ConfigError, check_kind
@@ -20,6 +20,7 @@ ObjectDistance = Annotated[
     float, Field(ge=-0.05, le=0.2)
 ]  # below 0: how far a box that is known roughly may overlap [m]
 LinkPattern = Annotated[str, Field(min_length=1)]
+ObstacleName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 
 
 class DistanceSettings(StrictModel):
@@ -93,6 +94,9 @@ class ControllerSettings(StrictModel):
     contact_allowed: tuple[ContactPair, ...] = Field(
         (), description="pairs that may touch in torque mode; of several, the last one counts"
     )
+    moving_obstacles: tuple[ObstacleName, ...] = Field(
+        (), max_length=16, description="names of obstacles that may come, move and go while a controller runs"
+    )
     distance_buffer: float = Field(
         0.002,
         ge=1e-4,
@@ -124,6 +128,13 @@ class ControllerSettings(StrictModel):
     tasks: dict[str, dict[str, Any]] = Field(
         {}, description="tasks of other packages, by their entry point's name, with the settings of each"
     )
+
+    @field_validator("moving_obstacles")
+    @classmethod
+    def _are_different(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) < len(names):
+            raise ValueError("allowed: each name once")
+        return names
 
     def without_contact(self) -> ControllerSettings:
         """The same, for modes in which nothing gives way: there ``contact_allowed`` allows nothing."""

@@ -10,11 +10,13 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import bound, pointer_to
 from q2r2_control.control.kernel_model import KernelData, kernel_model_of
 from q2r2_control.control.live_settings import LiveSettings, ObjectPairs
+from q2r2_control.control.moving_obstacles import MovingObstacles
 from q2r2_control.control.qp import DaqpSolver, QpProblem, Solver, assemble, find_minimum
 from q2r2_control.control.reference import move_reference, observe_bodies, spare_distance, start_reference
 from q2r2_control.control.safety.safety_data import ROUNDING
@@ -23,6 +25,7 @@ from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.control.tasks.external import add_costs, load_tasks
 from q2r2_control.errors import ConfigError, RobotError, check_kind
+from q2r2_control.robot.obstacle_bodies import roles_with_obstacles, with_obstacle_bodies
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, pose_of
@@ -59,6 +62,8 @@ class CartesianController:
         self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(data)
         self._objects = ObjectPairs(robot, settings, model, data)
         self._live = LiveSettings(robot, settings, model, data, self._objects)
+        geometry = with_obstacle_bodies(robot, settings.moving_obstacles)
+        self._obstacles = MovingObstacles(robot, settings, (self._model_pointer, self._data_pointer), geometry)
         self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
         self._stop, self._tasks = data.safety.certified, data.tasks
         self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step
@@ -75,8 +80,9 @@ class CartesianController:
         self._unchanged: IntArray = np.zeros(len(model.safety.collision.bodies.joint), dtype=np.int64)
         self._targets = TargetTracker(model.tasks, self._arms, settings)
         self._external_tasks = load_tasks(robot, settings.tasks)
-        self._names = LimitNames(robot)
-        self._with_others = {arm: pairs_with_others(self._names.pairs, robot.roles, arm) for arm in self._arms}
+        self._names = LimitNames(robot, geometry)
+        roles = roles_with_obstacles(robot, settings.moving_obstacles)
+        self._with_others = {arm: pairs_with_others(self._names.pairs, roles, arm) for arm in self._arms}
         self._compile()
         self.reset(robot.home)
 
@@ -95,6 +101,7 @@ class CartesianController:
             refused = self._live.change(self.settings.changed(values))
         except ConfigError as error:
             return str(error)
+        self._obstacles.change(self.settings)
         self._observe_again(self._unchanged)
         return refused
 
@@ -125,17 +132,20 @@ class CartesianController:
     def reset(self, q: Array, v: Array | None = None) -> None:
         """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each.
 
-        Targets and openings are forgotten, and nothing is held. A start outside the limits or in penetration is
-        allowed: the controller recovers from it. Raises :class:`RobotError` for a wrong shape or no finite number.
+        Targets and openings are forgotten, and nothing is held. Moving obstacles stay where they are. A start outside
+        the limits or in penetration is allowed: the controller recovers from it. Raises :class:`RobotError` for a
+        wrong shape or no finite number.
         """
         state = self._state
         posture, velocity = self.robot.checked("q", q), 0.0 if v is None else self.robot.checked("v", v)
         state.q[:], state.v[:] = posture, velocity
         self._fingers.set_all({})
         self._objects.clear()
+        self._obstacles.hold(self._objects.holding)
         self._active.used[0] = 0
         self._live.restart()
         self._targets.reset(state.q)
+        self._obstacles.keep_clear(0.0)
         proven = start_reference(self._model_pointer, self._data_pointer)
         self._live.begin()
         self._observe_again(self._unchanged)
@@ -157,6 +167,8 @@ class CartesianController:
             kept[:] = array
         self._targets.aim_posture(posture)
         summary = StepSummary()
+        if usable and dt > time:
+            self._obstacles.pass_time(float(dt) - time)
         known, longest = self._targets.offer(targets), self.settings.max_substep
         if time > 0.0:
             substeps = max(math.ceil(time / longest - 1e-9), 1)
@@ -191,6 +203,7 @@ class CartesianController:
         """
         if not _passes(dt):
             return
+        self._obstacles.pass_time(dt)
         self._observed, _, _ = self._move(self._model_pointer, self._data_pointer, self._solution, False, dt, 0.0)
         self._apart = self._observed[-1] >= -ROUNDING
 
@@ -248,6 +261,7 @@ class CartesianController:
         if not self._objects.set_holding(arm, holds):
             return
         self._active.used[0] = 0  # what it names may not count any more
+        self._obstacles.hold(self._objects.holding)
         self._observe_again(self._unchanged)
         self._objects.begin()
         self._observe_again(self._unchanged)
@@ -261,6 +275,27 @@ class CartesianController:
     def object_distances(self) -> Array:
         """Kept distance of every pair of ``Robot.objects`` now (pairs,) [m]; minus infinity while it does not count."""
         return self._objects.kept.copy()
+
+    def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> tuple[str, str] | None:
+        """Say where a moving obstacle is from the next step on, and how fast it may move; None: it is gone.
+
+        ``name`` is one of ``ControllerSettings.moving_obstacles``. The arms keep away from all that it can get to
+        until they rest, and slow down as it comes nearer. From then on nothing moves closer to it. It counts in any
+        case. The pair is returned for which the stop at hand is not proven to end before the obstacle could be there,
+        as when it appears in front of a moving arm. Raises :class:`ConfigError` for another name.
+        """
+        changed = self._obstacles.put(name, obstacle)
+        self._active.used[0] = 0  # what it names may not count any more
+        blocked = self._observe_again(changed) if self._state.v.any() else -1
+        self._certified &= blocked < 0
+        self._obstacles.keep_clear(0.0)
+        self._observe_again(self._unchanged)
+        return None if blocked < 0 else self._names.pair(blocked)
+
+    @property
+    def moving_obstacles(self) -> dict[str, MovingObstacle]:
+        """The moving obstacles that are there, by name, as :meth:`move_obstacle` was told last."""
+        return dict(self._obstacles.there)
 
     def _observe_again(self, grown: IntArray) -> int:
         """Observe what has changed; returns the pair in the way of bodies that have ``grown``, or -1."""
@@ -291,6 +326,7 @@ class CartesianController:
         ``tick``: see :func:`assemble`.
         """
         self._live.step(h)
+        self._obstacles.keep_clear(h)
         usable, inside, free = self._assemble(self._model_pointer, self._targets.pointer, self._data_pointer, h, tick)
         if self._external_tasks:
             add_costs(self._external_tasks, self._tasks.H, self._tasks.g, self._state.q, self._state.v)

@@ -14,6 +14,7 @@ from q2r2_control.control.safety.safety_data import Approach, SafetyData, Safety
 from q2r2_control.control.tasks.built_in import TaskData, TaskModel, task_model_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import KeptDistances, kept_distances
+from q2r2_control.robot.obstacle_bodies import with_obstacle_bodies
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -40,11 +41,12 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
     for names of ``settings.pairs`` that no pair has.
     """
     check_priority(settings.priority, tuple(robot.arms))
-    kept, objects = kept_distances(robot, settings), len(robot.objects.holders)
-    min_distance = np.append(kept.values, np.full(objects, -np.inf))  # nothing is held yet
-    contact_speed = np.append(kept.contact_speed, np.full(objects, np.inf))
-    depth = np.append(-kept.values, np.zeros(objects))
-    collision = with_rounded_boxes(collision_model_of(robot, robot.objects.geometry), depth)
+    kept, geometry = kept_distances(robot, settings), with_obstacle_bodies(robot, settings.moving_obstacles)
+    more = len(geometry.collisionPairs) - len(kept.values)
+    min_distance = np.append(kept.values, np.full(more, -np.inf))  # nothing is held, no obstacle is known yet
+    contact_speed = np.append(kept.contact_speed, np.full(more, np.inf))
+    depth = np.append(-kept.values, np.zeros(more))
+    collision = with_rounded_boxes(collision_model_of(robot, geometry), depth)
     _check_depths(robot, collision, kept)
     arm = np.full(robot.model.nv, len(robot.arms), dtype=np.int64)
     for i, joints in enumerate(robot.arms.values()):

@@ -52,7 +52,8 @@ class ObjectPairs:
         self._robot, self._safety, self._data = robot, model.safety, data.safety
         self._arms, self._holders = tuple(robot.objects.by_arm), robot.objects.holders
         self._shared = np.array([len(holders) > 1 for holders in self._holders], dtype=np.bool_)
-        self._range = slice(len(model.safety.min_distance) - len(self._holders), None)
+        first = len(robot.collision_model.collisionPairs)
+        self._range = slice(first, first + len(self._holders))
         self._aim(settings)
         self.clear()
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import pinocchio as pin
+
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
 from q2r2_control.control.safety.safety_data import ActiveBounds
@@ -17,14 +19,16 @@ _KINDS = {POSITION: LimitKind.POSITION, VELOCITY: LimitKind.VELOCITY, ACCELERATI
 class LimitNames:
     """Names of limits and pairs, by the numbers that kernels know them by."""
 
-    def __init__(self, robot: Robot) -> None:
-        geometry = robot.objects.geometry
+    def __init__(self, robot: Robot, geometry: pin.GeometryModel) -> None:
+        """``geometry`` begins with the robot's, as the kernels' bodies and pairs do."""
         names = [item.name for item in geometry.geometryObjects]
         pairs = collision_model_of(
             robot, geometry
         ).pairs  # the kernels' know boxes that may be touched by other numbers
         both = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
-        self.pairs = [(names[first], names[second]) for first, second in both]  # of the cell, and then of objects
+        self.pairs = [
+            (names[first], names[second]) for first, second in both
+        ]  # of the cell, then of objects, then of obstacles
         self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()  # most ticks bind as the one before
         self._by_kind: dict[int, list[ActiveLimit]] = {
             kind: [ActiveLimit(limit, (joint,)) for joint in robot.joint_names] for kind, limit in _KINDS.items()

@@ -14,6 +14,7 @@ import pinocchio as pin
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.control import LIVE_IMPEDANCE
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Event, Reason, ReasonKind
@@ -50,6 +51,7 @@ class OperatorSide:
         self.chunks: list[ActionChunk] = []  # of a policy, since the last poll
         self._controller, self._requests, self._impedance = controller, requests, impedance
         self._homing = False  # supervision is on the way home
+        self._in_the_way: frozenset[str] = frozenset()  # moving obstacles, at their last report
         self.connected = False
         arms = controller.robot.arms
         self._conditions = ArmConditions(controller)
@@ -148,6 +150,14 @@ class OperatorSide:
                 refused = self._controller.change({k: v for k, v in values.items() if k not in springs})
                 problem = None if refused is None else Reason.of(ReasonKind.CONTROL_REFUSED, text=refused)
                 self._record_change(ReasonKind.CONTROL_CHANGED, problem, now)
+
+            case ReasonKind.OBSTACLE_REPORTED:
+                name, given = request.detail["name"], request.detail["obstacle"]
+                pair = self._controller.move_obstacle(name, None if given is None else MovingObstacle(**given))
+                if pair is not None and name not in self._in_the_way:
+                    reason = Reason.of(ReasonKind.OBSTACLE_IN_THE_WAY, name=name, pair=" | ".join(pair))
+                    self._teleop.record_event(now, reason)
+                self._in_the_way = self._in_the_way - {name} if pair is None else self._in_the_way | {name}
 
     def _record_change(self, changed: ReasonKind, problem: Reason | None, now: float) -> None:
         outcome = Reason(changed) if problem is None else Reason(ReasonKind.NOT_CHANGED, cause=problem)

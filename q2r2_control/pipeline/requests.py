@@ -10,6 +10,7 @@ from q2r2_control.compliance.impedance import ImpedanceController, check_springs
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import LIVE_IMPEDANCE
+from q2r2_control.config.moving_obstacle import MovingObstacle, check_obstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.drives.base import Drive, TorqueDrive
 from q2r2_control.errors import check_kind
@@ -75,6 +76,16 @@ class RequestedRun:
         self.config.control.changed({name: value for name, value in values.items() if name not in springs})
         self.requests.append(Reason.of(ReasonKind.CONTROL_REQUESTED, changes=dict(values)))
 
+    def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> None:
+        """Say where a moving obstacle is now, or that it is gone; from any thread.
+
+        :meth:`CartesianController.move_obstacle` says what follows, and an event names a pair that is in the way.
+        Raises :class:`ConfigError` for a name that ``control.moving_obstacles`` lacks.
+        """
+        check_obstacle(name, obstacle, self.config.control.moving_obstacles)
+        given = None if obstacle is None else obstacle.model_dump(mode="json")
+        self.requests.append(Reason.of(ReasonKind.OBSTACLE_REPORTED, name=name, obstacle=given))
+
     def record_outcome(self, reason: Reason) -> None:
         """Let the operator know what became of the recording or of an episode in it; from any thread."""
         self.requests.append(reason)
@@ -83,6 +94,7 @@ class RequestedRun:
 # Kinds of requests, which a replay asks for again; a recording that ended does not end again.
 REPEATED = {
     *(ReasonKind.HOME_REQUESTED, ReasonKind.PAUSE_REQUESTED, ReasonKind.POLICY_REQUESTED, ReasonKind.ENGAGE_REQUESTED),
+    ReasonKind.OBSTACLE_REPORTED,
     *(ReasonKind.RECORDING_REQUESTED, ReasonKind.SETTINGS_REQUESTED, ReasonKind.CONTROL_REQUESTED, ReasonKind.VERDICT),
 }
 

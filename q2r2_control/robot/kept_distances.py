@@ -10,6 +10,7 @@ import numpy as np
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.near_pairs import remedy
+from q2r2_control.robot.obstacle_bodies import roles_with_obstacles, with_obstacle_bodies
 from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -40,6 +41,11 @@ def kept_by_objects(robot: Robot, settings: ControllerSettings) -> KeptDistances
     return _of_all_pairs(robot, settings)[1]
 
 
+def kept_by_obstacles(robot: Robot, settings: ControllerSettings) -> KeptDistances:
+    """The same of the pairs of moving obstacles; raises as :func:`kept_distances` does."""
+    return _of_all_pairs(robot, settings)[2]
+
+
 def too_close_at_home(robot: Robot, kept: KeptDistances, *, remedies: bool = False) -> list[str]:
     """A line for each pair that is nearer at home than it has to be, the nearest first.
 
@@ -56,13 +62,14 @@ def too_close_at_home(robot: Robot, kept: KeptDistances, *, remedies: bool = Fal
     return lines
 
 
-def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDistances, KeptDistances]:
-    """Of the monitored pairs, and of those of objects."""
-    names = pair_names(robot.objects.geometry)
+def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDistances, KeptDistances, KeptDistances]:
+    """Of the monitored pairs, of those of objects, and of those of moving obstacles."""
+    names = pair_names(with_obstacle_bodies(robot, settings.moving_obstacles))
+    roles = roles_with_obstacles(robot, settings.moving_obstacles)
     keys = ["min_distance"] * len(names)
     values = np.full(len(names), settings.min_distance)
     for p, (a, b) in enumerate(names):
-        name = pair_class(robot.roles[link_of(a)], robot.roles[link_of(b)])
+        name = pair_class(roles[link_of(a)], roles[link_of(b)])
         value = getattr(settings.distances, name)
         if value is not None:
             values[p], keys[p] = value, f"distances.{name}"
@@ -70,13 +77,14 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDista
         for p in _found(f"pairs[{i}]", named.pair, names):
             values[p], keys[p] = named.distance, f"pairs[{i}]"
     speed = np.full(len(names), np.inf)
-    count = len(names) - len(robot.objects.holders)
+    count = len(robot.collision_model.collisionPairs)
+    last = count + len(robot.objects.holders)
     for i, contact in enumerate(settings.contact_allowed):  # objects need none: their classes allow contact
         for p in _found(f"contact_allowed[{i}]", contact.pair, names[:count]):
             values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed
-    parts = slice(0, count), slice(count, None)
-    monitored, of_objects = (KeptDistances(values[part], tuple(keys[part]), speed[part]) for part in parts)
-    return monitored, of_objects
+    parts = slice(0, count), slice(count, last), slice(last, None)
+    one, two, three = (KeptDistances(values[part], tuple(keys[part]), speed[part]) for part in parts)
+    return one, two, three
 
 
 def pair_class(first: Role, second: Role) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.events import Event
+from q2r2_control.events import Event, ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ArmTarget, HandSample
@@ -221,7 +221,8 @@ class RunStatistics:
         self._ticks += 1
         self._duration += tick.dt
         self._compute_times.add(tick.compute_time)
-        self.events.extend(tick.events)
+        # Reports of obstacles come many times a second.
+        self.events.extend(event for event in tick.events if event.kind is not ReasonKind.OBSTACLE_REPORTED)
         # Numbers that are not finite are passed over.
         np.fmax(self._speed, np.abs(reference.v), out=self._speed)
         np.fmax(self._acceleration, np.abs(reference.a), out=self._acceleration)

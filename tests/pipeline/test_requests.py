@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.bindings import Action, BindingSettings
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.drives.base import TorqueDrive
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import ReasonKind
 from q2r2_control.summary.tick import Tick
 from tests.pipeline.loops import pipeline, when_moving
-from tests.support.processes import changes
+from tests.support.processes import cell, changes
 
 
 def test_a_pause_holds_both_arms_until_a_new_press() -> None:
@@ -67,6 +68,29 @@ def test_springs_of_torque_mode_change_on_a_ramp_and_no_others() -> None:
         loop.change_control({"translational_stiffness": -1.0})
     with pytest.raises(ConfigError, match="translational_stiffness"):
         pipeline().change_control({"translational_stiffness": 500.0})
+
+
+def test_a_hand_that_a_program_reports_in_front_of_an_arm_is_named_once_and_brakes_it() -> None:
+    loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
+    ticks: list[Tick] = []
+
+    def report(tick: Tick) -> None:
+        ticks.append(tick)
+        if tick.t > 2.0:
+            place = tuple(loop.robot.tool_pose(loop.robot.home, "left").translation.tolist())
+            hand = MovingObstacle(shape="sphere", size=(0.1,), position=place, speed=0.1)
+            loop.move_obstacle("hand", hand)
+
+    loop.listeners.append(report)
+    summary = loop.run(3.0, realtime=False)
+    assert max(np.abs(tick.reference.v).max() for tick in ticks if tick.t < 2.0) > 0.1
+    named = [event for event in summary.events if event.kind is ReasonKind.OBSTACLE_IN_THE_WAY and event.arm == "left"]
+    assert 1 <= len(named) < 20
+    assert "hand_0" in named[0].reason.detail["pair"]
+    assert ReasonKind.OBSTACLE_REPORTED not in {event.kind for event in summary.events}
+    assert min(tick.reference.report.margin for tick in ticks) < 0.0
+    with pytest.raises(ConfigError, match="foot"):
+        loop.move_obstacle("foot", None)
 
 
 def test_a_mark_without_a_recording_is_refused() -> None:

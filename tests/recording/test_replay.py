@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.bindings import Action
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, Solver
 from q2r2_control.errors import PlantError, RecordingError
@@ -60,11 +61,15 @@ def test_a_replay_of_a_run_in_simulated_time_is_identical(
 
 
 def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
-    loop = pipeline("circle", "kinematic")
+    loop = pipeline("circle", "kinematic", control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
+    tool = loop.robot.tool_pose(loop.robot.home, "left").translation
+    place = tuple((tool + np.array([0.0, 0.6, 0.0])).tolist())  # so near that the arms slow down
     changes = {"position_scale": 0.3, "workspace": {"left": BOX}, "filter": {"smoothing_delay": 0.05}}
     other = TeleopSettings.model_validate(loop.config.teleop.model_dump() | changes)
     asks = {
         0.8: lambda: loop.change_teleop(other),
+        0.9: lambda: loop.move_obstacle("hand", MovingObstacle(shape="sphere", size=(0.1,), position=place, speed=1.0)),
+        0.96: lambda: loop.move_obstacle("hand", None),
         1.0: lambda: loop.change_control({"min_distance": 0.03, "position_gain": 4.0}),
         1.2: loop.go_home,
         1.3: lambda: loop.mark(Action.RECORD_TOGGLE),

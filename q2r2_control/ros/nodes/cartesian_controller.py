@@ -2,8 +2,8 @@
 
 Every topic is one of all arms or one an arm, as the robot's layout asks for. Targets are on ``/q2r2/left/target_frame``
 or ``left.target_topic``, joint states on ``joint_states`` or ``left.joint_states_topic``, commands on ``output_topic``
-or ``left.output_topic``. With output ``none`` another controller moves the arms, for which ``~/safe_target/left`` is
-published. The rules for targets: :mod:`supervisor`.
+or ``left.output_topic``. Moving obstacles are on ``~/obstacles``. With output ``none`` another controller moves the
+arms, for which ``~/safe_target/left`` is published. The rules for targets: :mod:`supervisor`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import KINDS, NONE, make_output
 from q2r2_control.ros.bridge.lbr_driver import LbrDrivers
 from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live, make_watching_live
+from q2r2_control.ros.bridge.obstacle_intake import ObstacleIntake
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.supervision.joint_watch import (
     ExternalArms,
@@ -83,6 +84,7 @@ class CartesianControllerNode(ManagedNode):
             make_impedance_live(self, self._output.drive.impedance)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
         make_control_live(self, self._controller)
+        self._obstacles = ObstacleIntake(self, self._controller)
         self._loop = ControlLoop(
             self._controller,
             self._output.drive,

@@ -1,0 +1,51 @@
+"""An obstacle that comes, moves and goes while a controller runs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from q2r2_control.config.cell import ObstacleConfig
+from q2r2_control.errors import ConfigError, check_kind, shown
+
+
+class MovingObstacle(ObstacleConfig):
+    """Its shape and pose in the world, and how fast any of its points may move from then on."""
+
+    shape: Literal["box", "sphere", "capsule"]
+    speed: float = Field(ge=0, le=10, description="no point of it ever gets faster; 0: it stays [m/s]")
+    acceleration: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        description="no point of it gains speed faster; none: it may be at its speed at once [m/s^2]",
+    )
+    speed_now: float | None = Field(None, ge=0, description="of its fastest point now; none: its speed [m/s]")
+    age: float = Field(0.0, ge=0, le=10, description="of the pose when it is handed over [s]")
+
+    @property
+    def slower(self) -> float:
+        """By how much its points are slower now than they may get [m/s]."""
+        return 0.0 if self.acceleration is None or self.speed_now is None else self.speed - self.speed_now
+
+    @property
+    def rise(self) -> float:
+        """How long they take to make up for that at least, more than 0 [s]."""
+        return max(self.slower / (self.acceleration or 1.0), 1e-9)
+
+    @model_validator(mode="after")
+    def _is_within_its_speed(self) -> Self:
+        if self.speed_now is not None and self.speed_now > self.speed:
+            raise ValueError(f"speed_now {self.speed_now:g}: allowed: up to speed, {self.speed:g} m/s")
+        return self
+
+
+def check_obstacle(name: str, obstacle: MovingObstacle | None, names: Collection[str]) -> None:
+    """Raises :class:`ConfigError` for a name that ``control.moving_obstacles`` lacks and for what is no obstacle."""
+    if name not in names:
+        allowed = ", ".join(names) or "none; control.moving_obstacles names them"
+        raise ConfigError(f"moving obstacle {shown(name)}: allowed: {allowed}")
+    if obstacle is not None:
+        check_kind(f"obstacle {name}", obstacle, MovingObstacle, "a MovingObstacle, or None to take it away")

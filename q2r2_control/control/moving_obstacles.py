@@ -1,0 +1,119 @@
+"""Moving obstacles of one controller: where they were reported, and what pairs with them keep."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.config.moving_obstacle import MovingObstacle, check_obstacle
+from q2r2_control.control.geometry.collision import bodies_of
+from q2r2_control.control.geometry.kinematics import IntArray
+from q2r2_control.control.jit import KernelPointer, bound, pointer_to
+from q2r2_control.control.kernel_model import KernelModel, stop_buffer
+from q2r2_control.control.safety.protective_distance import ObstacleData, keep_clear, keep_while_stopping
+from q2r2_control.robot.kept_distances import kept_by_obstacles
+from q2r2_control.robot.obstacle_bodies import HULL
+from q2r2_control.robot.robot import Robot
+
+_SHAPES = {"sphere": coal.Sphere, "capsule": coal.Capsule, "box": coal.Box}
+
+
+class MovingObstacles:
+    """The obstacles that are there, by name. One that is not there keeps minus infinity, as an object not held."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        settings: ControllerSettings,
+        pointers: tuple[KernelPointer, ...],
+        geometry: pin.GeometryModel,
+    ) -> None:
+        """``pointers`` to the kernels' model and data, which were made with ``geometry``."""
+        model: KernelModel = pointers[0].value
+        self._robot, self._bodies, limits = robot, model.safety.collision.bodies, model.safety.limits
+        names, last = [item.name for item in geometry.geometryObjects], len(geometry.collisionPairs)
+        self._number = {name: names.index(f"{name}_0") for name in settings.moving_obstacles}
+        count, goal = len(self._number), kept_by_obstacles(robot, settings).values
+        hulls = {f"{held.link}{HULL}": arm for arm, held in robot.objects.by_arm.items()}
+        pairs = list(geometry.collisionPairs)[last - len(goal) :]
+        self._holders = [hulls.get(names[pair.first]) for pair in pairs]  # arm that has to hold for a pair to count
+        self._limits = limits
+        self._data = ObstacleData(
+            first=(len(goal) // max(count, 1)) * np.arange(count + 1),
+            speed=np.zeros(count),
+            slower=np.zeros(count),
+            rise=np.ones(count),
+            age=np.zeros(count),
+            kept=np.full(len(goal), -np.inf),
+            buffer=np.zeros(len(goal)),
+            velocity=limits.velocity.copy(),
+            stop_time=np.zeros(1),
+        )
+        self.there: dict[str, MovingObstacle] = {}
+        self._holding: frozenset[str] = frozenset()
+        if count:
+            pointers = *pointers, pointer_to(self._data)
+            self._keep_while_stopping = partial(bound(keep_while_stopping, *pointers), *pointers)
+            self._keep_clear = partial(bound(keep_clear, *pointers, 0.0), *pointers)
+        self.change(settings)
+
+    def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
+        """Take it that an obstacle is there as described, or is not there; returns a 1 for its body (g,).
+
+        Until :meth:`keep_clear` all pairs with obstacles keep what they have to while the arms stop. Raises as
+        :func:`check_obstacle` does.
+        """
+        check_obstacle(name, obstacle, self._number)
+        number, index = self._number[name], list(self._number).index(name)
+        changed: IntArray = np.zeros(len(self._bodies.joint), dtype=np.int64)
+        if obstacle is None:
+            self.there.pop(name, None)
+        else:
+            self.there[name] = obstacle
+            changed[number] = 1
+            placement = pin.SE3(pin.rpy.rpyToMatrix(*obstacle.rpy), np.array(obstacle.position))
+            body = pin.GeometryModel()
+            body.addGeometryObject(pin.GeometryObject(name, 0, placement, _SHAPES[obstacle.shape](*obstacle.size)))
+            for array, value in zip(self._bodies, bodies_of(body), strict=True):
+                array[number] = value[0]
+            data = self._data
+            data.speed[index], data.slower[index], data.rise[index] = obstacle.speed, obstacle.slower, obstacle.rise
+            data.age[index] = obstacle.age
+        self._count()
+        return changed
+
+    def hold(self, holding: frozenset[str]) -> None:
+        """Take it that these arms' grippers hold their objects."""
+        self._holding = holding
+        self._count()
+
+    def change(self, settings: ControllerSettings) -> None:
+        """Let pairs keep what ``settings`` say."""
+        self._goal = kept_by_obstacles(self._robot, settings).values
+        self._data.buffer[:] = stop_buffer(self._goal, settings)
+        self._count()
+
+    def keep_clear(self, h: float) -> None:
+        """Before a step of ``h`` [s] from an observed reference: say what pairs have to keep, and joint speeds."""
+        if self.there:
+            self._keep_clear(h)
+
+    def pass_time(self, time: float) -> None:
+        """Let reports get older by a ``time`` [s] for which no step is taken."""
+        self._data.age[:] += time
+
+    def _count(self) -> None:
+        """Let pairs count whose obstacle is there and whose object is held."""
+        if not self._number:
+            return
+        there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))
+        held = np.array([arm is None or arm in self._holding for arm in self._holders])
+        self._data.kept[:] = np.where(there & held, self._goal, -np.inf)
+        self._keep_while_stopping()
+        if not self.there:
+            self._limits.velocity[:] = self._data.velocity
+            self._data.stop_time[:] = (self._data.velocity / self._limits.acceleration).max()

@@ -1,0 +1,55 @@
+"""Bodies for moving obstacles: one for each name, and its pairs with all that moves.
+
+They end the collision geometries that a controller is made with. Shape and pose are written at run time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import product
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
+from q2r2_control.robot.held_objects import HeldObject
+from q2r2_control.robot.pairs import LinkClass, Role
+from q2r2_control.robot.robot import Robot
+
+HULL = "_hull"  # ending of the capsule around a held object
+
+
+def with_obstacle_bodies(robot: Robot, names: Iterable[str]) -> pin.GeometryModel:
+    """``Robot.objects.geometry``, and after it a sphere and its pairs for each of ``names``.
+
+    A held object counts as the capsule around it: two boxes would need pairs of all their edges.
+    """
+    if not names:
+        return robot.objects.geometry
+    geometry = robot.objects.geometry.copy()
+    moving = [i for i, item in enumerate(robot.collision_model.geometryObjects) if item.parentJoint != 0]
+    moving += [int(geometry.addGeometryObject(_hull(held))) for held in robot.objects.by_arm.values()]
+    for name in names:
+        body = geometry.addGeometryObject(pin.GeometryObject(f"{name}_0", 0, pin.SE3.Identity(), coal.Sphere(1.0)))
+        for number in moving:
+            geometry.addCollisionPair(pin.CollisionPair(number, body))
+    return geometry
+
+
+def roles_with_obstacles(robot: Robot, names: Iterable[str]) -> dict[str, Role]:
+    """Roles of links and of moving obstacles. Raises :class:`ConfigError` for the name of a link."""
+    for name in names:
+        if name in robot.roles:
+            raise ConfigError(f"control.moving_obstacles: {name}: the cell has a link {name}; allowed: another name")
+    return robot.roles | dict.fromkeys(names, Role(LinkClass.OBSTACLE, frozenset()))
+
+
+def _hull(held: HeldObject) -> pin.GeometryObject:
+    shape, placement = coal.Sphere(held.config.radius), held.placement
+    if held.config.box is not None:
+        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * held.config.box
+        shape, within = capsule_between(*enclosing_capsule(corners))
+        placement = placement * within
+    return pin.GeometryObject(f"{held.link}{HULL}", held.joint, placement, shape)
