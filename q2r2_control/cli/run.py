@@ -35,7 +35,7 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, AssemblyTask, tasks_named
+from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, AssemblyTask, held_to_promises, tasks_named
 from q2r2_control.demo.trials import try_tasks
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import adapted, make_input, options_of
@@ -209,10 +209,12 @@ def demo(
         record=record,
         notes={"task": "; ".join(task.about for task in chosen)},
     )
+    if options.table and not (viewer or web):
+        say("--viewer shows the arms in MuJoCo's window, --web in a browser")
     if plant == "fri":
         with rehearsal(_FRI_CONFIG, mode, chosen, period, rt) as results:
             done = run_cell(load_config(_FRI_CONFIG), options)
-        done = replace(done, tasks=tuple(results))
+        done = replace(done, tasks=held_to_promises(results, done.summary))
     else:
         done = run_cell(load_config(DEMO_CONFIG), options)
     print_summary(done, json)

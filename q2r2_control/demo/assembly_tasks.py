@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from q2r2_control.config.cell import Config
 from q2r2_control.demo.part_judges import CarryJudge, HandoverJudge, Judge, LiftJudge, StackJudge, Toucher, TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 
 
@@ -78,6 +79,21 @@ def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
     if unknown := sorted(wanted - {*TASKS, ALL_TASKS}):
         raise ConfigError(f"task {unknown[0]!r:.60}: allowed: {', '.join((*TASKS, ALL_TASKS))}")
     return tuple(task for name, task in TASKS.items() if name in wanted or ALL_TASKS in wanted)
+
+
+def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
+    """The same ``results``, all failed where measured links met or a stop was not certified in their run."""
+    faults, torque = [], summary.torque
+    if torque is not None and torque.measured_closest_pair and (torque.min_measured_distance_mm or 0.0) < 0.0:
+        met = " and ".join(torque.measured_closest_pair)
+        faults.append(f"measured {met} met: {torque.min_measured_distance_mm:.1f} mm, {torque.max_wall_force_n:.0f} N")
+    if summary.uncertified_ticks:
+        faults.append(f"{summary.uncertified_ticks} ticks without a certified stop")
+    results = tuple(results)
+    if not faults:
+        return results
+    reasons = ("; ".join(filter(None, (result.reason, *faults))) for result in results)
+    return tuple(replace(one, succeeded=False, reason=why) for one, why in zip(results, reasons, strict=True))
 
 
 class TaskWatch:

@@ -11,7 +11,7 @@ from functools import partial
 from multiprocessing import get_context
 
 from q2r2_control.config.cell import Config
-from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, tasks_named
+from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, held_to_promises, tasks_named
 from q2r2_control.errors import PlantError
 from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -71,7 +71,7 @@ def try_task(config: Config, mode: CommandMode, job: tuple[str, int]) -> str:
     pipeline = Pipeline(config, robot, ScriptedInput(name, human=True, seed=seed), plant, mode)
     pipeline.listeners.append(watch := TaskWatch(tasks_named([name]), plant, robot, config))
     try:
-        pipeline.run(trajectory_named(name).duration, realtime=False)
+        summary = pipeline.run(trajectory_named(name).duration, realtime=False)
     except PlantError as error:
         return str(error)
-    return watch.results()[0].reason
+    return held_to_promises(watch.results(), summary)[0].reason
