@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
+from q2r2_control.demo.contact_judges import PegJudge, WipeJudge
 from q2r2_control.demo.part_judges import CarryJudge, HandoverJudge, Judge, LiftJudge, StackJudge, Toucher, TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
@@ -32,6 +34,7 @@ class AssemblyTask:
     about: str
     parts: tuple[str, ...]
     judges: Callable[[dict[str, float]], tuple[Judge, ...]]  # of parts and their heights [m]
+    pressed: tuple[str, ...] = ()  # parts whose force on the table counts
 
 
 _ALL = (
@@ -49,8 +52,8 @@ _ALL = (
     ),
     AssemblyTask(
         "carry",
-        "both hands lift a bar of 120 mm together, carry it to the middle and put it back",
-        ("bar",),
+        "one hand leads both arms, which lift a tray, carry it level and put it back",
+        ("tray",),
         lambda parts: tuple(map(CarryJudge, parts)),
     ),
     AssemblyTask(
@@ -64,6 +67,19 @@ _ALL = (
         "three blocks on each other, one by the left hand and one by the right",
         ("green_block", "blue_block", "yellow_block"),
         lambda parts: (StackJudge(parts),),
+    ),
+    AssemblyTask(
+        "wipe",
+        "a sponge is moved over the table and pressed on with 5 to 15 N",
+        ("sponge",),
+        lambda parts: tuple(map(WipeJudge, parts)),
+        pressed=("sponge",),
+    ),
+    AssemblyTask(
+        "peg",
+        "a peg of 20 mm is put into a hole of 21 mm",
+        ("peg", "socket"),
+        lambda parts: (PegJudge(parts),),
     ),
 )
 TASKS: dict[str, AssemblyTask] = {task.name: task for task in _ALL}
@@ -79,6 +95,15 @@ def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
     if unknown := sorted(wanted - {*TASKS, ALL_TASKS}):
         raise ConfigError(f"task {unknown[0]!r:.60}: allowed: {', '.join((*TASKS, ALL_TASKS))}")
     return tuple(task for name, task in TASKS.items() if name in wanted or ALL_TASKS in wanted)
+
+
+def with_carry(config: Config) -> Config:
+    """The cell with the grips bound to ``carry``, as the task of this name has it, where no control is."""
+    bindings = config.teleop.bindings
+    if bindings.words_of(Action.CARRY) is not None:
+        return config
+    teleop = config.teleop.model_copy(update={"bindings": bindings.model_copy(update={"grip": Action.CARRY})})
+    return config.model_copy(update={"teleop": teleop})
 
 
 def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
@@ -107,7 +132,8 @@ class TaskWatch:
         heights = {name: item.size[2] for name, item in config.mujoco.objects.items()}
         self._judges = {task.name: task.judges({part: heights[part] for part in task.parts}) for task in tasks}
         parts = tuple(part for task in tasks for part in task.parts)
-        self._touches = TouchWatch(plant, robot, parts, tuple(config.mujoco.objects))
+        pressed = tuple(part for task in tasks for part in task.pressed)
+        self._touches = TouchWatch(plant, robot, parts, tuple(config.mujoco.objects), pressed)
 
     def __call__(self, tick: Tick) -> None:
         """See what this tick has made of the parts."""
