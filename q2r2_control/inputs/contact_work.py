@@ -58,7 +58,7 @@ CARRY = HandWork(
 )
 
 _SPONGE_X, _SPONGE_Y, _SPONGE_HELD = 0.60, 0.42, 0.248
-_WIPING = _SPONGE_HELD - 0.0057  # the spring of the impedance presses with what is left of it [m]
+_WIPING = _SPONGE_HELD - 0.005  # the spring of the impedance presses with what is left of it [m]
 _STROKES = ((0.72, 0.42), (0.72, 0.39), (0.60, 0.39), (0.60, 0.36), (0.72, 0.36))
 WIPE = HandWork(
     duration=19.4,
