@@ -21,9 +21,9 @@ import typer
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.inputs.assembly import minimum_jerk
 from q2r2_control.inputs.played import HandButtons, HeadsetSampling, PlayedInput
 from q2r2_control.inputs.scripted import HANDS_AT_REST
+from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.judging.motion import Track, delays_behind
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant

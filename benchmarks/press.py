@@ -21,7 +21,7 @@ from q2r2_control.config.cell import Config, load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import TorqueDrive
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.assembly import minimum_jerk
+from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names

@@ -19,7 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.assembly import minimum_jerk
+from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.types import Array
 
 ARMS = ("left", "right")

@@ -25,7 +25,7 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
-from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
+from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, held_to_promises
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.base import make_input
 from q2r2_control.judging.episode_judge import EpisodeJudge
@@ -164,7 +164,7 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, pa
     if page is not None:
         say(f"page: {page.begin(pipeline, options.name, recorder is not None)}", console)
     summary = _run(pipeline, options, recorder, console)
-    results = () if watch is None else watch.results()
+    results = () if watch is None else held_to_promises(watch.results(), summary)
     if recorder is not None and results:
         recorder.success = all(task.succeeded for task in results)
     return CellRun(summary, results)

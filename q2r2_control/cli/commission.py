@@ -31,7 +31,7 @@ from q2r2_control.recording.about import program
 from q2r2_control.robot.commissioned import fingerprint, sign_off_file
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, CommandMode
-from q2r2_control.viewer.tables import figure_table, record_table
+from q2r2_control.viewer.tables import figure_table, print_table, record_table
 
 _MOST_LOST = 0.01  # of a cabinet's messages
 _POINTS = 3  # that both tips touch
@@ -95,7 +95,7 @@ class _Commissioning:
         def listened() -> list[dict[str, Any]]:
             self._plant.reset()
             heard = listen(self._plant, self._duration)
-            self._console.print(heard.table(self._duration))
+            print_table(heard.table(self._duration), self._console)
             for its in heard.cabinets:
                 lost = its.lost / (its.lost + its.messages)
                 if its.quality not in ("good", "excellent") or lost > _MOST_LOST or its.safety != "normal":
@@ -126,7 +126,7 @@ class _Commissioning:
             notes = ["its tool went {} mm forwards (x), {} left (y), {} up (z)".format(*way_mm)]
             rows = zip(names, before.tolist(), now.tolist(), (now - before).tolist(), strict=True)
             columns = ("joint", "before [deg]", "now [deg]", "change [deg]")
-            self._console.print(figure_table(f"{arm} arm", columns, rows, notes))
+            print_table(figure_table(f"{arm} arm", columns, rows, notes), self._console)
             moved = bool(np.abs(now - before).max() > _GUIDED)
             if not moved:
                 say(f"the {arm} arm's joints have not moved", self._console, "yellow")
@@ -149,7 +149,7 @@ class _Commissioning:
         report = self._tried(
             lambda: measure_mount(self._plant, self.config, self._robot, _POINTS, self._tip, self._console)
         )
-        self._console.print(report.table())
+        print_table(report.table(), self._console)
         if max(report.off_mm) > _MOST_APART:
             raise PlantError(
                 f"the tips are {max(report.off_mm):.1f} mm apart; allowed: {_MOST_APART:g} mm; see to --tip, and touch "
@@ -177,7 +177,7 @@ class _Commissioning:
                 reports.append(self._tried(partial(measure_joint, run, joint), run))
         columns = ("joint", "commanded [deg]", "measured [deg]", "behind [deg]", "others [deg]")
         rows = [tuple(asdict(report).values()) for report in reports]
-        self._console.print(figure_table("joints", columns, rows))
+        print_table(figure_table("joints", columns, rows), self._console)
         return [asdict(report) for report in reports]
 
     def _load(self, run: SlowRun) -> list[dict[str, Any]] | None:
@@ -189,7 +189,7 @@ class _Commissioning:
         figures = [tuple(asdict(report).values()) for report in reports]
         columns = ("arm", "against", "found [kg]", "expected [kg]", "found [mm]", "expected [mm]", "unexplained [Nm]")
         rows = [[" ".join(map(str, cell)) if isinstance(cell, list) else cell for cell in row] for row in figures]
-        self._console.print(figure_table("loads, centres in the flange's frame", columns, rows))
+        print_table(figure_table("loads, centres in the flange's frame", columns, rows), self._console)
         for report in reports:
             report.check()
             if not report.is_judged:
@@ -199,7 +199,7 @@ class _Commissioning:
 
     def _stop(self, run: SlowRun) -> list[dict[str, Any]]:
         reports = [self._tried(partial(measure_stop, run, arm), run) for arm in run.robot.arms]
-        self._console.print(record_table("stops", reports))
+        print_table(record_table("stops", reports), self._console)
         return [asdict(report) for report in reports]
 
     def _tried(self, measure: Callable[[], _Measured], run: SlowRun | None = None) -> _Measured:

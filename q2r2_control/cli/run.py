@@ -35,12 +35,12 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, AssemblyTask, tasks_named
+from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, AssemblyTask, held_to_promises, tasks_named, with_carry
 from q2r2_control.demo.trials import try_tasks
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
-from q2r2_control.inputs.scripted import TRAJECTORIES, trajectory_named
+from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, trajectory_named
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.types import CommandMode
@@ -164,6 +164,12 @@ def demo(
     web_host: WebHost = "127.0.0.1",
     web_port: WebPort = 8080,
     human: Human = False,
+    hands: Annotated[
+        str | None,
+        Option(
+            metavar="[careful|shaky]", help="careful: as --human; shaky: faster, 2 mm of tremor, lost for a second."
+        ),
+    ] = None,
     seed: Seed = 0,
     seeds: Annotated[
         int | None, Option(min=1, help="Try each task so often with --human, in simulated time; count successes.")
@@ -181,6 +187,9 @@ def demo(
     _check_times(fast, rt)
     if plant not in ("mujoco", "fri"):
         raise ConfigError(f"--plant {plant!r:.40}: allowed: mujoco, fri")
+    if hands not in (None, "careful", "shaky"):
+        raise ConfigError(f"--hands {hands!r:.40}: allowed: careful, shaky")
+    shaky = hands == "shaky"
     mode = mode or (CommandMode.POSITION if plant == "fri" else CommandMode.TORQUE)
     chosen = tasks_named(tasks or ("handover", "stack"))
     if seeds is not None:
@@ -188,10 +197,11 @@ def demo(
         unfit |= {"--duration": duration is not None, "--seed": seed != 0}
         if refused := [option for option, given in unfit.items() if given]:
             raise ConfigError(f"{refused[0]} cannot be used with --seeds")
-        _try_tasks(chosen, mode, seeds, json)
+        _try_tasks(chosen, mode, seeds, shaky, json)
         return
     trajectory = "+".join(task.name for task in chosen)
     work = trajectory_named(trajectory)
+    work = hurried(work, seed) if shaky else work
     options = RunOptions(
         name="demo",
         input="scripted",
@@ -199,7 +209,7 @@ def demo(
         mode=mode.value,
         duration=positive("--duration", duration) or work.duration,
         fast=fast,
-        input_options={"trajectory": trajectory, "human": human, "seed": seed},
+        input_options={"trajectory": trajectory, "human": human or hands is not None, "seed": seed, "shaky": shaky},
         table=_shows_table(headless, viewer),
         window=viewer,
         page=(web_host, web_port) if web else None,
@@ -209,20 +219,22 @@ def demo(
         record=record,
         notes={"task": "; ".join(task.about for task in chosen)},
     )
+    if options.table and not (viewer or web):
+        say("--viewer shows the arms in MuJoCo's window, --web in a browser")
     if plant == "fri":
         with rehearsal(_FRI_CONFIG, mode, chosen, period, rt) as results:
-            done = run_cell(load_config(_FRI_CONFIG), options)
-        done = replace(done, tasks=tuple(results))
+            done = run_cell(with_carry(load_config(_FRI_CONFIG)), options)
+        done = replace(done, tasks=held_to_promises(results, done.summary))
     else:
-        done = run_cell(load_config(DEMO_CONFIG), options)
+        done = run_cell(with_carry(load_config(DEMO_CONFIG)), options)
     print_summary(done, json)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)
 
 
-def _try_tasks(tasks: tuple[AssemblyTask, ...], mode: CommandMode, seeds: int, json: bool) -> None:
+def _try_tasks(tasks: tuple[AssemblyTask, ...], mode: CommandMode, seeds: int, shaky: bool, json: bool) -> None:
     with notice_of_compiling():
-        reports = try_tasks(load_config(DEMO_CONFIG), tasks, mode, seeds, print_progress)
+        reports = try_tasks(load_config(DEMO_CONFIG), tasks, mode, seeds, shaky, print_progress)
     if json:
         print(as_json_text(reports))
     for report in () if json else reports:

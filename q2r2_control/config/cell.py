@@ -88,12 +88,21 @@ class HeadsetConfig(StrictModel):
         return None if self.allow is None else tuple(map(network_of, self.allow))
 
 
+class BoxConfig(StrictModel):
+    """A further box of a loose object."""
+
+    size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
+    at: Metres3 = Field(description="its centre, from that of the first box [m]")
+
+
 class ObjectConfig(StrictModel):
     """A loose box in the simulated cell, to be grasped. The controller does not know of it."""
 
     size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
     position: Metres3 = Field(description="of the centre at the start [m]")
-    mass: float = Field(0.2, gt=0, le=100, description="[kg]")
+    mass: float = Field(0.2, gt=0, le=100, description="of all of it [kg]")
+    boxes: tuple[BoxConfig, ...] = Field((), description="further boxes fixed to it, as the walls of a hole")
+    friction: float = Field(1.0, ge=0, le=1.5, description="against other objects; pads and obstacles have theirs")
     colour: Colour = (0.2, 0.45, 0.8, 1.0)
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
+from q2r2_control.demo.contact_judges import PegJudge, WipeJudge
 from q2r2_control.demo.part_judges import CarryJudge, HandoverJudge, Judge, LiftJudge, StackJudge, Toucher, TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 
 
@@ -31,6 +34,7 @@ class AssemblyTask:
     about: str
     parts: tuple[str, ...]
     judges: Callable[[dict[str, float]], tuple[Judge, ...]]  # of parts and their heights [m]
+    pressed: tuple[str, ...] = ()  # parts whose force on the table counts
 
 
 _ALL = (
@@ -48,8 +52,8 @@ _ALL = (
     ),
     AssemblyTask(
         "carry",
-        "both hands lift a bar of 120 mm together, carry it to the middle and put it back",
-        ("bar",),
+        "one hand leads both arms, which lift a tray, carry it level and put it back",
+        ("tray",),
         lambda parts: tuple(map(CarryJudge, parts)),
     ),
     AssemblyTask(
@@ -63,6 +67,19 @@ _ALL = (
         "three blocks on each other, one by the left hand and one by the right",
         ("green_block", "blue_block", "yellow_block"),
         lambda parts: (StackJudge(parts),),
+    ),
+    AssemblyTask(
+        "wipe",
+        "a sponge is moved over the table and pressed on with 5 to 15 N",
+        ("sponge",),
+        lambda parts: tuple(map(WipeJudge, parts)),
+        pressed=("sponge",),
+    ),
+    AssemblyTask(
+        "peg",
+        "a peg of 20 mm is put into a hole of 21 mm",
+        ("peg", "socket"),
+        lambda parts: (PegJudge(parts),),
     ),
 )
 TASKS: dict[str, AssemblyTask] = {task.name: task for task in _ALL}
@@ -80,6 +97,30 @@ def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
     return tuple(task for name, task in TASKS.items() if name in wanted or ALL_TASKS in wanted)
 
 
+def with_carry(config: Config) -> Config:
+    """The cell with the grips bound to ``carry``, as the task of this name has it, where no control is."""
+    bindings = config.teleop.bindings
+    if bindings.words_of(Action.CARRY) is not None:
+        return config
+    teleop = config.teleop.model_copy(update={"bindings": bindings.model_copy(update={"grip": Action.CARRY})})
+    return config.model_copy(update={"teleop": teleop})
+
+
+def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
+    """The same ``results``, all failed where measured links met or a stop was not certified in their run."""
+    faults, torque = [], summary.torque
+    if torque is not None and torque.measured_closest_pair and (torque.min_measured_distance_mm or 0.0) < 0.0:
+        met = " and ".join(torque.measured_closest_pair)
+        faults.append(f"measured {met} met: {torque.min_measured_distance_mm:.1f} mm, {torque.max_wall_force_n:.0f} N")
+    if summary.uncertified_ticks:
+        faults.append(f"{summary.uncertified_ticks} ticks without a certified stop")
+    results = tuple(results)
+    if not faults:
+        return results
+    reasons = ("; ".join(filter(None, (result.reason, *faults))) for result in results)
+    return tuple(replace(one, succeeded=False, reason=why) for one, why in zip(results, reasons, strict=True))
+
+
 class TaskWatch:
     """A listener of a run that judges tasks. Raises :class:`ConfigError` for a cell without a task's parts."""
 
@@ -91,7 +132,8 @@ class TaskWatch:
         heights = {name: item.size[2] for name, item in config.mujoco.objects.items()}
         self._judges = {task.name: task.judges({part: heights[part] for part in task.parts}) for task in tasks}
         parts = tuple(part for task in tasks for part in task.parts)
-        self._touches = TouchWatch(plant, robot, parts, tuple(config.mujoco.objects))
+        pressed = tuple(part for task in tasks for part in task.pressed)
+        self._touches = TouchWatch(plant, robot, parts, tuple(config.mujoco.objects), pressed)
 
     def __call__(self, tick: Tick) -> None:
         """See what this tick has made of the parts."""

@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import mujoco
+import numpy as np
+
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 
@@ -34,16 +37,29 @@ class PartState:
     place: tuple[float, float, float]  # of its centre in the world [m]
     tilt: float  # of its own z axis from the world's [rad]
     touched: int  # by what: flags of :class:`Toucher`
+    pressed: float = 0.0  # on the surroundings, where that is measured [N]
 
 
 class TouchWatch:
     """Looks at loose parts of a simulated cell, and remembers every touch of an arm that is not a grasp."""
 
-    def __init__(self, plant: MujocoPlant, robot: Robot, parts: Sequence[str], objects: Sequence[str]) -> None:
-        """``parts`` are looked at, ``objects`` are all that fingers may touch; names of ``mujoco.objects``."""
+    def __init__(
+        self,
+        plant: MujocoPlant,
+        robot: Robot,
+        parts: Sequence[str],
+        objects: Sequence[str],
+        pressed: Sequence[str] = (),
+    ) -> None:
+        """``parts`` are looked at, of those in ``pressed`` the force too; ``objects`` are all that fingers may touch.
+
+        All are names of ``mujoco.objects``.
+        """
         self._model, self._data = plant.model, plant.data
         loose = {self._model.body(name).id for name in objects}
         self._parts = {name: int(self._model.body(name).id) for name in parts}
+        self._pressed = {self._parts[name] for name in pressed}
+        self._wrench = np.zeros(6)  # of one contact, the normal first
         self._body: list[int] = self._model.geom_bodyid.tolist()
         self._kinds = [Toucher.PART if body in loose else self._kind(body, robot) for body in self._body]
         self._is_grasp = [
@@ -53,9 +69,9 @@ class TouchWatch:
 
     def look(self, t: float) -> dict[str, PartState]:
         """Every part at ``t`` [s], as of the last physics step."""
-        touched = dict.fromkeys(self._body, 0)
+        touched, force = dict.fromkeys(self._body, 0), dict.fromkeys(self._body, 0.0)
         kinds, body = self._kinds, self._body
-        for first, second in self._data.contact.geom.tolist():
+        for contact, (first, second) in enumerate(self._data.contact.geom.tolist()):
             one, other = kinds[first], kinds[second]
             touched[body[first]] |= other
             touched[body[second]] |= one
@@ -63,9 +79,15 @@ class TouchWatch:
             if not self._is_grasp[one | other]:
                 pair = self._model.body(body[first]).name, self._model.body(body[second]).name
                 self.forbidden.setdefault(pair, t)
+            pressed = self._pressed.intersection((body[first], body[second]))
+            if pressed and one | other == Toucher.PART | Toucher.SURROUNDINGS:
+                mujoco.mj_contactForce(self._model, self._data, contact, self._wrench)
+                force[pressed.pop()] += self._wrench.item(0)
         places, rotations = self._data.xpos, self._data.xmat
         return {
-            name: PartState(tuple(places[part].tolist()), math.acos(min(rotations[part, 8], 1.0)), touched[part])
+            name: PartState(
+                tuple(places[part].tolist()), math.acos(min(rotations[part, 8], 1.0)), touched[part], force[part]
+            )
             for name, part in self._parts.items()
         }
 
@@ -94,6 +116,7 @@ _FALL = 0.005  # without a finger on it, deeper than a part that is put down [m]
 _PUT_BACK = (0.01, 0.001)  # from where it was, sideways and in height [m]
 _STACKED = (0.01, 0.001)  # from the middle of the part below, sideways and in height [m]
 _UPRIGHT = math.radians(2.0)
+_LEVEL = math.radians(5.0)  # of what both hands carry
 
 
 class Judge:
@@ -170,12 +193,27 @@ class LiftJudge(Judge):
 
 
 class CarryJudge(LiftJudge):
-    """The same with both hands at once, and 100 mm from where it lay."""
+    """The same with both hands at once, 100 mm from where it lay, and never inclined by 5 degrees or more."""
 
     _wanted = f"held by both hands, {1e3 * _LIFT:.0f} mm up and {1e3 * _CARRY:.0f} mm away,"
 
+    def __init__(self, part: str) -> None:
+        super().__init__(part)
+        self._tilt = 0.0
+
+    def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
+        super().see(dt, parts)
+        self._tilt = max(self._tilt, parts[self.parts[0]].tilt)
+
     def _is_up(self, part: PartState) -> bool:
         return part.touched == FINGERS and self._away[0] >= _CARRY and self._away[1] >= _LIFT
+
+    def measured(self) -> dict[str, float]:
+        return {"tilt_deg": math.degrees(self._tilt)} | super().measured()
+
+    def faults(self) -> list[str]:
+        tilted = [f"{self.parts[0]}: inclined by {math.degrees(self._tilt):.1f} deg"] if self._tilt >= _LEVEL else []
+        return super().faults() + tilted
 
 
 class StackJudge(Judge):

@@ -11,9 +11,9 @@ from functools import partial
 from multiprocessing import get_context
 
 from q2r2_control.config.cell import Config
-from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, tasks_named
+from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, held_to_promises, tasks_named, with_carry
 from q2r2_control.errors import PlantError
-from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
+from q2r2_control.inputs.scripted import ScriptedInput, hurried, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
@@ -45,6 +45,7 @@ def try_tasks(
     tasks: Sequence[AssemblyTask],
     mode: CommandMode,
     seeds: int,
+    shaky: bool = False,
     progress: Callable[[str], None] = lambda line: None,
 ) -> list[TrialReport]:
     """Try each task by itself ``seeds`` times, in as many processes as there are processors."""
@@ -54,7 +55,7 @@ def try_tasks(
     workers = min(os.cpu_count() or 1, len(jobs))
     pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=signal.signal, initargs=ignored)
     try:
-        for (task, seed), failure in zip(jobs, pool.map(partial(try_task, config, mode), jobs), strict=True):
+        for (task, seed), failure in zip(jobs, pool.map(partial(try_task, config, mode, shaky), jobs), strict=True):
             if failure:
                 failures[task][seed] = failure
             progress(f"{task}, seed {seed}: {failure or 'succeeded'}")
@@ -63,15 +64,17 @@ def try_tasks(
     return [TrialReport(task, seeds, failed) for task, failed in failures.items()]
 
 
-def try_task(config: Config, mode: CommandMode, job: tuple[str, int]) -> str:
+def try_task(config: Config, mode: CommandMode, shaky: bool, job: tuple[str, int]) -> str:
     """Try a task of a name with a seed; returns what fell short, empty where it succeeded."""
     name, seed = job
+    config, work = with_carry(config), trajectory_named(name)
+    work = hurried(work, seed) if shaky else work
     robot = Robot.from_config(config)
     plant = MujocoPlant(robot, config)
-    pipeline = Pipeline(config, robot, ScriptedInput(name, human=True, seed=seed), plant, mode)
+    pipeline = Pipeline(config, robot, ScriptedInput(name, human=True, seed=seed, shaky=shaky), plant, mode)
     pipeline.listeners.append(watch := TaskWatch(tasks_named([name]), plant, robot, config))
     try:
-        pipeline.run(trajectory_named(name).duration, realtime=False)
+        summary = pipeline.run(work.duration, realtime=False)
     except PlantError as error:
         return str(error)
-    return watch.results()[0].reason
+    return held_to_promises(watch.results(), summary)[0].reason

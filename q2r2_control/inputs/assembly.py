@@ -1,73 +1,15 @@
 """Small assembly work of two hands, as way points: what lies on the table of config/dual_iiwa7.yaml is picked up.
 
-Way points are those of the tools that follow, in the world; the hands move alike, from wherever they start. Nothing is
-corrected on the way: where a part lies is known, and where a tool arrives is what the robot makes of it.
+Nothing is corrected on the way: where a part lies is known, and where a tool arrives is what the robot makes of it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
 
-import numpy as np
-import pinocchio as pin
-
-from q2r2_control.types import Array
-
-# Time [s], place x y z [m], tilt about x [rad], and the turn about z that comes before it [rad].
-WayPoint = tuple[float, float, float, float, float, float]
-
-_X, _Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-
-
-def minimum_jerk(fraction: float) -> float:
-    """Share of the way at a ``fraction`` of the time, which is cut to 0 .. 1 (Flash and Hogan, 1985)."""
-    s = min(max(fraction, 0.0), 1.0)
-    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-
-
-class WayPoints:
-    """A motion through ``points``, the times of which have to rise; before the first and after the last it rests."""
-
-    def __init__(self, points: Sequence[WayPoint]) -> None:
-        table = np.array(points, dtype=np.float64)
-        self._times, self._values = table[:, 0], table[:, 1:]
-
-    def at(self, t: float) -> tuple[Array, Array]:
-        """Place (3,) [m] and rotation vector (3,) [rad] at ``t`` [s]."""
-        times, values = self._times, self._values
-        index = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2))
-        share = minimum_jerk((t - times[index]) / (times[index + 1] - times[index]))
-        where = (1.0 - share) * values[index] + share * values[index + 1]
-        tilt, turn = where[3:]
-        if turn == 0.0:
-            return where[:3], tilt * _X
-        return where[:3], pin.log3(pin.exp3(tilt * _X) @ pin.exp3(turn * _Z))
-
-
-# Where the tools are at home [m]: pointing straight down, fingers closing along y.
-HOME: Mapping[str, tuple[float, float, float]] = {"left": (0.50, 0.25, 0.38), "right": (0.50, -0.25, 0.38)}
-_LEFT_HOME, _RIGHT_HOME = (*HOME["left"], 0.0, 0.0), (*HOME["right"], 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class HandWork:
-    """The motion of both hands, from and to home."""
-
-    duration: float  # [s]
-    tools: Mapping[str, tuple[WayPoint, ...]]  # after home, at rising times since the start; a hand without any rests
-    steps: tuple[tuple[float, str], ...]  # from when on [s], in words
-    presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # of the upper buttons, by hand [s]
-
-    def moved(self, x: float, y: float) -> HandWork:
-        """The same work on parts that lie ``x`` and ``y`` [m] farther along the axes of the world."""
-        tools = {
-            hand: tuple((p[0], p[1] + x, p[2] + y, *p[3:]) if p[1:4] != HOME[hand] else p for p in points)
-            for hand, points in self.tools.items()
-        }
-        return replace(self, tools=tools)
-
+from q2r2_control.inputs.contact_work import CARRY, PEG, WIPE
+from q2r2_control.inputs.way_points import LEFT_HOME, RIGHT_HOME, HandWork
 
 # A block of 60 mm, held 17 mm above its middle.
 _GRIP, _OVER = 0.243, 0.33
@@ -81,7 +23,7 @@ _MEET = (
     (12.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # back
     (14.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # put down
     (15.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # let go
-    (17.4, *_LEFT_HOME),
+    (17.4, *LEFT_HOME),
 )
 MEET = HandWork(
     duration=17.4,
@@ -110,7 +52,7 @@ GRASP = HandWork(
             (7.5, 0.45, -0.35, _LOW, 0.0, 0.0),  # put down
             (8.2, 0.45, -0.35, _LOW, 0.0, 0.0),  # let go
             (9.2, 0.45, -0.35, 0.30, 0.0, 0.0),
-            (10.6, *_RIGHT_HOME),
+            (10.6, *RIGHT_HOME),
         )
     },
     steps=(
@@ -135,10 +77,10 @@ STACK = HandWork(
             (6.6, 0.52, 0.00, _GRIP + 0.06, 0.0, 0.0),
             (7.3, 0.52, 0.00, _GRIP + 0.06, 0.0, 0.0),  # let go
             (8.3, 0.52, 0.00, 0.40, 0.0, 0.0),
-            (9.9, *_LEFT_HOME),
+            (9.9, *LEFT_HOME),
         ),
         "right": (
-            (4.0, *_RIGHT_HOME),
+            (4.0, *RIGHT_HOME),
             (5.0, 0.55, -0.25, _OVER, 0.0, 0.0),
             (6.2, 0.55, -0.25, _GRIP, 0.0, 0.0),
             (6.9, 0.55, -0.25, _GRIP, 0.0, 0.0),  # grasp
@@ -148,7 +90,7 @@ STACK = HandWork(
             (11.2, 0.52, 0.00, _GRIP + 0.12, 0.0, 0.0),
             (11.9, 0.52, 0.00, _GRIP + 0.12, 0.0, 0.0),  # let go
             (12.8, 0.52, 0.00, 0.42, 0.0, 0.0),
-            (14.8, *_RIGHT_HOME),
+            (14.8, *RIGHT_HOME),
         ),
     },
     steps=(
@@ -182,10 +124,10 @@ HANDOVER = HandWork(
             (6.8, 0.46, _OFF, 0.38, *_LEFT),  # to the middle
             (9.2, 0.46, _OFF, 0.38, *_LEFT),  # let go, once the other hand has it
             (10.2, 0.46, _OFF + _BACK_Y, 0.38 + _BACK_Z, *_LEFT),
-            (12.4, *_LEFT_HOME),
+            (12.4, *LEFT_HOME),
         ),
         "right": (
-            (3.4, *_RIGHT_HOME),
+            (3.4, *RIGHT_HOME),
             (5.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),  # where the bar's right end will be
             (6.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),
             (8.0, 0.46, -_OFF, 0.38, *_RIGHT),
@@ -195,7 +137,7 @@ HANDOVER = HandWork(
             (14.6, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # put down
             (15.3, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # let go
             (16.2, 0.46, -_OFF - 0.12 - _BACK_Y, _BAR_LOW + _BACK_Z, *_RIGHT),
-            (18.4, *_RIGHT_HOME),
+            (18.4, *RIGHT_HOME),
         ),
     },
     steps=(
@@ -212,39 +154,13 @@ HANDOVER = HandWork(
 )
 
 
-def _carrying(side: float, tilt: tuple[float, float]) -> tuple[WayPoint, ...]:
-    """The way of the hand at the end of the bar that is to this ``side`` of its middle along y, 1 or -1."""
-    lies, middle = 0.15 + side * _OFF, side * _OFF
-    return (
-        (2.2, 0.44, lies + side * _BACK_Y, _BAR_LOW + _BACK_Z, *tilt),
-        (3.4, 0.44, lies, _BAR_LOW, *tilt),
-        (4.2, 0.44, lies, _BAR_LOW, *tilt),  # grasp
-        (5.6, 0.44, lies, 0.33, *tilt),  # lift
-        (7.4, 0.46, middle, 0.33, *tilt),  # to the middle
-        (8.8, 0.46, middle, 0.33, *tilt),
-        (10.6, 0.44, lies, 0.33, *tilt),  # back
-        (12.0, 0.44, lies, _BAR_LOW, *tilt),  # put down
-        (12.8, 0.44, lies, _BAR_LOW, *tilt),  # let go
-        (13.8, 0.44, lies + side * _BACK_Y, _BAR_LOW + _BACK_Z, *tilt),
-    )
-
-
-CARRY = HandWork(
-    duration=16.0,
-    tools={
-        "left": (*_carrying(1.0, _LEFT), (16.0, *_LEFT_HOME)),
-        "right": (*_carrying(-1.0, _RIGHT), (16.0, *_RIGHT_HOME)),
-    },
-    steps=(
-        (0.0, "each hand reaches for an end of the bar"),
-        (3.4, "both grasp"),
-        (4.2, "both lift the bar"),
-        (5.6, "they carry it to the middle"),
-        (8.8, "they put it back"),
-        (12.0, "both let go"),
-    ),
-    presses={"left": (3.5, 12.1), "right": (3.5, 12.1)},
-)
-
 # In the order in which they can follow each other.
-WORKS: Mapping[str, HandWork] = {"meet": MEET, "grasp": GRASP, "carry": CARRY, "handover": HANDOVER, "stack": STACK}
+WORKS: Mapping[str, HandWork] = {
+    "meet": MEET,
+    "grasp": GRASP,
+    "carry": CARRY,
+    "handover": HANDOVER,
+    "stack": STACK,
+    "wipe": WIPE,
+    "peg": PEG,
+}

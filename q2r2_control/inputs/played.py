@@ -53,7 +53,8 @@ class HeadsetSampling(SampleTiming):
     """A headset's samples, all from ``seed``: uneven at 72-76 Hz, received late, with sensor noise.
 
     ``position_noise`` is the noise's standard deviation along each axis [m]. ``tremor`` adds that of a human hand, 8-12
-    Hz with about 1 mm and 0.3 degrees. ``dropout_probability`` is that of every sample to be lost, with up to 4 more.
+    Hz with about 1 mm and 0.3 degrees; a ``shaky`` one's has 6 Hz, 2 mm and 0.6 degrees. ``dropout_probability`` is
+    that of every sample to be lost, with up to 4 more. All are lost from the first of ``lost`` to the second [s].
     """
 
     def __init__(
@@ -64,18 +65,22 @@ class HeadsetSampling(SampleTiming):
         position_noise: float = 1e-4,
         tremor: bool = False,
         dropout_probability: float = 0.0,
+        shaky: bool = False,
+        lost: tuple[float, float] = (math.inf, math.inf),
     ) -> None:
+        self._lost = lost
         self._random = np.random.default_rng([seed, SIDES.index(hand)])
         self._position_noise, self._dropout_probability = position_noise, dropout_probability
         # Two tones per degree of freedom beat like a real tremor does.
-        self._frequencies = self._random.uniform(8.0, 12.0, (6, 2))
+        self._frequencies = self._random.uniform(*((5.5, 6.5) if shaky else (8.0, 12.0)), (6, 2))
         self._phases = self._random.uniform(0.0, 2.0 * math.pi, (6, 2))
-        self._amplitudes = 0.5 * tremor * np.array([1e-3] * 3 + [math.radians(0.3)] * 3)
+        self._amplitudes = (1.0 if shaky else 0.5) * tremor * np.array([1e-3] * 3 + [math.radians(0.3)] * 3)
 
     def times(self) -> Iterator[float]:
         t = 0.0
         while True:
-            yield t
+            if not self._lost[0] <= t < self._lost[1]:
+                yield t
             drops_out = self._random.random() < self._dropout_probability
             lost = int(self._random.integers(1, _LONGEST_DROPOUT + 1)) if drops_out else 0
             t += float(sum(1.0 / self._random.uniform(*_RATES, 1 + lost)))

@@ -15,8 +15,9 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.assembly import HOME, WORKS, HandWork, WayPoint, WayPoints, minimum_jerk
+from q2r2_control.inputs.assembly import WORKS
 from q2r2_control.inputs.played import EvenSampling, HeadsetSampling, PlayedInput, SampleTiming
+from q2r2_control.inputs.way_points import HOME, HandWork, WayPoint, WayPoints, minimum_jerk
 from q2r2_control.robot.compose import compose
 from q2r2_control.types import SIDES, Array, HandInputs
 
@@ -40,6 +41,8 @@ class HandTrajectory:
     lower_presses: tuple[float, ...] = (FIRST_PRESS,)  # of both hands [s]
     duration: float | None = None  # None: without end [s]
     steps: tuple[tuple[float, str], ...] = ()  # from when on [s], in words
+    grips: tuple[float, ...] = ()  # taps of the left grip [s]
+    lost: tuple[float, float] = (math.inf, math.inf)  # from when to when the headset does not see the hands [s]
 
     def displacement(self, hand: str, t: float, frequency: float) -> tuple[Array, Array]:
         """Displacement (3,) [m] and rotation vector (3,) [rad] of ``hand`` at ``t`` [s]."""
@@ -53,11 +56,18 @@ class HandTrajectory:
     def inputs(self, hand: str, t: float) -> HandInputs:
         """Buttons of ``hand`` at time ``t`` [s]; a closed hand also shows on the index trigger."""
         upper = self.upper_presses.get(hand, ())
+        grips = self.grips if hand == "left" else ()
         pressed = [
-            any(press <= t < press + PRESS_DURATION for press in presses) for presses in (upper, self.lower_presses)
+            any(press <= t < press + PRESS_DURATION for press in presses)
+            for presses in (upper, self.lower_presses, grips)
         ]
         closed = sum(press <= t for press in upper) % 2
-        return HandInputs(button_upper=pressed[0], button_lower=pressed[1], press_index=float(closed))
+        return HandInputs(
+            button_upper=pressed[0],
+            button_lower=pressed[1],
+            press_index=float(closed),
+            press_middle=float(pressed[2]),
+        )
 
 
 def _phase(t: float, frequency: float) -> float:
@@ -95,20 +105,24 @@ def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
     points = {hand: [home] for hand, home in homes.items()}
     presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
     begins, steps = START, [(0.0, "the hands rest")]
+    grips, engages = list[float](), list[float]()
     for name, work in works:
         steps += [(begins + t, f"{name}: {words}") for t, words in work.steps]
         for hand, home in homes.items():
             way = [(begins + point[0], *point[1:]) for point in (home, *work.tools.get(hand, ()))]
             points[hand] += [point for point in way if point[0] > points[hand][-1][0]]
             presses[hand] += [begins + t for t in work.presses.get(hand, ())]
+        grips += [begins + t for t in work.grips]
+        engages += [begins + t for t in work.engages]
         begins += work.duration
     return HandTrajectory(
         left=_from_home(points["left"], "left"),
         right=_from_home(points["right"], "right"),
         upper_presses={hand: tuple(times) for hand, times in presses.items()},
-        lower_presses=(FIRST_PRESS, begins + _LAST_PRESS),
+        lower_presses=(FIRST_PRESS, *engages, begins + _LAST_PRESS),
         duration=begins + _LAST_PRESS + _REST,
         steps=tuple(steps),
+        grips=tuple(grips),
     )
 
 
@@ -141,6 +155,58 @@ def trajectory_named(name: str) -> HandTrajectory:
     return in_sequence([(work, WORKS[work]) for work in works])
 
 
+_PACE = 1.25  # of hasty hands
+_HESITATIONS, _HESITATES = 3, 0.4  # [s]
+_LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1  # since a headset lost the hands [s]
+_EARLY = (0.1, 0.45)  # when that is, of the work, before it presses on anything
+_NO_PRESS = (0.3, 0.6)  # before and after a press the hands do not stop [s]
+
+
+def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
+    """The same work by hasty hands: faster, with hesitation, and the headset loses them for a second once.
+
+    They wait until they are seen again, engage both arms anew, and go on.
+    """
+    assert work.duration is not None
+    random, presses = np.random.default_rng([seed, len(SIDES)]), [*work.lower_presses, *work.grips]
+    presses = sorted(presses + [press for times in work.upper_presses.values() for press in times])
+
+    def stop(fraction: float) -> float:
+        at = fraction * (work.duration or 0.0)
+        for press in presses:
+            if press - _NO_PRESS[0] < at < press + _NO_PRESS[1]:
+                at = press + _NO_PRESS[1]
+        return at
+
+    lost = stop(random.uniform(*_EARLY))
+    stops = [(stop(fraction), _HESITATES) for fraction in random.uniform(0.1, 0.9, _HESITATIONS)]
+    played, written, t = [0.0], [0.0], 0.0
+    for at, pause in sorted([*stops, (lost, _GOES_ON), (work.duration, 0.0)]):
+        t += (at - written[-1]) / _PACE
+        played += [t, t + pause]
+        written += [at, at]
+        t += pause
+    seen = played[written.index(lost)]
+
+    def then(times: Sequence[float]) -> tuple[float, ...]:
+        return tuple(np.interp(times, written, played).tolist())
+
+    def slowed(path: Path) -> Path:
+        return lambda t, frequency: path(float(np.interp(t, played, written)), frequency)
+
+    carries = sum(grip < lost for grip in work.grips) % 2
+    return HandTrajectory(
+        left=slowed(work.left),
+        right=None if work.right is None else slowed(work.right),
+        upper_presses={hand: then(times) for hand, times in work.upper_presses.items()},
+        lower_presses=(*then(work.lower_presses), seen + _ENGAGES),
+        duration=t,
+        steps=tuple(zip(then([at for at, _ in work.steps]), [words for _, words in work.steps], strict=True)),
+        grips=(*then(work.grips), *[seen + _CARRIES] * carries),
+        lost=(seen, seen + _LOST),
+    )
+
+
 # Where an operator holds the hands; only what follows from here on moves an arm.
 HANDS_AT_REST = {
     "left": pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([0.35, 0.25, 1.1])),
@@ -157,13 +223,14 @@ _FULL_LENGTH = (
 class ScriptedInput(PlayedInput):
     """Plays a trajectory of both hands, from the first poll on. Implements :class:`Input`.
 
-    ``human`` hands are those of :class:`HeadsetSampling`, with tremor and dropouts. Others are sampled at an even rate,
+    ``human`` hands are those of :class:`HeadsetSampling`, with tremor and dropouts; ``shaky`` ones tremble more, and do
+    their work as :func:`hurried` says. Others are sampled at an even rate,
     and received each later by up to ``jitter`` [s]. Circle, line and rotate repeat ``frequency_hz`` times a second.
     Hands go ``scale`` times as far as the trajectory is written, and turn as far as it is.
     Raises :class:`ConfigError` for an unknown trajectory or hand, and for a number that is not allowed.
     """
 
-    options = ("trajectory", "human", "seed", "fast")
+    options = ("trajectory", "human", "seed", "fast", "shaky")
     executable = "SimulationInput"
 
     def __init__(
@@ -176,6 +243,7 @@ class ScriptedInput(PlayedInput):
         frequency_hz: float = 0.25,
         jitter: float = 0.0,
         scale: float = 1.0,
+        shaky: bool = False,
     ) -> None:
         for hand in hands:
             if hand not in SIDES:
@@ -189,12 +257,15 @@ class ScriptedInput(PlayedInput):
                 f"scripted input: jitter = {jitter!r}: allowed is 0 .. {0.5 / rate_hz:.3g}, half a sample"
             )
         self._trajectory = trajectory_named(trajectory) if isinstance(trajectory, str) else trajectory
-        self._frequency, self._scale = frequency_hz, scale
+        if shaky and self._trajectory.duration is not None:
+            self._trajectory = hurried(self._trajectory, seed)
+        self._frequency, self._scale, lost = frequency_hz, scale, self._trajectory.lost
 
         def sampling(hand: str) -> SampleTiming:
-            if not human:
+            if not (human or shaky):
                 return EvenSampling(rate_hz, jitter, (seed, SIDES.index(hand)))
-            return HeadsetSampling(hand, seed, tremor=True, dropout_probability=_DROPOUT_PROBABILITY)
+            often = _DROPOUT_PROBABILITY
+            return HeadsetSampling(hand, seed, tremor=True, dropout_probability=often, shaky=shaky, lost=lost)
 
         super().__init__(self._ideal, self._trajectory.inputs, {hand: sampling(hand) for hand in hands})
 
@@ -206,13 +277,14 @@ class ScriptedInput(PlayedInput):
         human: bool = False,
         seed: int = 0,
         fast: bool = False,
+        shaky: bool = False,
     ) -> ScriptedInput:
         """Motions as large as the shortest arm of the cell is long, if that is shorter than an iiwa 7.
 
         ``fast`` changes nothing: samples come by the time that passes, simulated or not.
         """
         shortest = min(compose(config).arm_lengths().values())
-        return cls(trajectory, human=human, seed=seed, scale=min(shortest / _FULL_LENGTH, 1.0))
+        return cls(trajectory, human=human, seed=seed, shaky=shaky, scale=min(shortest / _FULL_LENGTH, 1.0))
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """How ``hand`` ideally moves at ``t`` [s], in the axes that its poses have [m/s, rad/s]."""

@@ -6,6 +6,7 @@ that the controller uses.
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from itertools import combinations
 
@@ -232,13 +233,19 @@ def _add_objects(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
     for name, thing in config.objects.items():
         body = spec.worldbody.add_body(name=name, pos=thing.position)
         body.add_freejoint(name=f"{name}_free")
-        body.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=np.array(thing.size) / 2,
-            mass=thing.mass,
-            rgba=thing.colour,
-            group=VISUAL_GROUP,
-            condim=4,
-            friction=_PAD_FRICTION,
-        )
+        boxes = [(thing.size, (0.0, 0.0, 0.0)), *((box.size, box.at) for box in thing.boxes)]
+        volume = sum(math.prod(size) for size, _ in boxes)
+        for number, (size, at) in enumerate(boxes):
+            body.add_geom(
+                name=f"{name}_{number}" if number else name,
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=np.array(size) / 2,
+                pos=at,
+                mass=thing.mass * math.prod(size) / volume,
+                rgba=thing.colour,
+                group=VISUAL_GROUP,
+                condim=4,
+                friction=(thing.friction, TORSION, ROLLING),
+                # MuJoCo's usual contacts would let a light part sink millimetres into another one.
+                solref=_PAD_STIFFNESS,
+            )

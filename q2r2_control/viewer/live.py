@@ -167,7 +167,7 @@ class LiveTable:
             return table
         arms = list(tick.tools)
         for arm in arms:
-            table.add_column(arm, justify="right", min_width=14)
+            table.add_column(arm, justify="right", min_width=14, overflow="fold")
         if self._duration is not None:
             done = min(tick.t / self._duration, 1.0)
             bar = "━" * round(_BAR * done) + "·" * (_BAR - round(_BAR * done))

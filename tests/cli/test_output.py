@@ -11,9 +11,9 @@ from rich.table import Table
 
 from q2r2_control import Pipeline, RunSummary
 from q2r2_control.cli.output import late_line, summary_table
-from q2r2_control.demo.assembly_tasks import TaskResult
+from q2r2_control.demo.assembly_tasks import TaskResult, held_to_promises
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.summary.run_summary import Percentiles
+from q2r2_control.summary.run_summary import Percentiles, TorqueSummary
 from q2r2_control.viewer.tables import figure_table, print_table
 from q2r2_control.wording import sentence
 from tests.support.hands_input import HandsInput
@@ -102,6 +102,18 @@ def test_a_failed_task_is_told_with_how_late_the_loop_was(summary: RunSummary) -
     assert late_line(late, [done]) is None
     assert late_line(replace(summary, lateness_us=Percentiles(60.0, 310.0, 900.0)), [failed]) is None
     assert late_line(summary, [failed]) is None, "simulated time is never late"
+
+
+def test_no_task_succeeds_while_measured_links_met_or_no_stop_was_certified(summary: RunSummary) -> None:
+    done = TaskResult("stack", True, {}, "")
+    pair = ("left_link_6_0", "right_link_6_0")
+    torque = TorqueSummary({}, min_measured_distance_mm=0.4, measured_closest_pair=pair, max_wall_force_n=364.0)
+    assert held_to_promises([done], replace(summary, torque=torque)) == (done,)
+    met = replace(summary, torque=replace(torque, min_measured_distance_mm=-6.9))
+    (failed,) = held_to_promises([done], met)
+    assert (failed.succeeded, failed.reason) == (False, f"measured {pair[0]} and {pair[1]} met: -6.9 mm, 364 N")
+    (failed,) = held_to_promises([TaskResult("stack", False, {}, "fell")], replace(summary, uncertified_ticks=3))
+    assert failed.reason == "fell; 3 ticks without a certified stop"
 
 
 def test_a_tool_that_did_not_follow_is_said(summary: RunSummary) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.recording.reader import Recording
-from tests.cli.command import FAST, changed_cell, one_object, q2r2
+from tests.cli.command import CELL, FAST, changed_cell, one_object, q2r2
 from tests.support.pictures import needs_opengl
 
 OPTIONS = (*FAST[2:], "--duration", "0.1")
@@ -48,21 +48,38 @@ def test_rt_says_in_one_line_what_the_system_refuses_and_runs(monkeypatch: pytes
     assert "real time" not in q2r2(*options).stderr
 
 
-CAMERAS = "cameras: {front: {position: [1.9, 0, 1], look_at: [0.4, 0, 0.3], width: 32, height: 32, rate: 50}}"
+CAMERAS = ["above", "left_wrist", "right_wrist"]
 
 
-def test_a_cell_with_cameras_is_recorded_with_pictures(tmp_path: Path) -> None:
+def test_an_episode_of_the_demo_has_the_pictures_of_which_an_export_makes_videos(tmp_path: Path) -> None:
     needs_opengl()
-    options = ("--fast", "--json", "--headless", "--duration", "0.1", "--record", str(tmp_path / "recordings"))
-    result = q2r2("run", changed_cell(tmp_path, "cameras: {}", CAMERAS), *options)
+    pytest.importorskip("av", reason="the extra export is not installed")
+    options = ("--fast", "--json", "--headless", "--duration", "0.5", "--record", str(tmp_path / "recordings"))
+    recording = one_object(q2r2("demo", "grasp", *options).stdout)["recording"]
+    assert (recording["pictures_fault"], recording["lost_pictures"]) == (None, 0)
+    file = Recording(Path(recording["file"]))
+    counts = [len(list(file.pictures(name))) for name in CAMERAS]
+    assert counts == [counts[0]] * 3
+    assert sum(counts) == recording["pictures"] >= 3 * 8
+    exported = q2r2("export", "lerobot-v2.1", str(tmp_path / "recordings"), "--output", str(tmp_path / "grasp"))
+    assert exported.exit_code == 0, exported.stderr
+    assert len(list((tmp_path / "grasp/videos").rglob("episode_000000.mp4"))) == 3
+
+
+def test_where_nothing_can_be_drawn_one_line_says_so_and_all_else_is_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "nothing")
+    options = ("--fast", "--json", "--headless", "--duration", "0.1", "--record", str(tmp_path))
+    result = q2r2("run", CELL, *options)
     recording = one_object(result.stdout)["recording"]
-    assert (result.exit_code, recording["pictures_fault"], recording["lost_pictures"]) == (0, None, 0)
-    assert recording["pictures"] == len(list(Recording(Path(recording["file"])).pictures("front"))) >= 6
+    assert (result.exit_code, recording["fault"], recording["pictures"]) == (0, None, 0)
+    assert "MUJOCO_GL" in recording["pictures_fault"]
+    assert recording["ticks"] >= 100
 
 
 def test_a_plant_without_pictures_is_named_and_recorded_without(tmp_path: Path) -> None:
-    file = changed_cell(tmp_path, "cameras: {}", CAMERAS)
-    result = q2r2("run", file, *OPTIONS, "--record", str(tmp_path / "recordings"))
+    result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path / "recordings"))
     assert result.exit_code == 0
     assert "no pictures are recorded: the kinematic plant has none; allowed: --plant mujoco\n" in result.stderr
     assert Recording(Path(one_object(result.stdout)["recording"]["file"])).about.cameras == ()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.cell import Config, load_config
-from q2r2_control.demo.assembly_tasks import TASKS, TaskWatch, tasks_named
+from q2r2_control.demo.assembly_tasks import TASKS, TaskWatch, tasks_named, with_carry
 from q2r2_control.demo.part_judges import TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
@@ -29,7 +29,7 @@ PERIODS = {CommandMode.POSITION: 0.01, CommandMode.TORQUE: 0.005}  # [s]
 @cache
 def coarse(mode: CommandMode = CommandMode.POSITION) -> Config:
     """The demo's cell, with the control loop slowed down."""
-    config, period = load_config("config/dual_iiwa7.yaml"), PERIODS[mode]
+    config, period = with_carry(load_config("config/dual_iiwa7.yaml")), PERIODS[mode]
     control = config.control.model_copy(update={"max_substep": period})
     return config.model_copy(update={"loop_rate_hz": 1.0 / period, "control": control})
 
@@ -73,6 +73,9 @@ def test_every_task_succeeds_without_a_touch_that_is_no_grasp(played: Played) ->
     assert max(handover["fall_mm"], stack["fall_mm"]) < 2.0
     if played.mode is CommandMode.POSITION:
         grasp = played.results["grasp"].measured
+        assert played.results["carry"].measured["tilt_deg"] < 2.0
+        carried = {tick.states["right"] for tick in played.ticks}
+        assert "carried" in carried
         assert grasp["lifted_mm"] > 99.0
         assert max(grasp["put_back_mm"], grasp["fall_mm"]) < 1.0
 
@@ -90,6 +93,16 @@ def test_the_arms_follow_the_hands_within_a_millimetre_and_need_no_fallback(play
     assert played.summary.min_distance_mm < 3.0
     gaps = [np.linalg.norm(tick.tools["left"].translation - tick.tools["right"].translation) for tick in played.ticks]
     assert min(gaps) < 0.091
+
+
+@pytest.mark.parametrize("name", ["wipe", "peg"])
+def test_arms_that_yield_press_with_what_is_asked_and_find_the_hole(name: str) -> None:
+    result = Played(name, CommandMode.TORQUE).results[name]
+    assert result.reason == ""
+    if name == "wipe":
+        assert result.measured["wiped_mm"] > 350.0
+    else:
+        assert result.measured["tilt_deg"] < 1.0
 
 
 def test_hands_that_never_grip_lift_nothing_and_the_measure_says_so() -> None:
@@ -126,7 +139,9 @@ def test_arms_that_touch_what_they_should_not_spoil_the_task_and_are_named(
 def test_tasks_come_in_the_order_in_which_they_can_follow_each_other() -> None:
     assert [task.name for task in tasks_named(["stack", "meet", "stack"])] == ["meet", "stack"]
     assert tasks_named(["all"]) == tuple(TASKS.values())
-    with pytest.raises(ConfigError, match="task 'juggle': allowed: meet, grasp, carry, handover, stack, all"):
+    with pytest.raises(
+        ConfigError, match="task 'juggle': allowed: meet, grasp, carry, handover, stack, wipe, peg, all"
+    ):
         tasks_named(["juggle"])
 
 

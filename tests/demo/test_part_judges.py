@@ -73,6 +73,14 @@ GIVER, BOTH, TAKER = (1.0, 0.0, 0.4, LEFT), (0.5, 0.0, 0.4, FINGERS), (0.5, 0.0,
 AWAY = (1.2, -0.12, 0.4, RIGHT)
 
 
+def test_what_both_hands_carry_may_not_be_inclined_by_5_degrees() -> None:
+    level, inclined = (math.radians(angle) for angle in (4.9, 5.1))
+    for tilt, faults in ((level, []), (inclined, ["part: inclined by 5.1 deg"])):
+        judge = play(CarryJudge("part"), [LIES, (1.5, 0.12, 0.3, FINGERS)])
+        judge.see(DT, {"part": PartState((0.5, 0.12, 0.3), tilt, FINGERS)})
+        assert play(judge, [GRIPPED, BACK]).faults() == faults
+
+
 @pytest.mark.parametrize(
     ("away", "held", "touched"),
     [

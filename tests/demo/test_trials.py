@@ -19,7 +19,7 @@ def test_every_seed_is_tried_and_those_that_fail_say_why() -> None:
     elsewhere = block.model_copy(update={"position": (0.45, -0.40, block.position[2])})
     objects = {**config.mujoco.objects, "flat_block": elsewhere}
     moved = config.model_copy(update={"mujoco": config.mujoco.model_copy(update={"objects": objects})})
-    assert "flat_block: held 95 mm up for 0.0 s" in try_task(moved, CommandMode.POSITION, ("grasp", 0))
+    assert "flat_block: held 95 mm up for 0.0 s" in try_task(moved, CommandMode.POSITION, False, ("grasp", 0))
 
 
 @pytest.mark.parametrize(("failed", "reliable"), [(0, True), (1, True), (2, False)])

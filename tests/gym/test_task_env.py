@@ -23,8 +23,9 @@ from gymnasium.utils.env_checker import check_env
 from q2r2_control import gym
 from q2r2_control.demo.assembly_tasks import TASKS
 from q2r2_control.gym.task_env import TaskEnv
-from q2r2_control.inputs.assembly import HOME, WORKS, WayPoints
+from q2r2_control.inputs.assembly import WORKS
 from q2r2_control.inputs.policy import ActionSpace
+from q2r2_control.inputs.way_points import HOME, WayPoints
 from q2r2_control.types import SIDES
 from tests.demo.test_assembly_tasks import coarse
 from tests.support.pictures import needs_opengl

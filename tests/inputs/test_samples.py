@@ -11,11 +11,11 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.inputs import moved_frame
-from q2r2_control.inputs.assembly import minimum_jerk
 from q2r2_control.inputs.messages import HandPose, HandTwist
 from q2r2_control.inputs.moved_frame import Move
 from q2r2_control.inputs.samples import SAMPLES_KEPT, HandsWatch, HandTracker, SampleQueue, Watched
 from q2r2_control.inputs.session import Reception
+from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.types import SIDES, HandFault, HandInputs, HandSample
 from tests.support.two_hands import PERIOD, TwoHands, carry, hand_pose, rest
 

@@ -11,8 +11,10 @@ import pytest
 
 from q2r2_control import Robot, load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.assembly import HOME, WORKS, HandWork, WayPoints, minimum_jerk
-from q2r2_control.inputs.scripted import TRAJECTORIES, ScriptedInput, trajectory_named
+from q2r2_control.inputs.assembly import WORKS
+from q2r2_control.inputs.played import HeadsetSampling
+from q2r2_control.inputs.scripted import TRAJECTORIES, ScriptedInput, hurried, trajectory_named
+from q2r2_control.inputs.way_points import HOME, HandWork, WayPoints, minimum_jerk
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 EVERY = pytest.mark.parametrize("trajectory", list(TRAJECTORIES))
@@ -103,7 +105,7 @@ def test_nothing_comes_before_start_nor_after_close_and_it_waits_while_nobody_po
         *(
             (
                 {"trajectory": name},
-                r"allowed are circle, .*stack, and meet, grasp, carry, handover, stack joined by \+$",
+                r"allowed are circle, .*peg, and meet, grasp, carry, handover, stack, wipe, peg joined by \+$",
             )
             for name in ("spiral", "handover+", "circle+stack", "")
         ),
@@ -196,3 +198,39 @@ def test_the_hand_is_where_its_way_points_say_and_rests_at_each() -> None:
     for t in (1.0, 2.0, 4.0):
         assert np.linalg.norm(way.at(t + 1e-4)[0] - way.at(t - 1e-4)[0]) / 2e-4 < 1e-5
     assert [minimum_jerk(fraction) for fraction in (-1.0, 0.0, 0.5, 1.0, 2.0)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+
+
+def test_shaky_hands_are_lost_for_a_second_engage_anew_and_do_all_of_the_work() -> None:
+    for seed in range(20):
+        calm, hasty = trajectory_named("carry"), hurried(trajectory_named("carry"), seed)
+        assert hasty.duration is not None
+        samples = [s for s in play(ScriptedInput("carry", shaky=True, seed=seed), hasty.duration) if s.hand == "left"]
+        stamps = [sample.pose_stamp for sample in samples]
+        gaps = sorted((b - a, a) for a, b in itertools.pairwise(stamps))
+        assert 1.0 <= gaps[-1][0] < 1.1
+        assert gaps[-2][0] < 0.1
+        seen_again = gaps[-1][1] + gaps[-1][0]
+        presses = [
+            a.pose_stamp for b, a in itertools.pairwise(samples) if a.inputs.button_lower > b.inputs.button_lower
+        ]
+        assert len(presses) == len(calm.lower_presses) + 1
+        assert min(press for press in presses if press > gaps[-1][1]) == pytest.approx(seen_again + 0.3, abs=0.1)
+        opened = [a for b, a in itertools.pairwise(samples) if a.inputs.button_upper > b.inputs.button_upper]
+        assert len(opened) == len(calm.upper_presses["left"])
+        still = [hasty.displacement("left", t, 0.25)[0] for t in np.linspace(hasty.lost[0], hasty.lost[0] + 2.1, 20)]
+        assert np.ptp(still, axis=0).max() < 1e-9
+        way = [hasty.displacement("left", t, 0.25)[0] for t in np.arange(0.0, hasty.duration, 0.01)]
+        assert np.ptp(way, axis=0) == pytest.approx((0.14, 0.15, 0.145), abs=1e-3)
+
+
+def test_shaky_hands_tremble_twice_as_far_and_slower() -> None:
+    def trembling(shaky: bool) -> tuple[float, float]:
+        sampling = HeadsetSampling("left", 1, position_noise=0.0, tremor=True, shaky=shaky)
+        x = [sampling.measured(pin.SE3.Identity(), t).translation[0] for t in np.arange(0.0, 10.0, 0.005)]
+        spectrum = np.abs(np.fft.rfft(x))
+        return max(map(abs, x)), float(np.fft.rfftfreq(len(x), 0.005)[spectrum.argmax()])
+
+    (most, frequency), (least, _) = trembling(True), trembling(False)
+    assert most == pytest.approx(2e-3, rel=0.1)
+    assert 5.5 <= frequency <= 6.5
+    assert most == pytest.approx(2.0 * least, rel=0.2)

@@ -195,7 +195,7 @@ def loop_of(source: PlayedInput, **changes: object) -> Pipeline:
     """A pipeline at :data:`RATE` with a kinematic plant."""
     config = cell()
     control = config.control.model_copy(update={"max_substep": 1.0 / RATE})
-    config = config.model_copy(update={"loop_rate_hz": RATE, "control": control, **changes})
+    config = config.model_copy(update={"loop_rate_hz": RATE, "control": control, "cameras": {}, **changes})
     return Pipeline.from_config(config, input=source, plant="kinematic")
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from q2r2_control.config.teleop import Stance
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.inputs.assembly import minimum_jerk
+from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.judging.episode import FRAME, Flags
 from q2r2_control.judging.figures import HandFigures, figures_of, hand_figures, timing_figures
 from q2r2_control.judging.motion import arm_figures, delays, idle_share, ldlj, smoothness

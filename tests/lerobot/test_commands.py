@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -73,11 +74,12 @@ CHANGES = {
 
 # An ACT wants pictures, which are slow to make without a graphics card.
 CAMERA = "{position: [1.9, 0.0, 1.0], look_at: [0.4, 0.0, 0.3], width: 64, height: 48, rate: 25}"
-SEEN = {"cameras: {}": f"cameras: {{front: {CAMERA}}}"}
+SEEN = f"{{front: {CAMERA}}}"
 
 
-def write_cell(folder: Path, changes: dict[str, str]) -> Path:
+def write_cell(folder: Path, changes: dict[str, str], cameras: str = "{}") -> Path:
     text = (ROOT / "config/dual_iiwa7.yaml").read_text()
+    text = re.sub(r"(?ms)^cameras:.*?(?=^judge:)", f"cameras: {cameras}\n\n", text)
     for old, new in changes.items():
         assert text.count(old) == 1
         text = text.replace(old, new)
@@ -95,7 +97,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def seen(tmp_path: Path) -> Path:
     """A folder with a cell that has a camera, and with hands that take over."""
-    write_cell(tmp_path, CHANGES | SEEN)
+    write_cell(tmp_path, CHANGES, SEEN)
     hands.installed(tmp_path)
     return tmp_path
 
@@ -106,7 +108,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exported")
     q2r2, recordings = [sys.executable, "-m", "q2r2_control"], str(folder / "recordings")
     scripted = ["--input", "scripted", "--trajectory", "circle", "--fast", "--duration", "4", "--headless"]
-    run([*q2r2, "run", str(write_cell(folder, CHANGES | SEEN)), *scripted, "--record", recordings], folder)
+    run([*q2r2, "run", str(write_cell(folder, CHANGES, SEEN)), *scripted, "--record", recordings], folder)
     run([*q2r2, "export", "lerobot", recordings, "--output", str(folder / "dataset"), "--fps", str(FPS)], folder)
     return folder / "dataset"
 

@@ -26,6 +26,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.export.lerobot import write_shard
 from tests.export.files import record_step
+from tests.lerobot.test_commands import write_cell
 from tests.plants.fri.conftest import free_ports
 from tests.recording.runs import ROOT
 
@@ -34,6 +35,8 @@ MOVED, NEAR, TRIES = 0.02, 0.004, 1800  # [rad], [rad] or of an opening, of a th
 
 
 def made(folder: Path, **options: Any) -> Robot:
+    (without_cameras := folder / "without_cameras").mkdir(exist_ok=True)
+    options.setdefault("cell", str(write_cell(without_cameras, {})))
     return make_robot_from_config(RobotConfig.get_choice_class("q2r2_cell")(calibration_dir=folder / "none", **options))
 
 

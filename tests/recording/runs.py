@@ -71,8 +71,8 @@ def pipeline(
     source: Input | None = None,
     **changes: object,
 ) -> Pipeline:
-    """A pipeline at :data:`RATE`."""
-    config = cell().model_copy(update={"loop_rate_hz": RATE, **changes})
+    """A pipeline at :data:`RATE`, without cameras unless they are given, since drawing takes long."""
+    config = cell().model_copy(update={"loop_rate_hz": RATE, "cameras": {}, **changes})
     hands = source or ScriptedInput(trajectory, human=human, seed=3, frequency_hz=0.5)
     return Pipeline.from_config(config, input=hands, plant=plant, mode=mode)
 

@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.events import Event
-from q2r2_control.inputs.assembly import minimum_jerk
 from q2r2_control.inputs.headset import HeadsetServer, watch_of
+from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.inputs.assembly import minimum_jerk
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.played import HeadsetSampling
+from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.types import SIDES, Array
 
 START = {"left": np.array([0.35, 0.2, 1.1]), "right": np.array([0.35, -0.2, 1.1])}

@@ -38,6 +38,15 @@ def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot:
     assert "paused" not in text
 
 
+def test_names_and_progress_are_whole_in_80_columns(robot: Robot) -> None:
+    table = LiveTable("demo", JOINTS, BindingSettings(), ((0.0, "meet: both grasp"),), 10.0)
+    tick = tick_at(robot, 2.5)
+    pair = ("right_hand_e_finger_1_envelope_0", "left_hand_e_finger_1_envelope_0")
+    report = replace(tick.reference.report, closest_pair=pair)
+    table(replace(tick, reference=replace(tick.reference, report=report)))
+    assert "…" not in printed(table.render(), 80)
+
+
 def test_it_shows_each_arm_s_session_with_its_cabinet(robot: Robot) -> None:
     table = LiveTable("demo", JOINTS, BindingSettings())
     sessions = {"left": "commanding active, connection good, drives active", "right": "not heard"}

@@ -1,0 +1,82 @@
+"""Judges of work in which a force or a fit counts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from q2r2_control.demo.part_judges import FINGERS, HELD_TIME, Judge, PartState, Toucher
+
+_FORCE = (5.0, 15.0)  # [N]
+_MEAN_TIME = 0.05  # over which a force is averaged [s]
+_WIPED, _ASTRAY = 0.3, 0.1  # way with that force [m]; share of the way that may be made with another one
+_DEEP, _BESIDE = 0.003, 0.001  # from the bottom of the hole, and from its middle [m]
+_STRAIGHT = math.radians(3.0)
+
+
+class WipeJudge(Judge):
+    """A part that fingers hold is moved over the table, on which it presses with 5 to 15 N."""
+
+    def __init__(self, part: str) -> None:
+        super().__init__(part)
+        self._place: tuple[float, float] | None = None  # where it was pressed on last
+        self._force = self._most = self._wiped = self._astray = 0.0
+
+    def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
+        super().see(dt, parts)
+        part = parts[self.parts[0]]
+        self._force += (part.pressed - self._force) * min(dt / _MEAN_TIME, 1.0)
+        self._most = max(self._most, self._force)
+        if not (part.touched & FINGERS and part.touched & Toucher.SURROUNDINGS):
+            self._place = None
+            return
+        way = math.dist(part.place[:2], self._place or part.place[:2])
+        self._place = part.place[:2]
+        if _FORCE[0] <= self._force <= _FORCE[1]:
+            self._wiped += way
+        else:
+            self._astray += way
+
+    def measured(self) -> dict[str, float]:
+        wiped = {"wiped_mm": 1e3 * self._wiped, "wiped_with_another_force_mm": 1e3 * self._astray}
+        return wiped | {"pressed_N": self._most} | super().measured()
+
+    def faults(self) -> list[str]:
+        faults, part = super().faults(), self.parts[0]
+        if self._wiped < _WIPED:
+            faults.append(f"{part}: wiped {1e3 * self._wiped:.0f} mm with 5 to 15 N, not {1e3 * _WIPED:.0f} mm")
+        if self._astray > _ASTRAY * self._wiped:
+            faults.append(f"{part}: wiped {1e3 * self._astray:.0f} mm with less than 5 or more than 15 N")
+        if self._most > _FORCE[1]:
+            faults.append(f"{part}: pressed on with {self._most:.1f} N")
+        return faults
+
+
+class PegJudge(Judge):
+    """A part stands straight at the bottom of another one's hole, touched by no finger, for the last second."""
+
+    def __init__(self, parts: Mapping[str, float]) -> None:
+        """``parts``: the peg and what has the hole, with the heights of the peg and of the hole's bottom [m]."""
+        super().__init__(*parts)
+        self._rest = 0.5 * sum(parts.values())  # from centre to centre [m]
+        self._stood = self._beside = self._above = self._tilt = 0.0
+
+    def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
+        super().see(dt, parts)
+        peg, socket = (parts[name] for name in self.parts)
+        self._beside = math.dist(peg.place[:2], socket.place[:2])
+        self._above = peg.place[2] - socket.place[2] - self._rest
+        self._tilt = max(peg.tilt, socket.tilt)
+        stands = self._beside <= _BESIDE and abs(self._above) <= _DEEP and self._tilt <= _STRAIGHT
+        self._stood = self._stood + dt if stands and not peg.touched & FINGERS else 0.0
+
+    def measured(self) -> dict[str, float]:
+        found = {"stood_s": self._stood, "off_centre_mm": 1e3 * self._beside, "off_bottom_mm": 1e3 * self._above}
+        return found | {"tilt_deg": math.degrees(self._tilt)} | super().measured()
+
+    def faults(self) -> list[str]:
+        faults = super().faults()
+        if self._stood < HELD_TIME:
+            where = f"{1e3 * self._above:.0f} mm above the bottom, {1e3 * self._beside:.1f} mm off centre"
+            faults.append(f"{self.parts[0]}: stood in the hole for {self._stood:.1f} s, not {HELD_TIME:g} s; {where}")
+        return faults

@@ -1,0 +1,132 @@
+"""Work in which a force counts: a tray that both hands carry, a sponge over the table, a peg into a hole."""
+
+from __future__ import annotations
+
+import math
+
+from q2r2_control.inputs.way_points import LEFT_HOME, RIGHT_HOME, HandWork, WayPoint
+
+_TURN = 0.5 * math.pi  # fingers close along x
+_X, _Y, _HELD = 0.64, 0.10, 0.235  # of the tools at the tray's handles
+_CARRIED = (_X - 0.115, _HELD + 0.11)
+
+
+def _at_handle(side: float) -> tuple[WayPoint, ...]:
+    """Over the handle to this ``side`` of the tray's middle, and around it."""
+    turn = -side * _TURN
+    return (
+        (2.2, _X, side * _Y, _HELD + 0.09, 0.0, turn),
+        (3.4, _X, side * _Y, _HELD, 0.0, turn),
+        (4.8, _X, side * _Y, _HELD, 0.0, turn),  # grasp; from here on the left hand carries
+    )
+
+
+def _from_handle(side: float, home: tuple[float, float, float, float, float]) -> tuple[WayPoint, ...]:
+    turn = -side * _TURN
+    return (
+        (15.2, _X, side * _Y, _HELD, 0.0, turn),  # let go, each with its own hand
+        (16.4, _X, side * _Y, _HELD + 0.09, 0.0, turn),
+        (18.6, *home),
+    )
+
+
+CARRY = HandWork(
+    duration=18.6,
+    tools={
+        "left": (
+            *_at_handle(1.0),
+            (6.2, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # lift
+            (7.8, _CARRIED[0], _Y, _CARRIED[1], 0.0, -_TURN),
+            (9.2, _CARRIED[0], _Y, _CARRIED[1], 0.0, -_TURN),
+            (10.8, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # back
+            (12.6, _X, _Y, _HELD, 0.0, -_TURN),  # put down
+            *_from_handle(1.0, LEFT_HOME),
+        ),
+        "right": (*_at_handle(-1.0), *_from_handle(-1.0, RIGHT_HOME)),
+    },
+    steps=(
+        (0.0, "each hand reaches for a handle of the tray"),
+        (3.4, "both grasp"),
+        (4.2, "the left hand moves both arms: they lift the tray"),
+        (6.2, "they carry it nearer"),
+        (9.2, "they put it back"),
+        (12.9, "each hand lets go"),
+    ),
+    presses={"left": (3.5, 14.4), "right": (3.5, 14.4)},
+    grips=(4.4, 12.9),
+    engages=(13.6,),
+)
+
+_SPONGE_X, _SPONGE_Y, _SPONGE_HELD = 0.60, 0.42, 0.248
+_WIPING = _SPONGE_HELD - 0.005  # the spring of the impedance presses with what is left of it [m]
+_STROKES = ((0.72, 0.42), (0.72, 0.39), (0.60, 0.39), (0.60, 0.36), (0.72, 0.36))
+WIPE = HandWork(
+    duration=19.4,
+    tools={
+        "left": (
+            (1.6, _SPONGE_X, _SPONGE_Y, 0.33, 0.0, 0.0),
+            (3.0, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD, 0.0, 0.0),
+            (3.8, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD, 0.0, 0.0),  # grasp
+            (5.0, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD + 0.05, 0.0, 0.0),
+            (6.6, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD + 0.01, 0.0, 0.0),
+            (8.2, _SPONGE_X, _SPONGE_Y, _WIPING, 0.0, 0.0),  # press
+            *((10.0 + 1.5 * i, *place, _WIPING, 0.0, 0.0) for i, place in enumerate(_STROKES)),
+            (16.6, *_STROKES[-1], _SPONGE_HELD, 0.0, 0.0),
+            (17.4, *_STROKES[-1], _SPONGE_HELD, 0.0, 0.0),  # let go
+            (18.2, *_STROKES[-1], 0.33, 0.0, 0.0),
+            (19.4, *LEFT_HOME),
+        )
+    },
+    steps=(
+        (0.0, "the left hand reaches for the sponge"),
+        (3.0, "it grasps"),
+        (6.6, "it presses the sponge on the table"),
+        (8.2, "it wipes"),
+        (16.6, "it lets go"),
+    ),
+    presses={"left": (3.1, 16.7)},
+)
+
+_PEG, _HOLE = (0.60, -0.40), (0.66, -0.24)
+_PEG_HELD = 0.265  # 30 mm over the middle of a peg of 70 mm
+_ON_TOP = _PEG_HELD + 0.04  # with the peg on the socket
+_SEARCH = 8  # way points of the search, a spiral of two turns
+
+
+def _searching(begins: float) -> tuple[WayPoint, ...]:
+    """A spiral, pressed on lightly, until the peg falls in; then the way down."""
+    points = []
+    for i in range(2 * _SEARCH + 1):
+        angle, radius = 2.0 * math.pi * i / _SEARCH, 0.0015 * i / (2 * _SEARCH)
+        x, y = _HOLE[0] + radius * math.cos(angle), _HOLE[1] + radius * math.sin(angle)
+        points.append((begins + 0.25 * i, x, y, _ON_TOP - 0.003, 0.0, 0.0))
+    return tuple(points)
+
+
+PEG = HandWork(
+    duration=19.0,
+    tools={
+        "right": (
+            (1.6, *_PEG, 0.35, 0.0, 0.0),
+            (3.0, *_PEG, _PEG_HELD, 0.0, 0.0),
+            (3.8, *_PEG, _PEG_HELD, 0.0, 0.0),  # grasp
+            (5.0, *_PEG, _ON_TOP + 0.03, 0.0, 0.0),
+            (6.8, *_HOLE, _ON_TOP + 0.03, 0.0, 0.0),
+            (8.2, *_HOLE, _ON_TOP + 0.004, 0.0, 0.0),
+            *_searching(9.4),
+            (14.6, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # in
+            (15.6, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # let go
+            (16.8, *_HOLE, 0.36, 0.0, 0.0),
+            (19.0, *RIGHT_HOME),
+        )
+    },
+    steps=(
+        (0.0, "the right hand reaches for the peg"),
+        (3.0, "it grasps"),
+        (5.0, "it carries the peg over the hole"),
+        (8.2, "it looks for the hole"),
+        (13.4, "it pushes the peg in"),
+        (15.0, "it lets go"),
+    ),
+    presses={"right": (3.1, 15.0)},
+)
