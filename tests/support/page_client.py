@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from base64 import b64decode
 from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
@@ -32,6 +33,7 @@ class PageClient:
         self._socket = connect(f"ws://{host}", origin=Origin(f"http://{host}"), subprotocols=protocol, max_size=None)
         self._contents: dict[str, str] = {}  # of the panel's pieces of HTML
         self.buttons: dict[str, str] = {}  # by label
+        self.pictures: list[bytes] = []  # of cameras, as they came
         self._send("ViewerCameraMessage", **_CAMERA)  # before which no press counts
 
     def __enter__(self) -> Self:
@@ -86,3 +88,4 @@ class PageClient:
             content = (one.get("props") or one.get("updates") or {}).get("content")
             if isinstance(content, str):
                 self._contents[one["uuid"]] = content
+                self.pictures += map(b64decode, re.findall(r"base64,([^']*)", content))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
 from queue import SimpleQueue
@@ -22,7 +22,19 @@ from std_srvs.srv import Trigger
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event
-from q2r2_control.recording.messages import NANOSECONDS, RECORDER, TEXT, Message, Topic, hand_pose, heard_on, ros_topics
+from q2r2_control.recording.messages import (
+    NANOSECONDS,
+    PICTURE,
+    RECORDER,
+    TEXT,
+    Message,
+    Topic,
+    data_of,
+    hand_pose,
+    heard_on,
+    is_compressed,
+    ros_topics,
+)
 from q2r2_control.recording.recorded_ticks import tool_poses
 from q2r2_control.recording.ros_recording import RosTicks
 from q2r2_control.recording.tick_rows import STATUSES
@@ -41,6 +53,8 @@ _PERIOD = 1.0 / 30.0  # between frames [s]
 _LOOK_PERIOD = 0.5  # between two looks at which nodes there are [s]
 _CONTROLLER = "/cartesian_controller"
 _STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # ticks of a frame, and far more
+_PICTURE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+_PICTURE_PERIOD = 0.2  # between two pictures of a camera [s]
 _UNREADABLE = SerdeError, ValueError, KeyError, IndexError, TypeError
 
 
@@ -78,16 +92,25 @@ class WebPage(BaseNode):
         shown = self._ticks.topics - {hand_pose(hand) for hand in SIDES}
         for topic in ros_topics(tuple(self._robot.arms), {}):
             if topic.name in shown:
-                self._listen(topic)
+                self._listen(topic, partial(self._take, topic), RECORDED_QOS if topic.type == TEXT else _STREAM_QOS)
+        self._pictures: dict[str, bytes] = {}  # newest messages, by camera
+        for camera in [name for name, its in config.cameras.items() if its.topic and is_compressed(its.topic)]:
+            topic = Topic(0, str(config.cameras[camera].topic), PICTURE)
+            self._listen(topic, partial(self._pictures.__setitem__, camera), _PICTURE_QOS)
+        self.create_timer(_PICTURE_PERIOD, self._show_pictures, clock=STEADY)
         self.create_timer(_LOOK_PERIOD, self._look, clock=STEADY)
         self.create_tick(_PERIOD, self._show, clock=STEADY)
         self.get_logger().info(f"page: {url}")
 
-    def _listen(self, topic: Topic) -> None:
+    def _listen(self, topic: Topic, take: Callable[[bytes], None], qos: QoSProfile) -> None:
         package, _, kind = topic.type.split("/")
-        qos = RECORDED_QOS if topic.type == TEXT else _STREAM_QOS
         message = getattr(import_module(f"{package}.msg"), kind)
-        self.create_subscription(message, heard_on(topic.name), partial(self._take, topic), qos, raw=True)
+        self.create_subscription(message, heard_on(topic.name), take, qos, raw=True)
+
+    def _show_pictures(self) -> None:
+        while self._pictures:
+            camera, payload = self._pictures.popitem()
+            self._page.show_picture(camera, data_of(payload, PICTURE).tobytes())
 
     def _take(self, topic: Topic, payload: bytes) -> None:
         self._waiting.append((topic.name, Message(topic.channel, 0, time.monotonic_ns(), 0, bytes(payload))))

@@ -54,6 +54,7 @@ class Frame:
     ages: Mapping[str, float] = field(default_factory=dict)  # of the newest pose of each arm's hand [s]
     why: Mapping[str, str] = field(default_factory=dict)  # of each arm, where another program knows it
     notice: str = ""  # what became of a request
+    pictures: Mapping[str, bytes] = field(default_factory=dict)  # newest ones by camera, JPEG or PNG
 
 
 class Ready(NamedTuple):

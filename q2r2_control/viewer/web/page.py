@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from importlib.util import find_spec
 from threading import Event as Flag
 from types import MappingProxyType
@@ -31,6 +32,7 @@ class Page:
         self._host, self._port, self._on_request = host, port, on_answer
         self._ready = Flag()
         self.url: str | None = None  # None: not begun
+        self._pictures: dict[str, bytes] = {}  # by camera, that wait for a frame
         try:
             # Room for one frame: a newer one is better than a queue.
             self._process = HelperProcess("serves the page", "q2r2_control.viewer.web.server", self._on_answer, room=1)
@@ -90,7 +92,15 @@ class Page:
 
     def send(self, frame: Frame) -> bool:
         """Show a frame, unless the page is not done with the last one."""
-        return self._process.send(frame, 1)
+        pictures, self._pictures = self._pictures, {}
+        sent = self._process.send(replace(frame, pictures=pictures) if pictures else frame, 1)
+        if not sent:
+            self._pictures = pictures | self._pictures
+        return sent
+
+    def show_picture(self, camera: str, picture: bytes) -> None:
+        """Show a JPEG or PNG with the next frame; from any thread."""
+        self._pictures = self._pictures | {camera: picture}
 
     def _on_answer(self, answer: Any) -> None:
         if isinstance(answer, Ready):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from base64 import b64encode
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -74,6 +75,9 @@ class Panel:
             self._add_buttons(gui)
         self._table = gui.add_html("")
         self._episodes = gui.add_html("", visible=False)
+        self._cameras = gui.add_html("", visible=False)
+        self._pictures: Mapping[str, bytes] = {}  # newest ones by camera
+        self._pictured: Mapping[str, bytes] = self._pictures  # those that are shown
         if driving is not None:
             with gui.add_folder("Grippers", expand_by_default=False):
                 driving.add_buttons(gui)
@@ -142,6 +146,8 @@ class Panel:
             if event.kind in _OF_EPISODES and line not in self._told[-2:]:  # both arms tell it
                 self._told.append(line)
         self._binding |= dict.fromkeys(frame.binding)
+        if frame.pictures:
+            self._pictures = {**self._pictures, **frame.pictures}
         self._ticks += frame.ticks
         self._slowest = max(self._slowest, frame.slowest)
 
@@ -158,6 +164,9 @@ class Panel:
             self._table.content = self._drawn(frame, binding)
             if self._told and not self._setup.replayed:  # of a replay, each frame has the last events
                 self._episodes.content, self._episodes.visible = _table(self._told[-_EPISODES:]), True
+            if (pictures := self._pictures) is not self._pictured:
+                self._pictured, self._cameras.visible = pictures, True
+                self._cameras.content = "".join(_image(name, picture) for name, picture in pictures.items())
             if (line := self._time_line) is not None and frame.tick.t != line.value:
                 line.max = max(frame.end, line.max)
                 line.value = frame.tick.t
@@ -235,6 +244,11 @@ def _milliseconds(age: float | None) -> str:
 def _table(rows: Iterable[tuple[str, str]]) -> str:
     cells = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in rows)
     return f"<div style='{_STYLE}'><table>{cells}</table></div>"
+
+
+def _image(name: str, picture: bytes) -> str:
+    data = f"data:image/jpeg;base64,{b64encode(picture).decode()}"
+    return f"<div style='{_STYLE}'>{escape(name)}<img src='{data}' style='display:block;width:100%'></div>"
 
 
 def _share(opening: float | None) -> str:
