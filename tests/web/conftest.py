@@ -67,7 +67,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
     yield start_one
     for run in runs:
-        run.interrupt()
+        run.kill()
 
 
 @pytest.fixture
