@@ -17,7 +17,6 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.viewer.web import view
 from tests.support.processes import cell
 
-
 _SILENT, _STANDS = 0.5, 1.0  # an engaged hand without samples for longer lets each tick take so long [s]
 
 
