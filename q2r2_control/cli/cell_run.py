@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 
 from rich.console import Console
@@ -43,12 +42,13 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.headset_display import DisplayInput, HeadsetView
-from q2r2_control.viewer.headset_pictures import HeadsetPictures
 from q2r2_control.viewer.live import LiveTable
+from q2r2_control.viewer.live_pictures import LivePictures
 from q2r2_control.viewer.tables import print_table
 from q2r2_control.viewer.web.view import PageView
 
 _PERIOD = 1.0 / 30.0  # [s]
+_ON_PAGE, _IN_HEADSET = 5.0, 30.0  # pictures of a camera a second
 
 
 def check_window(plant: str | None) -> None:
@@ -163,7 +163,7 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, pa
         HeadsetView(source, pipeline, recorder is not None)
     if page is not None:
         say(f"page: {page.begin(pipeline, options.name, recorder is not None)}", console)
-    summary = _run(pipeline, options, recorder, console)
+    summary = _run(pipeline, options, recorder, page, console)
     results = () if watch is None else held_to_promises(watch.results(), summary)
     if recorder is not None and results:
         recorder.success = all(task.succeeded for task in results)
@@ -217,7 +217,9 @@ def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
     return judged
 
 
-def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, console: Console) -> RunSummary:
+def _run(
+    pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, page: PageView | None, console: Console
+) -> RunSummary:
     """Run with what is to be shown and recorded of it."""
     with ExitStack() as stack:
         if options.window:
@@ -229,10 +231,10 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
             table = LiveTable(title, joints, pipeline.config.teleop.bindings, options.steps, options.duration)
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
-        if isinstance(pipeline.input, DisplayInput) and isinstance(pipeline.plant, MujocoPlant):
-            for name, camera in islice(pipeline.config.simulated_cameras.items(), 1):
-                pictures = HeadsetPictures(pipeline.plant, name, camera, pipeline.input.show_picture)
-                pipeline.listeners.append(stack.enter_context(pictures))
+        if isinstance(pipeline.plant, MujocoPlant):
+            for name, most, show in _lookers(pipeline, page):
+                camera = pipeline.config.simulated_cameras[name]
+                pipeline.listeners.append(stack.enter_context(LivePictures(pipeline.plant, name, camera, most, show)))
         if options.real_time and (refused := stack.enter_context(real_time())):
             say(refused, console, "yellow")
         if recorder is not None:
@@ -252,3 +254,12 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
                 judge_now = EpisodeJudge(lambda: recorder.file, pipeline.record_outcome)
                 pipeline.listeners.append(stack.enter_context(judge_now))
         return pipeline.run(options.duration, realtime=not options.fast)
+
+
+def _lookers(pipeline: Pipeline, page: PageView | None) -> Iterator[tuple[str, float, Callable[[bytes], object]]]:
+    """Cameras whose pictures are shown, how many a second at most, and where."""
+    names = list(pipeline.config.simulated_cameras)
+    if isinstance(pipeline.input, DisplayInput):
+        yield from ((name, _IN_HEADSET, pipeline.input.show_picture) for name in names[:1])
+    if page is not None:
+        yield from ((name, _ON_PAGE, partial(page.show_picture, name)) for name in names)

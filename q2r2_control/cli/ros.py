@@ -15,7 +15,18 @@ from rich.live import Live
 from rich.text import Text
 from typer import Argument, Exit, Option
 
-from q2r2_control.cli.output import DEMO_CONFIG, Json, Operator, Task, as_json_text, notes_of, positive, say
+from q2r2_control.cli.output import (
+    DEMO_CONFIG,
+    Json,
+    Operator,
+    Task,
+    WebHost,
+    WebPort,
+    as_json_text,
+    notes_of,
+    positive,
+    say,
+)
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
@@ -204,6 +215,9 @@ def up(
     robot: Annotated[RobotSource, Option(help="auto: mujoco for controller: builtin, else none.")] = RobotSource.AUTO,
     record: Annotated[str | None, Option(metavar="DIR", help="Record all topics to a new folder in DIR.")] = None,
     separate: Annotated[bool, Option("--separate", help="A process an arm, which its hand alone stops.")] = False,
+    web: Annotated[bool, Option("--web", help="Show the set in a browser; the extra `web`.")] = False,
+    web_host: WebHost = "127.0.0.1",
+    web_port: WebPort = 8080,
     task: Task = None,
     operator: Operator = None,
 ) -> None:
@@ -215,5 +229,6 @@ def up(
     """
     notes = notes_of(task, operator, record)
     recording = None if record is None else {"folder": record, **notes}
-    nodes = nodes_of(config, input, robot.value, recording, separate)
+    page = (web_host, web_port) if web else None
+    nodes = nodes_of(config, input, robot.value, recording, separate, page)
     raise Exit(run_together(nodes, lambda line: print(line, flush=True)))

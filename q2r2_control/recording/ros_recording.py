@@ -22,7 +22,7 @@ from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event
 from q2r2_control.recording import messages as names
-from q2r2_control.recording.about import ROS, About
+from q2r2_control.recording.about import ROS
 from q2r2_control.recording.messages import NANOSECONDS, STORE, Message, pose_of
 from q2r2_control.recording.reader import Recording, TickChunk
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, tool_poses
@@ -49,7 +49,7 @@ class RosRecording(Recording):
                 f"{self.file}: recorded with controller: {config.controller}, so there is no reference of the built-in "
                 "controller to judge or export; ros2 bag, Foxglove and mcap tools open it"
             )
-        ticks = RosTicks(self.about, robot)
+        ticks = RosTicks(self.about.epoch, robot)
         previous: TickChunk | None = None
         for messages in self.messages():
             with self._faults():
@@ -82,14 +82,16 @@ class _Tick:
 
 
 class RosTicks:
-    """Makes ticks of the messages of a recording."""
+    """Makes ticks of the messages of a set of nodes."""
 
-    def __init__(self, about: About, robot: Robot) -> None:
-        self._robot, self._epoch, self._arms, self._joint_names = robot, about.epoch, about.arms, about.joints
-        self._fields, self._type = names.tick_fields(about.arms), tick_type(len(about.arms), len(about.joints))
-        self._types = {topic.name: topic.type for topic in names.ros_topics(about.arms, {})}
-        self._joints = np.full((3, len(about.joints)), np.nan)
-        self._flags = np.full((len(about.arms), len(names.ARM_FIELDS)), np.nan)
+    def __init__(self, epoch: int, robot: Robot) -> None:
+        """``epoch`` [ns]: where times of ticks begin, by the clock of the messages' times."""
+        self._robot, self._epoch, self._joint_names = robot, epoch, robot.joint_names
+        self._arms = arms = tuple(robot.arms)
+        self._fields, self._type = names.tick_fields(arms), tick_type(len(arms), len(robot.joint_names))
+        self._types = {topic.name: topic.type for topic in names.ros_topics(arms, {})}
+        self.joints = np.full((3, len(robot.joint_names)), np.nan)  # newest q, v and tau
+        self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)
         self._targets: dict[int, tuple[int, Array]] = {}  # by the arm's place: when it came [ns], and the pose
         self._samples: list[Array] = []
         self._events: list[Event] = []
@@ -102,12 +104,17 @@ class RosTicks:
             names.CONTROLLER_TICK: self._on_tick,
             names.RECORDER_EVENTS: self._on_event,
         }
-        for place, arm in enumerate(about.arms):
+        for place, arm in enumerate(arms):
             self._handlers[names.target(arm)] = partial(self._on_target, place)
             self._handlers[names.arm_flags(arm)] = partial(self._on_flags, place)
             self._handlers[names.arm_events(arm)] = self._on_event
         for side, hand in enumerate(SIDES):
             self._handlers[names.hand_pose(hand)] = partial(self._on_hand, side)
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """Those that ticks are made of."""
+        return frozenset(self._handlers)
 
     def add_messages(self, messages: Iterable[tuple[str, Message]]) -> TickChunk:
         """The ticks that are known after some more messages, with their topics; there may be none."""
@@ -130,7 +137,7 @@ class RosTicks:
         for index, name in enumerate(self._joint_names):
             if (column := columns.get(name)) is not None:
                 for row, values in enumerate((message.position, message.velocity, message.effort)):
-                    self._joints[row, index] = values[column] if len(values) else 0.0
+                    self.joints[row, index] = values[column] if len(values) else 0.0
 
     def _on_reference(self, message: Any, _: int) -> None:
         stamp, point = message.header.stamp, message.points[0]
@@ -155,7 +162,7 @@ class RosTicks:
         self._samples.append(sample)
 
     def _on_tick(self, message: Any, time: int) -> None:
-        if np.isnan(self._joints).any() or np.isnan(self._flags[:, 0]).any():
+        if np.isnan(self.joints).any() or np.isnan(self._flags[:, 0]).any():
             return  # nothing can be said of it yet
         values = dict(zip(self._fields, message.data.tolist(), strict=True))
         row = np.zeros(1, dtype=self._type)
@@ -163,7 +170,7 @@ class RosTicks:
             row[name] = values[name]
         row["now"] = row["state_stamp"] = (time - self._epoch) / NANOSECONDS
         row["following"] = row["connected"] = 1.0
-        row["q"], row["v"], row["tau"] = self._joints
+        row["q"], row["v"], row["tau"] = self.joints
         arms = row["arms"][0]
         for place, (arm, flags) in enumerate(zip(self._arms, self._flags, strict=True)):
             for name, value in zip(names.ARM_FIELDS, flags.tolist(), strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 import runpy
@@ -144,8 +143,8 @@ def test_arms_have_a_process_each_where_that_is_asked_for_and_a_cell_with_one_ar
 def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
     scripts: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     for source in ("scripted", "headset", NO_INPUT):
-        sets = (nodes_of(CONFIG, source, "mujoco", {"folder": "recordings"}, separate) for separate in (True, False))
-        for node in itertools.chain(*sets):
+        more = {"folder": "recordings"}, True, ("127.0.0.1", 8080)
+        for node in [*nodes_of(CONFIG, source, "mujoco", *more), *nodes_of(CONFIG, source)]:
             module, _, function = scripts[node.name].partition(":")
             assert module == executables.__name__
             assert node.name in executables.NODES

@@ -32,7 +32,7 @@ ARGUMENTS = [
 ]
 HIDDEN = "[class*=mantine-Notification] {display: none !important}"  # a warning of slow drawing, which covers an arm
 VIEW = {"width": 680, "height": 360}
-PATIENCE = 120.0  # far longer than a page takes that a processor draws [s]
+PATIENCE = 600.0  # far longer than a page takes that a processor draws beside ten other programs [s]
 
 
 _URL = r"(?:page:|webxr: open) (http\S+)\n"
@@ -45,7 +45,11 @@ class WebRun:
         self._errors = errors
         with open(errors, "w") as file:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", *command], stdout=subprocess.PIPE, stderr=file, text=True
+                [sys.executable, "-m", *command],
+                stdout=subprocess.PIPE,
+                stderr=file,
+                text=True,
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
             )
         wait_until(lambda: re.search(_URL, self.errors) or self._process.poll() is not None)
         found = re.search(_URL, self.errors)
@@ -65,8 +69,12 @@ class WebRun:
 
     def interrupt(self) -> None:
         """As Ctrl-C does."""
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGINT)
+        self._process.send_signal(signal.SIGINT)
+
+    def kill(self) -> None:
+        """End a run that a failed test has left, which would keep a processor from the next test."""
+        self._process.kill()
+        self._process.communicate()
 
 
 @contextmanager

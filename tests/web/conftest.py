@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,7 +12,10 @@ pytest.importorskip("playwright")
 
 from playwright.sync_api import BrowserContext, Page, sync_playwright
 
+from q2r2_control.inputs.samples import HandsWatch
+from q2r2_control.inputs.webxr.webxr import WebXrInput
 from tests.web.browser import ARGUMENTS, CHROMIUM, HIDDEN, PATIENCE, VIEW, WebRun, one_processor
+from tests.web.headset_page import Listen
 
 _COARSE = 0.5  # of a pixel's width, since a processor draws them
 Open = Callable[..., Page]
@@ -63,4 +67,19 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
     yield start_one
     for run in runs:
-        run.interrupt()
+        run.kill()
+
+
+@pytest.fixture
+def listen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Listen]:
+    """Start servers of a headset's page, each of which ends with the test."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    with ExitStack() as stack:
+
+        def start_one(**settings: Any) -> WebXrInput:
+            made = WebXrInput(port=0, watch=HandsWatch(None, frame=False), **settings)
+            stack.callback(made.close)
+            made.start()
+            return made
+
+        yield start_one

@@ -17,19 +17,26 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.viewer.web import view
 from tests.support.processes import cell
 
+_SILENT, _STANDS = 0.5, 1.0  # an engaged hand without samples for longer lets each tick take so long [s]
+
 
 class SlowTime:
-    """The loop's time, of which a tick of 1 ms takes ``pause`` [s] and more."""
+    """The loop's time, of which a tick of 1 ms takes ``pause`` [s] and more.
+
+    It all but stands still while an engaged arm waits for a page that is busy drawing.
+    """
 
     def __init__(self, pause: float) -> None:
-        self._pause, self._now = pause, 0.0
+        self._pause, self._now, self._heard = pause, 0.0, 0.0
 
     def __call__(self) -> float:
         return self._now
 
     def pass_by(self, tick: Tick) -> None:
         self._now = tick.now
-        time.sleep(self._pause)
+        if tick.samples or not (tick.following and any(tick.engaged.values())):
+            self._heard = tick.now
+        time.sleep(self._pause if tick.now - self._heard < _SILENT else _STANDS)
 
 
 def patient(config: Config) -> Config:

@@ -22,6 +22,7 @@ NODES = {
     "cartesian_controller": ("cartesian_controller", "CartesianControllerNode"),
     "mujoco_robot": ("mujoco_robot", "MujocoRobot"),
     "recorder": ("recorder", "RecorderNode"),
+    "web_page": ("web_page", "WebPage"),
     "left_arm_controller": ("arm_controllers", "LeftArmController"),
     "right_arm_controller": ("arm_controllers", "RightArmController"),
     "arm_controllers": ("arm_controllers", "run_both_arms"),
@@ -52,6 +53,7 @@ check_tcp_connection = _executable("CheckTCPconnection")
 cartesian_controller = _executable("cartesian_controller")
 mujoco_robot = _executable("mujoco_robot")
 recorder = _executable("recorder")
+web_page = _executable("web_page")
 left_arm_controller = _executable("left_arm_controller")
 right_arm_controller = _executable("right_arm_controller")
 arm_controllers = _executable("arm_controllers")

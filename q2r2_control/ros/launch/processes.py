@@ -55,12 +55,13 @@ def nodes_of(
     robot: str = "auto",
     recording: Mapping[str, str] | None = None,
     separate: bool = False,
+    page: tuple[str, int] | None = None,
 ) -> list[NodeProcess]:
     """The processes for a cell's YAML, in the order of their start. Raises :class:`ConfigError`.
 
     ``source`` of the hands: an installed input, "none", or None for the cell's. ``robot``: mujoco, none, or auto:
     mujoco for ``controller: builtin`` only. ``recording``: parameters of the recorder, which starts first and ends
-    last. ``separate``: each arm is a process with a teleoperation of its own.
+    last. ``separate``: each arm is a process with a teleoperation of its own. ``page``: its address.
     """
     if robot not in ROBOTS:
         raise ConfigError(f"robot = {robot!r:.60}: allowed are {', '.join(ROBOTS)}")
@@ -81,6 +82,10 @@ def nodes_of(
     if source != NO_INPUT:
         executable = getattr(load_class(INPUTS, source), "executable", "hand_input")
         nodes.append(NodeProcess(executable, config | {"input": source}))
+    if page is not None:
+        host, port = page
+        address: dict[str, str | float] = {"web_host": host, "web_port": port, "recorded": recording is not None}
+        nodes.append(NodeProcess("web_page", config | address))
     return nodes
 
 

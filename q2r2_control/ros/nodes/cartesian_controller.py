@@ -215,6 +215,7 @@ class CartesianControllerNode(ManagedNode):
                 values["nearer_than_min_distance"] = "|".join(pair)
             values["qp_status"] = str(report.status)
             values["closest_pair"] = "|".join(report.closest_pair)
+            values["tightest_pair"] = "|".join(report.tightest_pair)
             values["closest_distance_m"] = round(report.closest_distance, 4)
         if fault is not None:
             values["kind"] = str(fault.kind)

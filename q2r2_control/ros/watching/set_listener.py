@@ -59,11 +59,7 @@ class SetListener:
         self._names = tuple(sorted(name for name in found if name != own))
 
     def view(self) -> SetView:
-        now = time.monotonic()
-        nodes = tuple(
-            NodeView(name, state["level"], state["message"], now - at, state)
-            for name, (state, at) in sorted(self._states.newest.items())
-        )
+        nodes = node_views(self._states)
         members = {node.name for node in nodes}
         topics = tuple(
             TopicView(name, types, self._publishers[name], self._subscribers[name], self._rate(name))
@@ -99,6 +95,14 @@ class SetListener:
         receivers = [self._states.newest[name][0] for name in members.intersection(self._subscribers[topic])]
         # Arms and controllers need what they receive; a robot receives one of many kinds of commands.
         return any(self._publishers[topic] or "arm" in state or "phase" in state for state in receivers)
+
+
+def node_views(states: NodeStates) -> tuple[NodeView, ...]:
+    now = time.monotonic()
+    return tuple(
+        NodeView(name, state["level"], state["message"], now - at, state)
+        for name, (state, at) in sorted(states.newest.items())
+    )
 
 
 def watch_set(

@@ -15,7 +15,7 @@ from q2r2_control.viewer.web.figure import place
 
 _SIZE = 0.22  # of a gizmo [m]
 _PERIOD = 0.02  # between samples [s]
-_ANSWER = 10.0  # a page that does not answer for longer drives no more; the gate stops the arms long before [s]
+_ANSWER = 60.0  # a page that does not answer for longer drives no more; the gate stops the arms long before [s]
 _Gizmos = dict[str, viser.TransformControlsHandle]  # by arm
 
 

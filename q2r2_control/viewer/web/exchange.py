@@ -34,10 +34,10 @@ class PageSetup:
     model: pin.Model
     collision_model: pin.GeometryModel  # whose pairs are monitored
     parts: Mapping[str, int]  # loose objects by name -> where their pose begins in ``Frame.moved``
-    recorded: bool  # whether a recorder runs
+    requests: tuple[PageRequest, ...]  # whose buttons are shown
+    changes: tuple[PageSetting, ...]  # whose sliders are shown
     driven: bool  # whether the page is the run's input
     replayed: bool  # whether the run is a recorded one
-    yields: bool  # whether springs hold the arms, as in torque mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +52,9 @@ class Frame:
     moved: Array | None  # MuJoCo's positions of all that moves
     end: float = 0.0  # of what can be shown of a replay, by its time [s]
     ages: Mapping[str, float] = field(default_factory=dict)  # of the newest pose of each arm's hand [s]
+    why: Mapping[str, str] = field(default_factory=dict)  # of each arm, where another program knows it
+    notice: str = ""  # what became of a request
+    pictures: Mapping[str, bytes] = field(default_factory=dict)  # newest ones by camera, JPEG or PNG
 
 
 class Ready(NamedTuple):
@@ -104,6 +107,7 @@ class PageRequest(StrEnum):
     """The requests of the page's buttons."""
 
     STOP = "stop"
+    RESET = "reset"  # takes back a stop that ends no run
     ENGAGE = "engage"
     PAUSE = "pause"
     HOME = "home"

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
+from base64 import b64encode
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 import viser
 
-from q2r2_control.config.bindings import Action
 from q2r2_control.events import Event, ReasonKind
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.live import next_press, why
@@ -36,6 +36,15 @@ _OF_EPISODES = (
     *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
     *(ReasonKind.EPISODE_DISCARDED, ReasonKind.MARK, ReasonKind.VERDICT),
 )
+_BUTTONS = {
+    PageRequest.STOP: ("Stop: rest, and end the run", "red"),
+    PageRequest.RESET: ("Take a stop back", "gray"),
+    PageRequest.ENGAGE: ("Engage both arms", "green"),
+    PageRequest.PAUSE: ("Pause both arms", "orange"),
+    PageRequest.HOME: ("Bring both arms home", "blue"),
+    PageRequest.RECORD: ("Begin or end an episode", "gray"),
+    PageRequest.MARK: ("Mark this moment", "gray"),
+}
 _STYLE = "font-size:12px;line-height:1.35;padding:0 0.6em 0.4em"
 
 
@@ -66,47 +75,41 @@ class Panel:
             self._add_buttons(gui)
         self._table = gui.add_html("")
         self._episodes = gui.add_html("", visible=False)
+        self._cameras = gui.add_html("", visible=False)
+        self._pictures: Mapping[str, bytes] = {}  # newest ones by camera
+        self._pictured: Mapping[str, bytes] = self._pictures  # those that are shown
         if driving is not None:
             with gui.add_folder("Grippers", expand_by_default=False):
                 driving.add_buttons(gui)
-        if not setup.replayed:
+        if setup.changes and not setup.replayed:
             self._add_settings(gui)
+        if not setup.replayed:
             with gui.add_folder("Controls of a hand", expand_by_default=False):
                 gui.add_html(_table(self._bindings.meanings().items()))
 
     def _add_settings(self, gui: viser.GuiApi) -> None:
+        ratio, scale = self._setup.config.impedance.damping_ratio, self._setup.config.teleop.position_scale
+        sliders = {
+            PageSetting.SPEED: ("speed [%]", (5.0, 100.0, 5.0, 100.0), 0.01),
+            PageSetting.STIFFNESS: ("stiffness [%]", (10.0, 100.0, 5.0, 100.0), 0.01),
+            PageSetting.DAMPING: ("damping ratio", (0.3, 2.0, 0.05, ratio), 1.0),
+            PageSetting.SCALE: ("hand scale", (0.1, max(2.0, scale), 0.05, scale), 1.0),
+        }
         with gui.add_folder("Settings", expand_by_default=False):
-            self._add_slider(gui, "speed [%]", PageSetting.SPEED, (5.0, 100.0, 5.0, 100.0), 0.01)
-            if self._setup.yields:
-                ratio = self._setup.config.impedance.damping_ratio
-                self._add_slider(gui, "stiffness [%]", PageSetting.STIFFNESS, (10.0, 100.0, 5.0, 100.0), 0.01)
-                self._add_slider(gui, "damping ratio", PageSetting.DAMPING, (0.3, 2.0, 0.05, ratio))
-            if self._driving is None:
-                scale = self._setup.config.teleop.position_scale
-                self._add_slider(gui, "hand scale", PageSetting.SCALE, (0.1, max(2.0, scale), 0.05, scale))
+            for setting in self._setup.changes:
+                label, numbers, unit = sliders[setting]
+                self._add_slider(gui, label, setting, numbers, unit)
 
     def _add_buttons(self, gui: viser.GuiApi) -> None:
-        buttons = [
-            ("Stop: rest, and end the run", PageRequest.STOP, "red"),
-            *([("Engage both arms", PageRequest.ENGAGE, "green")] if self._engages_by_press else []),
-            ("Pause both arms", PageRequest.PAUSE, "orange"),
-            ("Bring both arms home", PageRequest.HOME, "blue"),
-        ]
-        if self._setup.recorded:
-            buttons += [
-                ("Begin or end an episode", PageRequest.RECORD, "gray"),
-                ("Mark this moment", PageRequest.MARK, "gray"),
-            ]
-        for label, request, colour in buttons:
+        for request in self._setup.requests:
+            label, colour = _BUTTONS[request]
+            if request is PageRequest.STOP and PageRequest.RESET in self._setup.requests:
+                label = "Stop: rest, until that is taken back"
 
             def ask(_: object, request: PageRequest = request) -> None:
                 self._answer(request)
 
             gui.add_button(label, color=colour).on_click(ask)
-
-    @property
-    def _engages_by_press(self) -> bool:
-        return any(one.action is Action.PAUSE_TOGGLE for one in self._bindings.bound())
 
     def _add_time_line(self, gui: viser.GuiApi) -> None:
         gui.add_button("Play, or stand still", color="blue").on_click(lambda _: self._answer(PagePlay()))
@@ -125,7 +128,7 @@ class Panel:
         label: str,
         setting: PageSetting,
         numbers: tuple[float, float, float, float],
-        unit: float = 1.0,
+        unit: float,
     ) -> None:
         """``numbers``: least, greatest, step and first value, in ``unit`` of the setting."""
         slider = gui.add_slider(label, *numbers)
@@ -138,9 +141,13 @@ class Panel:
     def follow(self, frame: Frame) -> None:
         """Keep what a frame says that may be shown later."""
         self._last |= {event.arm: event for event in frame.events}
-        told = {(event.t, event.kind): event for event in frame.events if event.kind in _OF_EPISODES}  # by both arms
-        self._told += [(f"{event.t:.1f} s", sentence(event.reason)) for event in told.values()]
+        for event in frame.events:
+            line = f"{event.t:.1f} s", sentence(event.reason)
+            if event.kind in _OF_EPISODES and line not in self._told[-2:]:  # both arms tell it
+                self._told.append(line)
         self._binding |= dict.fromkeys(frame.binding)
+        if frame.pictures:
+            self._pictures = {**self._pictures, **frame.pictures}
         self._ticks += frame.ticks
         self._slowest = max(self._slowest, frame.slowest)
 
@@ -157,6 +164,9 @@ class Panel:
             self._table.content = self._drawn(frame, binding)
             if self._told and not self._setup.replayed:  # of a replay, each frame has the last events
                 self._episodes.content, self._episodes.visible = _table(self._told[-_EPISODES:]), True
+            if (pictures := self._pictures) is not self._pictured:
+                self._pictured, self._cameras.visible = pictures, True
+                self._cameras.content = "".join(_image(name, picture) for name, picture in pictures.items())
             if (line := self._time_line) is not None and frame.tick.t != line.value:
                 line.max = max(frame.end, line.max)
                 line.value = frame.tick.t
@@ -169,7 +179,7 @@ class Panel:
         rows = [
             ("", [f"<b>{escape(arm)}</b>" for arm in arms]),
             ("state", [_coloured(tick.states[arm], state_colour(tick.states[arm])) for arm in arms]),
-            ("why", [escape(why(tick, arm, self._names[arm], binding, self._last.get(arm))) for arm in arms]),
+            ("why", [escape(self._why(frame, arm, binding)) for arm in arms]),
             ("next press", [escape(next_press(tick, arm, self._bindings)) for arm in arms]),
             ("off its target", [_distance(tick.tracking_error(arm)[0]) for arm in arms]),
             ("hand's age", [_milliseconds(frame.ages.get(arm)) for arm in arms]),
@@ -193,6 +203,8 @@ class Panel:
             plots.append(_plot(f"slowest tick, {self._times[-1]:.0f} us", self._times, 1e6 / top))
         if self._driving is not None:
             lines.insert(0, escape(self._driving.words))
+        if frame.notice:
+            lines.insert(0, _coloured(frame.notice, RED))
         cells = "".join(
             f"<tr><td style='color:#777;padding-right:0.6em;vertical-align:top'>{name}</td>"
             + "".join(f"<td style='width:45%;vertical-align:top'>{value}</td>" for value in values)
@@ -201,6 +213,9 @@ class Panel:
         )
         below = "<br>".join(lines) + "".join(plots)
         return f"<div style='{_STYLE}'><table style='width:100%'>{cells}</table>{below}</div>"
+
+    def _why(self, frame: Frame, arm: str, binding: list[ActiveLimit]) -> str:
+        return frame.why.get(arm) or why(frame.tick, arm, self._names[arm], binding, self._last.get(arm))
 
     def _bars(self, frame: Frame, arm: str) -> str:
         joints, setup = self._setup.joints[arm], self._setup
@@ -229,6 +244,11 @@ def _milliseconds(age: float | None) -> str:
 def _table(rows: Iterable[tuple[str, str]]) -> str:
     cells = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in rows)
     return f"<div style='{_STYLE}'><table>{cells}</table></div>"
+
+
+def _image(name: str, picture: bytes) -> str:
+    data = f"data:image/jpeg;base64,{b64encode(picture).decode()}"
+    return f"<div style='{_STYLE}'>{escape(name)}<img src='{data}' style='display:block;width:100%'></div>"
 
 
 def _share(opening: float | None) -> str:

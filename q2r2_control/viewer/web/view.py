@@ -5,10 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from functools import partial
-from importlib.util import find_spec
-from threading import Event as Flag
 from typing import Any
 
 from pydantic import ValidationError
@@ -20,7 +18,6 @@ from q2r2_control.events import Event
 from q2r2_control.inputs.web import WebInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.web.exchange import (
@@ -30,18 +27,15 @@ from q2r2_control.viewer.web.exchange import (
     PageLost,
     PageRequest,
     PageSetting,
-    PageSetup,
-    Ready,
 )
+from q2r2_control.viewer.web.page import Page
 
 _PERIOD = 1.0 / 30.0  # between frames [s]
-_READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
-_PATIENCE = 2.0  # for it to end [s]
 
 _logger = logging.getLogger(__name__)
 
 
-class PageView(AbstractContextManager["PageView"]):
+class PageView(Page):
     """A listener of one run, as a context around it. Nothing in a browser can keep the loop waiting.
 
     A tick stores references, 30 times a second a thread gets them; where it is not done with the last ones, newer ones
@@ -50,11 +44,6 @@ class PageView(AbstractContextManager["PageView"]):
 
     def __init__(self, host: str, port: int) -> None:
         """Start the process, which takes a second. Raises :class:`ConfigError` where viser is not installed."""
-        if find_spec("viser") is None:
-            raise ConfigError("--web needs viser: pip install 'q2r2_control[web]'")
-        self._host, self._port = host, port
-        self._ready = Flag()
-        self.url: str | None = None  # None: not begun
         self._due = 0.0  # of the next frame, by the clock on the wall [s]
         self._events: list[Event] = []
         self._binding: dict[ActiveLimit, None] = {}
@@ -63,14 +52,9 @@ class PageView(AbstractContextManager["PageView"]):
         self._plant: MujocoPlant | None = None  # whose loose objects are shown
         self._input: WebInput | None = None  # that the page drives
         self._requests: dict[PageRequest, Callable[[], None]] = {}
-        self._on_request: Callable[[Any], None] | None = None  # instead of the run
         self._changes: dict[PageSetting, Callable[[float], None]] = {}
         self._hand_of: Callable[[str], str]  # that drives an arm
-        try:
-            # Room for one frame: a newer one is better than a queue.
-            self._process = HelperProcess("serves the page", "q2r2_control.viewer.web.server", self._on_answer, room=1)
-        except OSError as error:
-            raise ConfigError(f"--web: {reason_of(error)}") from error
+        super().__init__(host, port, self._do)
 
     def begin(self, pipeline: Pipeline, title: str, recorded: bool) -> str:
         """Serve the page of a run that is about to begin; returns its URL. Raises :class:`ConfigError`."""
@@ -88,8 +72,9 @@ class PageView(AbstractContextManager["PageView"]):
         on_request: Callable[[Any], None] | None = None,
     ) -> str:
         """Serve a page; returns its URL. ``on_request`` gets what its buttons ask for, instead of the run."""
-        self._on_request = on_request
-        robot, plant = pipeline.robot, pipeline.plant
+        if on_request is not None:
+            self._on_request = on_request
+        config, plant = pipeline.config, pipeline.plant
         source: object = pipeline.input
         while (operator := getattr(source, "operator", None)) is not None:  # of a policy: its hands
             source = operator
@@ -97,8 +82,7 @@ class PageView(AbstractContextManager["PageView"]):
         parts = {}
         if isinstance(plant, MujocoPlant):
             self._plant = plant
-            names = pipeline.config.mujoco.objects
-            parts = {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in names}
+            parts = {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in config.mujoco.objects}
         self._requests = {
             PageRequest.STOP: pipeline.stop,
             PageRequest.ENGAGE: pipeline.engage,
@@ -108,42 +92,23 @@ class PageView(AbstractContextManager["PageView"]):
             PageRequest.MARK: partial(pipeline.mark, Action.RECORD_MARK),
         }
         self._changes, self._hand_of = _changes_of(pipeline), lambda arm: pipeline.teleop.hand_of(arm)
-        setup = PageSetup(
-            host=self._host,
-            port=self._port,
-            title=title,
-            config=pipeline.config,
-            urdf=robot.urdf,
-            joint_names=robot.joint_names,
-            joints={arm: its.joints for arm, its in robot.arms.items()},
-            fingers={arm: its.finger_joints for arm, its in robot.arms.items()},
-            tools={arm: its.frame_id for arm, its in robot.arms.items()},
-            home=robot.home,
-            lower=robot.position_lower,
-            upper=robot.position_upper,
-            model=robot.model,
-            collision_model=robot.collision_model,
+        by_press = any(one.action is Action.PAUSE_TOGGLE for one in config.teleop.bindings.bound())
+        hidden = {
+            *([] if by_press else [PageRequest.ENGAGE]),
+            *([] if recorded else [PageRequest.RECORD, PageRequest.MARK]),
+            *([] if pipeline.drive.yields else [PageSetting.STIFFNESS, PageSetting.DAMPING]),
+            *([] if self._input is None else [PageSetting.SCALE]),
+        }
+        return self.open(
+            pipeline.robot,
+            config,
+            title,
+            tuple(one for one in self._requests if one not in hidden),
+            tuple(one for one in self._changes if one not in hidden),
             parts=parts,
-            recorded=recorded,
             driven=self._input is not None,
             replayed=replayed,
-            yields=pipeline.drive.yields,
         )
-        self._process.send(setup)
-        waited = 0.0
-        while self._process.alive and waited < _READY and not self._ready.wait(0.1):
-            waited += 0.1
-        if self.url is None:
-            raise ConfigError(self._process.fault or f"--web: the page was not ready within {_READY:g} s")
-        return self.url
-
-    @property
-    def alive(self) -> bool:
-        return self._process.alive
-
-    def send(self, frame: Frame) -> bool:
-        """Show a frame, unless the page is not done with the last one."""
-        return self._process.send(frame, 1)
 
     def __call__(self, tick: Tick) -> None:
         """Store one tick, and send it where a frame is due."""
@@ -158,9 +123,9 @@ class PageView(AbstractContextManager["PageView"]):
         now = time.monotonic()
         if now < self._due or self.url is None:
             return
-        if not self._process.alive:
+        if not self.alive:
             self.url = None
-            _logger.warning("the page is gone, the run goes on: %s", self._process.fault)
+            _logger.warning("the page is gone, the run goes on: %s", self.fault)
             return
         moved = None if self._plant is None else self._plant.observed_qpos
         stamps = {arm: self._heard.get(self._hand_of(arm)) for arm in tick.tools}
@@ -170,14 +135,9 @@ class PageView(AbstractContextManager["PageView"]):
             self._due = now + _PERIOD
             self._events, self._binding, self._ticks, self._slowest = [], {}, 0, 0.0
 
-    def _on_answer(self, answer: Any) -> None:
+    def _do(self, answer: Any) -> None:
         """In a thread of its own."""
-        if isinstance(answer, Ready):
-            self.url = answer.url
-            self._ready.set()
-        elif self._on_request is not None:
-            self._on_request(answer)
-        elif isinstance(answer, PageRequest):
+        if isinstance(answer, PageRequest):
             self._requests[answer]()
         elif isinstance(answer, PageChange):
             with suppress(ConfigError):  # a number that no slider has
@@ -187,9 +147,6 @@ class PageView(AbstractContextManager["PageView"]):
             self._input.receive(answer.hand, answer.position, answer.quaternion, controls)
         elif self._input is not None and isinstance(answer, PageLost):
             self._input.lose()
-
-    def __exit__(self, *_: object) -> None:
-        self._process.finish(_PATIENCE)
 
 
 def _changes_of(pipeline: Pipeline) -> dict[PageSetting, Callable[[float], None]]:

@@ -1,4 +1,4 @@
-"""Pictures of one camera of the simulated cell for a headset, taken in a process of their own."""
+"""Pictures of one camera of the simulated cell for those who look on, taken in a process of their own."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.process.helper_process import HelperProcess
 from q2r2_control.summary.tick import Tick
 
-_MOST = 30.0  # pictures a second
 _NICENESS = 19  # loop and hands go first
 _QUALITY = 70  # of JPEG
 _logger = logging.getLogger(__name__)
@@ -45,12 +44,14 @@ def main(requests: Iterator[Any], answer: Callable[[bytes], None]) -> None:
         answer(jpeg_of(cell.take(setup.name), _QUALITY))
 
 
-class HeadsetPictures(AbstractContextManager["HeadsetPictures"]):
+class LivePictures(AbstractContextManager["LivePictures"]):
     """A listener of one run, as a context around it. Where it fails, a line says so and the run goes on."""
 
-    def __init__(self, plant: MujocoPlant, name: str, camera: CameraConfig, show: Callable[[bytes], object]) -> None:
-        """``show`` gets each picture, in a thread of its own. Raises :class:`OSError`."""
-        self._plant, self._period = plant, 1.0 / min(camera.rate, _MOST)
+    def __init__(
+        self, plant: MujocoPlant, name: str, camera: CameraConfig, most: float, show: Callable[[bytes], object]
+    ) -> None:
+        """``show`` gets ``most`` pictures a second, in a thread of its own. Raises :class:`OSError`."""
+        self._plant, self._period = plant, 1.0 / min(camera.rate, most)
         self._due = 0.0  # by the clock on the wall [s]
 
         def pass_on(jpeg: bytes) -> None:
@@ -67,7 +68,7 @@ class HeadsetPictures(AbstractContextManager["HeadsetPictures"]):
             self._due = now + self._period
         elif not self._process.alive and not self._told:
             self._told = True
-            _logger.warning("no pictures for the headset: %s", self._process.fault)
+            _logger.warning("no more pictures are shown: %s", self._process.fault)
 
     def __exit__(self, *_: object) -> None:
         self._process.kill()

@@ -1,4 +1,4 @@
-"""Pictures for a headset come from a process of their own, and a fault of it is one line."""
+"""Pictures to look at come from a process of their own, and a fault of it is one line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from PIL import Image
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.viewer.headset_pictures import HeadsetPictures
+from q2r2_control.viewer.live_pictures import LivePictures
 from tests.support.processes import cell, wait_until
 
 
@@ -19,7 +19,7 @@ def test_a_picture_of_the_cell_comes_and_a_lost_process_is_one_line(caplog: pyte
     loop = Pipeline.from_config(cell().model_copy(update={"cameras": {"front": camera}}), plant="mujoco")
     assert isinstance(loop.plant, MujocoPlant)
     got: list[bytes] = []
-    with HeadsetPictures(loop.plant, "front", camera, got.append) as pictures:
+    with LivePictures(loop.plant, "front", camera, 30.0, got.append) as pictures:
         loop.begin()
         tick = loop.tick()
 
@@ -35,4 +35,4 @@ def test_a_picture_of_the_cell_comes_and_a_lost_process_is_one_line(caplog: pyte
             pictures(tick)
     loop.end()
     assert Image.open(io.BytesIO(got[0])).size == (64, 48)
-    assert len([record for record in caplog.records if "no pictures for the headset" in record.message]) == 1
+    assert len([record for record in caplog.records if "no more pictures are shown" in record.message]) == 1

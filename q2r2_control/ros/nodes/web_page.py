@@ -1,0 +1,248 @@
+"""``web_page``: shows in browsers what the nodes of a cell publish. It listens as the recorder does, to no command.
+
+Its buttons call services that anybody may call, and none of them engages an arm.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import import_module
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosbags.serde import SerdeError
+from std_srvs.srv import Trigger
+
+from q2r2_control.config.cell import load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.events import Event
+from q2r2_control.recording.messages import (
+    NANOSECONDS,
+    PICTURE,
+    RECORDER,
+    TEXT,
+    Message,
+    Topic,
+    data_of,
+    hand_pose,
+    heard_on,
+    is_compressed,
+    ros_topics,
+)
+from q2r2_control.recording.recorded_ticks import tool_poses
+from q2r2_control.recording.ros_recording import RosTicks
+from q2r2_control.recording.tick_rows import STATUSES
+from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.base_node import OK, RECORDED_QOS, STEADY, WARN, BaseNode
+from q2r2_control.ros.monitoring import NodeStates
+from q2r2_control.ros.watching.set_listener import node_views
+from q2r2_control.ros.watching.set_view import arm_views
+from q2r2_control.summary.tick import RunStart, Tick
+from q2r2_control.teleop.arm_states import HOLDING
+from q2r2_control.types import SIDES, ArmTarget, Command, CommandMode, Reference, RobotState, StepReport
+from q2r2_control.viewer.web.exchange import Frame, PageRequest
+from q2r2_control.viewer.web.page import Page
+
+_PERIOD = 1.0 / 30.0  # between frames [s]
+_LOOK_PERIOD = 0.5  # between two looks at which nodes there are [s]
+_CONTROLLER = "/cartesian_controller"
+_STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # ticks of a frame, and far more
+_PICTURE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+_PICTURE_PERIOD = 0.2  # between two pictures of a camera [s]
+_UNREADABLE = SerdeError, ValueError, KeyError, IndexError, TypeError
+
+
+class WebPage(BaseNode):
+    """Draws what it has heard, and passes on what the page's buttons ask for."""
+
+    ticks = True
+
+    def __init__(self) -> None:
+        super().__init__("web_page")
+        config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
+        what = "address of the page; beyond 127.0.0.1 its URL has a token"
+        host = self.parameter("web_host", "127.0.0.1", what)
+        port = self.parameter("web_port", 8080, "of the page; 0: any free one", within=(0, 65535))
+        rate = self.parameter("rate", 250.0, "of the controller's loop, as it is set there [Hz]", within=(20, 1000))
+        recorded = self.parameter("recorded", False, "whether a recorder runs, whose buttons are shown")
+        if config.external is not None and not config.external.filtered:
+            allowed = "allowed: controller: builtin, or mode: filtered"
+            raise ConfigError(f"--web: {config.name} has no ticks to show; {allowed}")
+        self._asked: SimpleQueue[Any] = SimpleQueue()
+        self._page = Page(host, port, self._asked.put)  # its process starts while this one builds
+        self._cell, self._robot = config.model_copy(update={"loop_rate_hz": rate}), Robot.from_config(config)
+        self._begun = time.monotonic_ns()
+        self._ticks = RosTicks(self._begun, self._robot)
+        self._waiting: list[tuple[str, Message]] = []
+        self._row: Any = None  # newest tick; None: nothing to be shown was heard yet
+        self._start: RunStart | None = None
+        self._events: list[Event] = []
+        self._number, self._shown, self._slowest = -1, -1, 0.0  # newest tick, and the last one of a frame
+        self._states, self._notice = NodeStates(self), ""
+        self._trigger_clients: dict[str, Any] = {}
+        requests = [PageRequest.STOP, PageRequest.RESET, PageRequest.PAUSE, PageRequest.HOME]
+        self._requests = (*requests, *((PageRequest.RECORD, PageRequest.MARK) if recorded else ()))
+        url = self._page.open(self._robot, self._cell, config.name, self._requests)
+        shown = self._ticks.topics - {hand_pose(hand) for hand in SIDES}
+        for topic in ros_topics(tuple(self._robot.arms), {}):
+            if topic.name in shown:
+                self._listen(topic, partial(self._take, topic), RECORDED_QOS if topic.type == TEXT else _STREAM_QOS)
+        self._pictures: dict[str, bytes] = {}  # newest messages, by camera
+        for camera in [name for name, its in config.cameras.items() if its.topic and is_compressed(its.topic)]:
+            topic = Topic(0, str(config.cameras[camera].topic), PICTURE)
+            self._listen(topic, partial(self._pictures.__setitem__, camera), _PICTURE_QOS)
+        self.create_timer(_PICTURE_PERIOD, self._show_pictures, clock=STEADY)
+        self.create_timer(_LOOK_PERIOD, self._look, clock=STEADY)
+        self.create_tick(_PERIOD, self._show, clock=STEADY)
+        self.get_logger().info(f"page: {url}")
+
+    def _listen(self, topic: Topic, take: Callable[[bytes], None], qos: QoSProfile) -> None:
+        package, _, kind = topic.type.split("/")
+        message = getattr(import_module(f"{package}.msg"), kind)
+        self.create_subscription(message, heard_on(topic.name), take, qos, raw=True)
+
+    def _show_pictures(self) -> None:
+        while self._pictures:
+            camera, payload = self._pictures.popitem()
+            self._page.show_picture(camera, data_of(payload, PICTURE).tobytes())
+
+    def _take(self, topic: Topic, payload: bytes) -> None:
+        self._waiting.append((topic.name, Message(topic.channel, 0, time.monotonic_ns(), 0, bytes(payload))))
+
+    def _look(self) -> None:
+        """Find the nodes, and their services before a button needs them."""
+        self._states.look()
+        for name in {name for request in self._requests for name in self._services_of(request)} - set(
+            self._trigger_clients
+        ):
+            self._trigger_clients[name] = self.create_client(Trigger, name)
+
+    def _services_of(self, request: PageRequest) -> list[str]:
+        states = {name: state for name, (state, _) in self._states.newest.items()}
+        arms = [name for name, state in states.items() if "arm" in state]
+        match request:
+            case PageRequest.PAUSE:  # the way home too
+                return [f"{_CONTROLLER}/hold", *(f"{arm}/pause" for arm in arms)]
+            case PageRequest.RESET:
+                return [f"{_CONTROLLER}/reset", *(f"{arm}/reset" for arm in arms)]
+            case PageRequest.RECORD:
+                return [f"{RECORDER}/{'stop' if states.get(RECORDER, {}).get('episode_open') else 'start'}"]
+            case PageRequest.MARK:
+                return [f"{RECORDER}/mark"]
+        return [f"{_CONTROLLER}/{request}"]
+
+    def _serve(self, request: PageRequest) -> None:
+        self._notice = ""
+        for name in self._services_of(request):
+            client = self._trigger_clients.get(name)
+            if client is None or not client.service_is_ready():
+                self._notice = f"{name} is not there: its node does not run"
+            else:
+                client.call_async(Trigger.Request()).add_done_callback(partial(self._on_served, name))
+
+    def _on_served(self, name: str, future: Any) -> None:
+        if not future.result().success:
+            self._notice = f"{name}: {future.result().message}"
+
+    def _show(self) -> None:
+        """Serve what was asked for, and draw the newest tick."""
+        while not self._asked.empty():
+            self._serve(self._asked.get())
+        waiting, self._waiting = self._waiting, []
+        # A frame has one posture, flag and target of each; all ticks, references and events count.
+        try:
+            chunk = self._ticks.add_messages(waiting)
+        except _UNREADABLE as error:
+            self.drop("one of those that the page shows", f"{error!r:.60}")
+            return
+        self._events += [event for events in chunk.events().values() for event in events]
+        if len(chunk.rows):
+            self._row, self._number = chunk.rows[-1], int(chunk.numbers[-1])
+            self._slowest = max(self._slowest, float(chunk.rows["compute_time"].max()))
+        if self._row is None:
+            return
+        # A controller that is stopped has no ticks; where the joints are is shown all the same.
+        self._row["now"] = (time.monotonic_ns() - self._begun) / NANOSECONDS
+        self._row["q"], self._row["v"], self._row["tau"] = self._ticks.joints
+        nodes = node_views(self._states)
+        views = arm_views(nodes, self._cell)
+        told = {node.arm: node.values.get("hand_age") for node in nodes}  # twice a second, and at each event
+        ages = {arm: age for arm, age in told.items() if arm is not None and isinstance(age, int | float)}
+        frame = Frame(
+            tick=self._tick_of(self._row.copy(), {view.name: view.state for view in views}),
+            events=tuple(self._events),
+            binding=(),
+            ticks=self._number - self._shown,
+            slowest=self._slowest,
+            moved=None,
+            ages=ages,
+            why={view.name: view.why for view in views},
+            notice=self._notice,
+        )
+        if self._page.send(frame):
+            self._events, self._shown, self._slowest = [], self._number, 0.0
+
+    def _tick_of(self, row: Any, states: Mapping[str, str]) -> Tick:
+        now, arms = float(row["now"]), dict(zip(self._robot.arms, row["arms"], strict=True))
+        state = RobotState(row["q"], row["v"], row["tau"], None, now)
+        self._start = self._start or RunStart(now, state)
+        controller, _ = self._states.newest.get(_CONTROLLER, ({}, 0.0))
+        closest, tightest = (controller.get(f"{which}_pair", "|").split("|") for which in ("closest", "tightest"))
+        report = StepReport(
+            status=STATUSES[int(row["status"])],
+            rejected=(),
+            binding=(),
+            closest_pair=tuple(closest),
+            closest_distance=float(row["closest_distance"]),
+            certified=bool(row["certified"]),
+            fallback=bool(row["fallback"]),
+            slack=float(row["slack"]),
+            solve_time=float(row["solve_time"]),
+            tightest_pair=tuple(tightest),
+            margin=float(row["margin"]),
+        )
+        reference = Reference(row["reference_q"], row["reference_v"], row["reference_a"], report)
+        openings = {arm: float(its["opening"]) for arm, its in arms.items() if math.isfinite(its["opening"])}
+        tools = tool_poses(row["q"][None], self._robot)[0]
+        return Tick(
+            t=now,
+            start=self._start,
+            now=now,
+            dt=float(row["dt"]),
+            step=float(row["step"]),
+            following=True,
+            connected=True,
+            samples=[],
+            targets={arm: _target_of(its, states.get(arm) in HOLDING) for arm, its in arms.items()},
+            engaged={arm: its["engaged"] > 0.5 for arm, its in arms.items()},
+            states={arm: states.get(arm, "") for arm in arms},
+            reference=reference,
+            state=state,
+            openings=openings,
+            tools={arm: pin.XYZQUATToSE3(pose) for arm, pose in zip(arms, tools, strict=True)},
+            command=Command(CommandMode.POSITION, reference.q, reference.v, np.zeros_like(reference.q), {}),
+            events=[],
+            grippers=openings,
+            compute_time=float(row["compute_time"]),
+        )
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        if not self._page.alive:
+            return WARN, f"the page is gone: {self._page.fault}", {}
+        if self._row is None:
+            return WARN, "waits for joint states, the controller and the arms' nodes", {"url": self._page.url}
+        return OK, f"page: {self._page.url}", {"url": self._page.url}
+
+    def close(self) -> None:
+        self._page.__exit__()
+
+
+def _target_of(row: Any, holds: bool) -> ArmTarget:
+    pose = pin.XYZQUATToSE3(row["target"]) if row["target"].any() and not holds else None
+    return ArmTarget(pose, float(row["wanted"]), float(row["slip"]), float(row["slip_angle"]))

@@ -1,0 +1,116 @@
+"""The process that serves a page, from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from importlib.util import find_spec
+from threading import Event as Flag
+from types import MappingProxyType
+from typing import Any, Self
+
+from q2r2_control.config.cell import Config
+from q2r2_control.errors import ConfigError
+from q2r2_control.process.helper_process import HelperProcess, reason_of
+from q2r2_control.robot.robot import Robot
+from q2r2_control.viewer.web.exchange import Frame, PageRequest, PageSetting, PageSetup, Ready
+
+_READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
+_PATIENCE = 2.0  # for it to end [s]
+
+
+class Page:
+    """A page and its process, as a context. Nothing in a browser can keep this process waiting."""
+
+    def __init__(self, host: str, port: int, on_answer: Callable[[Any], None]) -> None:
+        """Start the process, which takes a second. Raises :class:`ConfigError` where viser is not installed.
+
+        ``on_answer`` gets what browsers ask for, in a thread of its own.
+        """
+        if find_spec("viser") is None:
+            raise ConfigError("--web needs viser: pip install 'q2r2_control[web]'")
+        self._host, self._port, self._on_request = host, port, on_answer
+        self._ready = Flag()
+        self.url: str | None = None  # None: not begun
+        self._pictures: dict[str, bytes] = {}  # by camera, that wait for a frame
+        try:
+            # Room for one frame: a newer one is better than a queue.
+            self._process = HelperProcess("serves the page", "q2r2_control.viewer.web.server", self._on_answer, room=1)
+        except OSError as error:
+            raise ConfigError(f"--web: {reason_of(error)}") from error
+
+    def open(
+        self,
+        robot: Robot,
+        config: Config,
+        title: str,
+        requests: tuple[PageRequest, ...],
+        changes: tuple[PageSetting, ...] = (),
+        *,
+        parts: Mapping[str, int] = MappingProxyType({}),
+        driven: bool = False,
+        replayed: bool = False,
+    ) -> str:
+        """Serve the page of a cell, see :class:`PageSetup`; returns its URL. Raises :class:`ConfigError`."""
+        setup = PageSetup(
+            host=self._host,
+            port=self._port,
+            title=title,
+            config=config,
+            urdf=robot.urdf,
+            joint_names=robot.joint_names,
+            joints={arm: its.joints for arm, its in robot.arms.items()},
+            fingers={arm: its.finger_joints for arm, its in robot.arms.items()},
+            tools={arm: its.frame_id for arm, its in robot.arms.items()},
+            home=robot.home,
+            lower=robot.position_lower,
+            upper=robot.position_upper,
+            model=robot.model,
+            collision_model=robot.collision_model,
+            parts=dict(parts),
+            requests=requests,
+            changes=changes,
+            driven=driven,
+            replayed=replayed,
+        )
+        self._process.send(setup)
+        waited = 0.0
+        while self._process.alive and waited < _READY and not self._ready.wait(0.1):
+            waited += 0.1
+        if self.url is None:
+            raise ConfigError(self.fault or f"--web: the page was not ready within {_READY:g} s")
+        return self.url
+
+    @property
+    def alive(self) -> bool:
+        return self._process.alive
+
+    @property
+    def fault(self) -> str | None:
+        """Why the process has ended before it was to."""
+        return self._process.fault
+
+    def send(self, frame: Frame) -> bool:
+        """Show a frame, unless the page is not done with the last one."""
+        pictures, self._pictures = self._pictures, {}
+        sent = self._process.send(replace(frame, pictures=pictures) if pictures else frame, 1)
+        if not sent:
+            self._pictures = pictures | self._pictures
+        return sent
+
+    def show_picture(self, camera: str, picture: bytes) -> None:
+        """Show a JPEG or PNG with the next frame; from any thread."""
+        self._pictures = self._pictures | {camera: picture}
+
+    def _on_answer(self, answer: Any) -> None:
+        if isinstance(answer, Ready):
+            self.url = answer.url
+            self._ready.set()
+        else:
+            self._on_request(answer)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.finish(_PATIENCE)

@@ -1,0 +1,92 @@
+"""The page of a set of real nodes: what it shows, and what its buttons ask for."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("viser", reason="the extra web brings it")
+
+from tests.ros.conftest import need_ros
+from tests.ros.processes import CONFIG, Processes, RosProcess, States, wait_until
+from tests.ros.test_processes import external_cell
+
+need_ros()
+
+from sensor_msgs.msg import CompressedImage
+from std_msgs.msg import String
+
+from q2r2_control.recording.messages import arm_events
+from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
+from tests.support.page_client import PageClient
+from tests.support.processes import children
+
+CAMERA = "cameras: {front: {topic: /front/compressed}}  "
+PATIENCE = 120.0  # for a whole set on a busy machine [s]
+
+
+def url_of(process: RosProcess) -> str:
+    return process.wait_for("page: http", PATIENCE).rpartition(" ")[2]
+
+
+@pytest.mark.alone
+def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
+    node: Any, processes: Processes, tmp_path: Path
+) -> None:
+    (cell := tmp_path / "cell.yaml").write_text(Path(CONFIG).read_text().replace("cameras: {} ", CAMERA))
+    command = ("ros", "up", str(cell), "--web", "--web-port", "0", "--record", str(tmp_path))
+    up = processes.start(sys.executable, "-u", "-m", "q2r2_control", *command, name="up")
+    with PageClient(url_of(up)) as page:
+        page.wait_until(lambda: page.row("state") == ["engaged", "engaged"])
+        before = page.row("tool [m]")
+        page.wait_until(lambda: page.row("tool [m]") != before)
+        page.wait_until(lambda: "certified" in page.words and "mm" in page.row("off its target")[0])
+        assert not any("ngage" in label for label in page.buttons), "nothing on it moves an arm but the way home"
+
+        camera = node.create_publisher(CompressedImage, "/front/compressed", STREAM_QOS)
+        picture = CompressedImage(data=b"a JPEG")
+        page.wait_until(lambda: camera.publish(picture) or b"a JPEG" in page.pictures)
+
+        page.press("Pause both")
+        page.wait_until(lambda: all("the pause service" in why for why in page.row("why")))
+        page.press("Bring both")
+        page.wait_until(lambda: page.row("state") == ["homing", "homing"])
+        page.press("Pause both")  # the way home too
+        page.wait_until(lambda: "homing" not in page.row("state"))
+        page.press("Stop")
+        page.wait_until(lambda: all("the stop service" in why for why in page.row("why")))
+        page.press("Bring both")
+        page.wait_until(lambda: "/cartesian_controller/home: " in page.words)  # it is refused, and says why
+        page.press("Take a stop back")
+        page.wait_until(lambda: all("waits for its operator" in why for why in page.row("why")))
+        assert "engaged" not in page.row("state")
+
+        for label, told in (("Begin or end", "episode begins"), ("Mark", "mark"), ("Begin or end", "episode ends")):
+            page.press(label)
+            page.wait_until(partial(page.says, f"|{told}|"))
+    assert up.interrupt(PATIENCE) == 0
+
+
+def test_neither_a_page_that_is_gone_nor_a_strange_message_ends_a_set(node: Any, processes: Processes) -> None:
+    process = processes.start_node("web_page", f"config:={CONFIG}", "web_port:=0")
+    url_of(process)
+    publisher = node.create_publisher(String, arm_events("left"), RECORDED_QOS)
+    wait_until(publisher.get_subscription_count, "the page listens to events")
+    publisher.publish(String(data="{"))
+    process.wait_for("cannot be read")
+    (server,) = children(process.pid)
+    os.kill(server, signal.SIGKILL)
+    assert "the page is gone" in States(node, "web_page").wait_for(level="warn")["message"]
+    assert process.interrupt(60.0) == 0
+
+
+def test_a_cell_without_the_built_in_controller_has_nothing_to_show(processes: Processes, tmp_path: Path) -> None:
+    process = processes.start_node("web_page", f"config:={external_cell(tmp_path, 'fzi', 'raw')}")
+    assert process.wait(60.0) == 2
+    assert "has no ticks to show; allowed: controller: builtin, or mode: filtered" in process.output

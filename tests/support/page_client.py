@@ -1,0 +1,91 @@
+"""A page without a browser: hears what the server of a page draws, and presses its buttons."""
+
+from __future__ import annotations
+
+import re
+import time
+from base64 import b64decode
+from collections.abc import Callable
+from contextlib import suppress
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+import msgspec
+import viser
+import zstandard
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
+
+_CAMERA = {
+    **{"position": (0.0, 0.0, 0.0), "look_at": (1.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)},
+    **{"wxyz": (1.0, 0.0, 0.0, 0.0), "fov": 1.0, "near": 0.1, "far": 9.0, "image_height": 100, "image_width": 100},
+}
+_PATIENCE = 120.0  # far longer than anything takes [s]
+
+
+class PageClient:
+    """A context. It speaks viser's protocol: lengths, packed messages, and arrays, which are not read."""
+
+    def __init__(self, url: str) -> None:
+        host = urlsplit(url).netloc
+        protocol = [Subprotocol(f"viser-v{viser.__version__}")]
+        self._socket = connect(f"ws://{host}", origin=Origin(f"http://{host}"), subprotocols=protocol, max_size=None)
+        self._contents: dict[str, str] = {}  # of the panel's pieces of HTML
+        self.buttons: dict[str, str] = {}  # by label
+        self.pictures: list[bytes] = []  # of cameras, as they came
+        self._send("ViewerCameraMessage", **_CAMERA)  # before which no press counts
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._socket.close()
+
+    @property
+    def html(self) -> str:
+        return "\n".join(self._contents.values())
+
+    @property
+    def words(self) -> str:
+        """The panel without its markup; cells of a table are apart by |."""
+        return re.sub(r"<[^>]*>", "", self.html.replace("</td>", "|"))
+
+    def says(self, text: str) -> bool:
+        return text in self.words
+
+    def row(self, name: str) -> list[str]:
+        """A row of the panel's table, arm by arm."""
+        found = re.search(rf">{re.escape(name)}</td>(.*?)</tr>", self.html)
+        return [] if found is None else re.sub(r"<[^>]*>", "", found[1].replace("</td>", "|")).split("|")[:-1]
+
+    def wait_until(self, condition: Callable[[], object]) -> None:
+        """Hear what is drawn until ``condition`` holds; otherwise the failure says what is seen."""
+        deadline = time.monotonic() + _PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline, f"the page says: {self.words}"
+            with suppress(TimeoutError):
+                self._hear(self._socket.recv(timeout=1.0))
+
+    def press(self, label: str) -> None:
+        """Click the button whose label begins so."""
+        self.wait_until(lambda: any(one.startswith(label) for one in self.buttons))
+        (uuid,) = (uuid for one, uuid in self.buttons.items() if one.startswith(label))
+        self._send("GuiUpdateMessage", uuid=uuid, updates={"value": True})
+
+    def _send(self, kind: str, **fields: Any) -> None:
+        self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def _hear(self, data: bytes | str) -> None:
+        assert isinstance(data, bytes)
+        length = int.from_bytes(data[8:16], "little")
+        told: dict[str, Any] = msgspec.msgpack.decode(zstandard.decompress(data[16 : 16 + length]))
+        for one in told["messages"]:
+            if one["type"] == "GuiButtonMessage":
+                self.buttons[one["props"]["label"]] = one["uuid"]
+            content = (one.get("props") or one.get("updates") or {}).get("content")
+            if isinstance(content, str):
+                self._contents[one["uuid"]] = content
+                self.pictures += map(b64decode, re.findall(r"base64,([^']*)", content))
