@@ -48,7 +48,7 @@ from q2r2_control.viewer.tables import print_table
 from q2r2_control.viewer.web.view import PageView
 
 _PERIOD = 1.0 / 30.0  # [s]
-_ON_PAGE, _IN_HEADSET = 5.0, 30.0  # pictures of a camera a second
+_ON_PAGE, _IN_HEADSET = 5.0, 30.0  # pictures of all cameras a second
 
 
 def check_window(plant: str | None) -> None:
@@ -262,4 +262,4 @@ def _lookers(pipeline: Pipeline, page: PageView | None) -> Iterator[tuple[str, f
     if isinstance(pipeline.input, DisplayInput):
         yield from ((name, _IN_HEADSET, pipeline.input.show_picture) for name in names[:1])
     if page is not None:
-        yield from ((name, _ON_PAGE, partial(page.show_picture, name)) for name in names)
+        yield from ((name, _ON_PAGE / len(names), partial(page.show_picture, name)) for name in names)
