@@ -236,7 +236,7 @@ def _add_objects(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
         boxes = [(thing.size, (0.0, 0.0, 0.0)), *((box.size, box.at) for box in thing.boxes)]
         volume = sum(math.prod(size) for size, _ in boxes)
         for number, (size, at) in enumerate(boxes):
-            body.add_geom(
+            geom = body.add_geom(
                 name=f"{name}_{number}" if number else name,
                 type=mujoco.mjtGeom.mjGEOM_BOX,
                 size=np.array(size) / 2,
@@ -246,6 +246,7 @@ def _add_objects(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
                 group=VISUAL_GROUP,
                 condim=4,
                 friction=(thing.friction, TORSION, ROLLING),
-                # MuJoCo's usual contacts would let a light part sink millimetres into another one.
-                solref=_PAD_STIFFNESS,
             )
+            # Parts that slide into each other are hard: MuJoCo's usual contacts let light ones sink in by millimetres.
+            if thing.friction < _PAD_FRICTION[0]:
+                geom.solref = _PAD_STIFFNESS
