@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-import coal
 import numpy as np
 import typer
 import yaml
@@ -21,6 +20,7 @@ from q2r2_control.config.cell import Config, load_config, parse_config
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, load_description
+from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.home_search import find_home
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, lacks_of, tip_of, tips_by_side
@@ -34,6 +34,7 @@ from q2r2_control.viewer.tables import figure_table, print_table
 
 _FITS = 8  # capsules in the table
 _LEAST_JOINTS = 3  # of an arm
+_OFF_FLOOR = 0.03  # that each link can get at least [m]
 _BARELY = 0.003  # a pair that parts by no more than this beyond what it keeps hardly does [m]
 
 Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, package:// or example-robot-data:NAME.")]
@@ -47,7 +48,7 @@ class _Draft:
 
     file: Path
     data: dict[str, Any]
-    notes: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)  # that the check of a cell does not look for
     fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # by model
     always: list[tuple[str, str]] = field(default_factory=list)  # links that overlap by construction
 
@@ -83,7 +84,7 @@ def new_cell(
     draft = _Draft(file, {"name": name})
     tips = {"left": left_tip, "right": right_tip}
     models = {side: model for side, model in (("left", left), ("right", right)) if model is not None}
-    _survey(draft, {side: robot for side in tips} if robot else models, tips, shared=robot)
+    _survey(draft, dict.fromkeys(tips, robot) if robot else models, tips, shared=robot)
     _mount(draft, distance, height, yes)
     _place(draft, yes)
     with counting() as progress:
@@ -95,19 +96,20 @@ def new_cell(
     never = [(pair.link_a, pair.link_b) for pair in approaches if pair.nearest > CLEARANCE]
     if always or never:
         comment = (
-            f"Found by q2r2 new-cell in {samples} random postures: links that stay more than {1e3 * CLEARANCE:g} mm apart, "
-            "or overlap by construction."
+            f"Found by q2r2 new-cell in {samples} random postures: these links stay more than {1e3 * CLEARANCE:g} mm "
+            "apart, or overlap by construction."
         )
         pairs = [*((a, b, "Always") for a, b in always), *((a, b, "Never") for a, b in never if (a, b) not in always)]
         srdf.write_text(srdf_text(name, comment, pairs), encoding="utf-8")
         draft.data["srdf"] = srdf.name
     file.write_text(_text(draft, cell), encoding="utf-8")
     result = check_cell(load_config(file))
+    faults = [*draft.faults, *result.faults]
     if json:
-        print(as_json_text({"file": str(file), "capsules": draft.fits, "notes": draft.notes, "check": result}))
+        print(as_json_text({"file": str(file), "capsules": draft.fits, "notes": result.notes, "faults": faults}))
     else:
-        _print(draft, [*draft.notes, *result.notes], result.faults)
-    raise Exit(1 if result.faults else 0)
+        _print(draft, result.notes, faults)
+    raise Exit(1 if faults else 0)
 
 
 def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], shared: str | None) -> None:
@@ -128,11 +130,15 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
             raise ConfigError(f"--{side}-tip {tip!r:.60}: no such link; links: {', '.join(tree.joint_to)}")
         chains[side] = tree.chain(tip)
         if len(chains[side]) < _LEAST_JOINTS:
-            moves = f"{len(chains[side])} joints move {tip}"
-            raise ConfigError(f"--{side} {models[side]!r:.120}: {moves}; allowed: an arm, of {_LEAST_JOINTS} or more")
+            moves = f"joints that move {tip}: {len(chains[side])}"
+            raise ConfigError(f"{models[side]!r:.120}: {moves}; allowed: an arm, of {_LEAST_JOINTS} or more")
         limits, masses = lacks_of(described[side], tree, tip)
-        lacks += [f"{models[side]}: {lack}" for lack in limits]
-        draft.notes += [f"{side} arm: {link} has no mass: simulation and torque mode need one" for link in masses]
+        if limits:
+            lacks.append(f"{models[side]}: {', '.join(limits)}")
+        if masses:
+            draft.faults.append(
+                f"{side} arm: links that move without a mass, which simulation needs: {', '.join(masses)}"
+            )
     if lacks:
         raise ConfigError(f"{'; '.join(dict.fromkeys(lacks))}; to change: the <limit> of these joints in the model")
     if shared is not None:
@@ -154,27 +160,28 @@ def _mount(draft: _Draft, distance: float | None, height: float | None, yes: boo
     arms, shared = draft.data["arms"], draft.data.get("robot")
     length = max(compose(draft.config()).arm_lengths().values())
     usual = round(min(max(length, 0.3), 1.0), 1)
-    stands = 0.0 if shared is None else _depth(Robot.from_config(draft.config()))
     if distance is None:
         apart = len(arms) == 2 and shared is None
         distance = _asked("metres between the bases of both arms", usual, yes) if apart else 0.0
     if height is None:
-        height = _asked("height of the base above the floor in metres", stands, yes)
+        height = _asked("height of the base above the floor in metres", _stand(Robot.from_config(draft.config())), yes)
     for side, part in {"robot": shared}.items() if shared is not None else arms.items():
         y = 0.0 if side == "robot" or len(arms) == 1 else distance / 2 if side == "left" else -distance / 2
         part["mount"]["position"] = [0.0, round(y, 4), height]
 
 
-def _depth(robot: Robot) -> float:
-    """How far the lowest fixed part is below the root link, as feet are [m]."""
+def _stand(robot: Robot) -> float:
+    """Height of the root link at which feet stand on the floor, and at which no link is held up by it [m]."""
     lowest = [0.0]
     for item in robot.collision_model.geometryObjects:
-        if item.parentJoint == 0 and not link_of(item.name) == "floor":
+        if item.parentJoint == 0 and link_of(item.name) != FLOOR:
             item.geometry.computeLocalAABB()
-            reach = (item.geometry.aabb_local.max_ - item.geometry.aabb_local.min_) / 2
-            centre = item.placement.act((item.geometry.aabb_local.max_ + item.geometry.aabb_local.min_) / 2)
-            lowest.append(float(centre[2] - np.abs(item.placement.rotation[2]) @ reach))
-    return math.ceil(-100.0 * min(lowest)) / 100.0
+            box = item.geometry.aabb_local
+            reach = np.abs(item.placement.rotation[2]) @ (box.max_ - box.min_) / 2
+            lowest.append(float(item.placement.act((box.max_ + box.min_) / 2)[2] - reach))
+    near = [pair for pair in pair_names(robot.collision_model) if FLOOR in map(link_of, pair)]
+    farthest = min((most for _, most in spreads_of(robot, near).values()), default=math.inf)
+    return math.ceil(100.0 * max(-min(lowest), _OFF_FLOOR - farthest)) / 100.0
 
 
 def _place(draft: _Draft, yes: bool) -> None:
@@ -198,12 +205,13 @@ def _place(draft: _Draft, yes: bool) -> None:
     kept = kept_distances(robot, draft.config().control).values
     names = [(link_of(a), link_of(b)) for a, b in pair_names(robot.collision_model)]
     kept[[names_of in draft.always for names_of in names]] = -np.inf
-    q, placed = robot.home.copy(), []
+    q = robot.home.copy()
+    placed: list[str] = []
     for side, arm in robot.arms.items():
-        twin = placed and draft.data["arms"][side].get("model") == draft.data["arms"][placed[0]].get("model", "")
-        if twin:
-            q[arm.joints] = q[robot.arms[placed[0]].joints]
-        found: Array = find_home(robot, side, q, kept, placed).round(3)
+        model = draft.data["arms"][side].get("model")
+        twins = [other for other in placed if model and draft.data["arms"][other]["model"] == model]
+        like = q[robot.arms[twins[0]].joints] if twins else None
+        found: Array = find_home(robot, side, q, kept, placed, like).round(3)
         text = " ".join(f"{value:g}" for value in found)
         answer = text if yes else typer.prompt(f"home of the {side} arm, found; or yours in radians", default=text)
         try:
@@ -248,12 +256,13 @@ def _text(draft: _Draft, robot: Robot) -> str:
         comments = {
             "mount": where,
             "tip": "# last link, which the operator moves",
-            "gripper": "# guessed: see it open and close",
-            "home": f"# tool at {tool} [rad]",
+            "gripper": "# guessed: see it open and close [rad or m]",
+            "home": f"# found: tool at {tool} m [rad]",
         }
         for key in ("model", "mount", "tip", "gripper", "home"):
             if key in arm:
-                lines.append(f"    {key}: {_flow(arm[key])}   {comments.get(key, '')}".rstrip())
+                comment = comments.get(key, "") if key == "home" or side == next(iter(data["arms"])) else ""
+                lines.append(f"    {key}: {_flow(arm[key])}   {comment}".rstrip())
     table = "table: {shape: box, size: [0.6, 1.4, 0.2], position: [0.6, 0.0, 0.1]}"
     lines += ["", "obstacles: {}   # all that stands around, with size and centre [m], such as", f"#  {table}"]
     if "srdf" in data:
@@ -274,10 +283,12 @@ def _flow(value: Any) -> str:
     return str(yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=math.inf)).strip()[1:-1]
 
 
-def _print(draft: _Draft, notes: list[str], faults: tuple[str, ...]) -> None:
+def _print(draft: _Draft, notes: list[str], faults: list[str]) -> None:
     console = Console(highlight=False, soft_wrap=True)
     for model, fits in draft.fits.items():
-        rows = ((fit.link, 1e3 * fit.radius, 1e3 * fit.length, 1e3 * fit.beyond, 100 * fit.wasted) for fit in fits[:_FITS])
+        rows = (
+            (fit.link, 1e3 * fit.radius, 1e3 * fit.length, 1e3 * fit.beyond, 100 * fit.wasted) for fit in fits[:_FITS]
+        )
         columns = ("link", "radius [mm]", "length [mm]", "beyond the mesh [mm]", "empty [%]")
         if fits:
             title = f"{model}: capsules around {len(fits)} meshes, which none sticks out of; the worst first"

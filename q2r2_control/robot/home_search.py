@@ -18,21 +18,27 @@ from q2r2_control.types import Array
 _SAMPLES, _BEST, _STEPS = 2000, 24, 150
 _INSIDE = 0.85  # of the half range that each joint may use
 _HALF = np.pi / 2  # of a joint that turns farther, as if that were half its range [rad]
-_WORK = np.array([0.62, 0.0, -0.1])  # of the tool from the shoulder, in reaches
+_WORK = np.array([0.62, 0.0, 0.05])  # of the tool from the shoulder, in reaches
 _AHEAD = np.array([0.8, 0.0, -0.6])  # where it points
 _LEAST_GAIN = 0.15  # of the weakest direction of motion, in reaches
 _BORNE = 0.7  # of the torque limits, by gravity
 _ROOM = 0.04  # more than a pair keeps; what is needed is a part of it [m]
 _NEEDED = 0.005  # [m]
+_FAULTY = 100.0  # cost of what is needed and missing
 
 
-def find_home(robot: Robot, arm: str, q: Array, kept: Array, placed: Collection[str], seed: int = 0) -> Array:
+def find_home(
+    robot: Robot, arm: str, q: Array, kept: Array, placed: Collection[str], like: Array | None = None
+) -> Array:
     """Positions of the joints of ``arm`` to start from (n,), the others being at ``q`` (nv,) [rad].
 
-    ``kept`` (pairs,) [m]; pairs with arms that are not ``placed`` yet do not count. Where ``q`` is a good one, that of
-    a twin, it is improved only. The result is the best found, which need not be free of faults.
+    ``kept`` (pairs,) [m]; pairs with arms that are not ``placed`` yet do not count. Positions ``like`` those of a twin
+    (n,) are taken as they are where they may. The result is the best found, which need not be free of faults.
     """
-    return _HomeSearch(robot, arm, q, kept, placed).best(np.random.default_rng(seed))
+    search = _HomeSearch(robot, arm, q, kept, placed)
+    if like is not None and search.cost(like) < _FAULTY:
+        return like
+    return search.best(np.random.default_rng(0))
 
 
 class _HomeSearch:
@@ -47,7 +53,7 @@ class _HomeSearch:
         self._data = robot.model.createData()
         arms_of = [[robot.roles[link_of(name)].arms for name in names] for names in pair_names(robot.collision_model)]
         self._counts = np.array([all(not arms or arms & {arm, *placed} for arms in both) for both in arms_of], bool)
-        self._reach = 1.0
+        self._reach = 1.0  # [m]
         # The first two joints turn and lift most arms: the shoulder is where the second is.
         self._shoulder = int(self._joints[min(1, len(self._joints) - 1)]) + 1
 
@@ -55,12 +61,11 @@ class _HomeSearch:
         samples = random.uniform(*self._box, (_SAMPLES, len(self._joints)))
         self._reach = float(np.quantile([np.linalg.norm(self._lever(x)) for x in samples], 0.95)) or 1.0
         samples = samples[np.argsort([self._cost_of_posture(x) for x in samples])[:_BEST]]
-        candidates = [self._q[self._joints], *samples]
-        costs = [self._cost(x) for x in candidates]
-        x, cost, step = candidates[int(np.argmin(costs))], min(costs), 0.3
+        costs = [self.cost(x) for x in samples]
+        x, cost, step = samples[int(np.argmin(costs))], min(costs), 0.3
         for _ in range(_STEPS):
             other = np.clip(x + random.normal(0.0, step, len(x)) * self._half, *self._box)
-            if (its := self._cost(other)) < cost:
+            if (its := self.cost(other)) < cost:
                 x, cost, step = other, its, step * 1.2
             else:
                 step = max(step * 0.97, 0.01)
@@ -95,7 +100,7 @@ class _HomeSearch:
             + _beyond(float(torques[self._joints].max()) - _BORNE, 1.0 - _BORNE)
         )
 
-    def _cost(self, x: Array) -> float:
+    def cost(self, x: Array) -> float:
         """With what bodies lack of their room."""
         missing = self._kept + _ROOM - self._robot.distance_values(self._at(x))
         most = float(missing[self._counts].max(initial=0.0))
@@ -104,4 +109,4 @@ class _HomeSearch:
 
 def _beyond(excess: float, most: float) -> float:
     """0 up to 0, and a jump at ``most``."""
-    return max(excess, 0.0) / most + (100.0 * (1.0 + excess) if excess > most else 0.0)
+    return max(excess, 0.0) / most + (_FAULTY * (1.0 + excess) if excess > most else 0.0)
