@@ -263,8 +263,8 @@ def _text(draft: _Draft, robot: Robot) -> str:
             if key in arm:
                 comment = comments.get(key, "") if key == "home" or side == next(iter(data["arms"])) else ""
                 lines.append(f"    {key}: {_flow(arm[key])}   {comment}".rstrip())
-    table = "table: {shape: box, size: [0.6, 1.4, 0.2], position: [0.6, 0.0, 0.1]}"
-    lines += ["", "obstacles: {}   # all that stands around, with size and centre [m], such as", f"#  {table}"]
+    cabinet = "{cabinet: {shape: box, size: [0.2, 1.4, 1.0], position: [-0.7, 0.0, 0.5]}}"
+    lines += ["", f"obstacles: {{}}   # what stands around [m], such as {cabinet}"]
     if "srdf" in data:
         lines.append(f"srdf: {_flow(data['srdf'])}   # pairs of links that cannot meet")
     if control := data.get("control"):
