@@ -88,9 +88,10 @@ def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, 
     driven = [name for name, joint in beyond.items() if mimic_of(joint) is None and joint.get("type") != "floating"]
     if not driven:
         return {}
-    ends = joint_limits(beyond[driven[0]])
-    # All are driven alike.
-    driven = [name for name in driven if np.allclose(joint_limits(beyond[name]), ends)]
+    # A cell drives all of them alike, so joints of one travel only: that of most.
+    travels = [joint_limits(beyond[name]) for name in driven]
+    ends = max(travels, key=travels.count)
+    driven = [name for name, travel in zip(driven, travels, strict=True) if travel == ends]
     text = ET.tostring(description.urdf, encoding="unicode")
     model = pin.buildModelFromXML(text)
     geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
@@ -103,8 +104,8 @@ def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, 
     speed, force = (0.0 if limit is None else float(limit.get(what, "0")) for what in ("velocity", "effort"))
     return {
         "joints": driven,
-        "open_position": round(float(np.clip(opened, -_WIDEST, _WIDEST)), 4),
-        "closed_position": round(float(np.clip(closed, -_WIDEST, _WIDEST)), 4),
+        "open_position": float(np.clip(opened, -_WIDEST, _WIDEST)),
+        "closed_position": float(np.clip(closed, -_WIDEST, _WIDEST)),
         **({"speed": min(speed, _FASTEST)} if speed > 0.0 else {}),
         **({"force": min(force, _STRONGEST)} if force > 0.0 else {}),
     }
