@@ -164,17 +164,18 @@ def _mount(draft: _Draft, distance: float | None, height: float | None, yes: boo
         apart = len(arms) == 2 and shared is None
         distance = _asked("metres between the bases of both arms", usual, yes) if apart else 0.0
     if height is None:
-        height = _asked("height of the base above the floor in metres", _stand(Robot.from_config(draft.config())), yes)
+        stand = _stand(Robot.from_config(draft.config()), has_feet=shared is not None)
+        height = _asked("height of the base above the floor in metres", stand, yes)
     for side, part in {"robot": shared}.items() if shared is not None else arms.items():
         y = 0.0 if side == "robot" or len(arms) == 1 else distance / 2 if side == "left" else -distance / 2
         part["mount"]["position"] = [0.0, round(y, 4), height]
 
 
-def _stand(robot: Robot) -> float:
+def _stand(robot: Robot, has_feet: bool) -> float:
     """Height of the root link at which feet stand on the floor, and at which no link is held up by it [m]."""
     lowest = [0.0]
     for item in robot.collision_model.geometryObjects:
-        if item.parentJoint == 0 and link_of(item.name) != FLOOR:
+        if has_feet and item.parentJoint == 0 and link_of(item.name) != FLOOR:
             item.geometry.computeLocalAABB()
             box = item.geometry.aabb_local
             reach = np.abs(item.placement.rotation[2]) @ (box.max_ - box.min_) / 2

@@ -20,7 +20,7 @@ from q2r2_control.robot.pinocchio_models import joint_origin
 _GRIPPER_JOINT = re.compile(r"gripper|finger|jaw|thumb|knuckle", re.IGNORECASE)
 # Links beside the tool. A sensor may carry the tool.
 _SIDE_BRANCH = re.compile(r"finger|jaw|thumb|knuckle|camera|antenna|imu", re.IGNORECASE)
-_SENSOR = re.compile(r"sensor", re.IGNORECASE)
+_SENSOR = re.compile(r"sensor|accelerometer|_range", re.IGNORECASE)
 # Names of tool frames, the most telling first.
 _TOOL_FRAMES = [
     re.compile(pattern, re.IGNORECASE)
