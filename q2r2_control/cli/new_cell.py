@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import pinocchio as pin
 import typer
 import yaml
 from rich.console import Console
@@ -174,7 +175,9 @@ def _mount(draft: _Draft, distance: float | None, height: float | None, yes: boo
 def _stand(robot: Robot, has_feet: bool) -> float:
     """Height of the root link at which feet stand on the floor, and at which no link is held up by it [m]."""
     lowest = [0.0]
-    for item in robot.collision_model.geometryObjects:
+    # Shapes as drawn: a capsule around a pedestal reaches far below it.
+    drawn = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+    for item in drawn.geometryObjects:
         if has_feet and item.parentJoint == 0 and link_of(item.name) != FLOOR:
             item.geometry.computeLocalAABB()
             box = item.geometry.aabb_local
