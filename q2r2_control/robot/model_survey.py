@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import coal
 import numpy as np
@@ -136,7 +137,8 @@ def _span(
     return float(np.mean([np.linalg.norm(lever - (lever @ axis) * axis) for lever in levers]))
 
 
-class CapsuleFit(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class CapsuleFit:
     """The capsule that stands for a mesh, which it holds wholly."""
 
     link: str
