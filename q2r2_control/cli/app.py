@@ -20,6 +20,7 @@ from q2r2_control.cli.doctor import doctor
 from q2r2_control.cli.fri import fri_cabinet
 from q2r2_control.cli.fri_check import fri_check
 from q2r2_control.cli.fri_mounts import fri_mounts
+from q2r2_control.cli.new_cell import new_cell
 from q2r2_control.cli.recordings import export, judge, replay, report
 from q2r2_control.cli.ros import app as ros_app
 from q2r2_control.cli.run import demo, headset_check, run
@@ -62,6 +63,7 @@ app.command(epilog="Example: q2r2 run config/dual_iiwa7.yaml --input headset --h
 app.command(epilog="Example: q2r2 replay recordings/20260101-120000-dual_iiwa7 --compare")(replay)
 app.command(epilog="Example: q2r2 judge recordings --json")(judge)
 app.command(epilog="Example: q2r2 report recordings --output report.html")(report)
+app.command("new-cell", epilog="Example: q2r2 new-cell my_cell --left arm.urdf --right arm.urdf")(new_cell)
 app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf")(check)
 app.command(epilog="Example: q2r2 doctor my_cell.yaml")(doctor)
 app.command(epilog="Example: q2r2 commission my_cell.yaml --duration 60")(commission)

@@ -20,13 +20,14 @@ from q2r2_control.robot.pinocchio_models import joint_origin
 _GRIPPER_JOINT = re.compile(r"gripper|finger|jaw|thumb|knuckle", re.IGNORECASE)
 # Links beside the tool. A sensor may carry the tool.
 _SIDE_BRANCH = re.compile(r"finger|jaw|thumb|knuckle|camera|antenna|imu", re.IGNORECASE)
-_SENSOR = re.compile(r"sensor", re.IGNORECASE)
+_SENSOR = re.compile(r"sensor|accelerometer|_range", re.IGNORECASE)
 # Names of tool frames, the most telling first.
 _TOOL_FRAMES = [
     re.compile(pattern, re.IGNORECASE)
     for pattern in (r"tcp", r"tool", r"(^|_)eef?(_|$)|end_?effector|endpoint", r"grasp|gripper_?frame", r"flange")
 ]
 _SAME_PLACE = 1e-3  # [m]
+_LEAST_JOINTS = 4  # of an arm among other chains, such as wheels and heads
 
 
 def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str) -> str:
@@ -34,25 +35,39 @@ def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str) -> st
 
     Raises :class:`ConfigError` that begins with ``key`` and names the candidates where there are several.
     """
-    link, depth = tree.root, 0
-    while True:
-        body = tree.fixed_to(link)
-        onwards = [
-            joint
-            for name, joint in tree.movable().items()
-            if joint_end(joint, "parent") in body and name not in gripper_joints and not _is_gripper_joint(tree, joint)
-        ]
+    link = tree.root
+    while onwards := _onwards(tree, link, gripper_joints):
         if len(onwards) > 1:
-            ends = {joint_end(joint, "child") for joint in onwards}
-            longest = max(len(tree.chain(end)) - depth for end in tree.joint_to if ends & set(tree.path(end)))
-            if depth >= longest > 0:
-                break  # the fingers of a hand, whatever they are called
             names = ", ".join(joint.get("name", "") for joint in onwards)
             raise ConfigError(f"{key}: the model's chain branches at {link} into {names}: name the arm's last link")
-        if not onwards:
-            break
-        link, depth = joint_end(onwards[0], "child"), depth + 1
+        link = joint_end(onwards[0], "child")
     return end_of(tree, link, key)
+
+
+def arm_ends(tree: LinkTree) -> list[str]:
+    """The link that the last joint of each chain carries which is long enough for an arm."""
+    ends, links = [], [tree.root]
+    for link in links:  # grows meanwhile
+        onwards = [joint_end(joint, "child") for joint in _onwards(tree, link, ())]
+        links += onwards
+        ends += [link] if not onwards and len(tree.chain(link)) >= _LEAST_JOINTS else []
+    return ends
+
+
+def _onwards(tree: LinkTree, link: str, gripper_joints: Collection[str]) -> list[ET.Element]:
+    """Joints that go on from what is fixed to ``link``; none where a hand begins."""
+    body, depth = tree.fixed_to(link), len(tree.chain(link))
+    onwards = [
+        joint
+        for name, joint in tree.movable().items()
+        if joint_end(joint, "parent") in body and name not in gripper_joints and not _is_gripper_joint(tree, joint)
+    ]
+    if len(onwards) > 1:
+        ends = {joint_end(joint, "child") for joint in onwards}
+        longest = max(len(tree.chain(end)) - depth for end in tree.joint_to if ends & set(tree.path(end)))
+        if depth >= longest > 0:
+            return []  # the fingers of a hand, whatever they are called
+    return onwards
 
 
 def end_of(tree: LinkTree, link: str, key: str) -> str:

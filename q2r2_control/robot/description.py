@@ -99,6 +99,8 @@ def _shipped_model(model: str) -> Path:
     except ConfigError:
         if Path(model).name == model and not Path(model).suffix:
             raise
+        if Path(model).suffix in (".xml", ".mjcf"):
+            raise ConfigError("MJCF is not read; convert it to a .urdf, as docs/my_robot.md says") from None
         kinds = f"a name in robots/, a path that ends in .urdf or .xacro, or {EXAMPLE_ROBOT_DATA}NAME"
         raise ConfigError(f"neither a name nor a model's file; allowed: {kinds}") from None
 

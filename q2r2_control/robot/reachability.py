@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from scipy.optimize import minimize
+from scipy.optimize import Bounds, minimize
 
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.pairs import distance_gradient, link_of, pair_names
@@ -25,6 +25,8 @@ Progress = Callable[[str, int, int], None]
 
 _STARTS = 8  # nearest samples of each pair that are followed downhill
 _STEPS = 30
+_FLAT = 1e-6  # relative progress in a step downhill that is too small to go on
+_BATCH, _FEW = 250, 4  # postures at a time, and how many of these before pairs are first followed downhill
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,25 +50,83 @@ def nearest_approaches(
         raise RobotError(f"samples = {samples}: allowed: 100 or more")
     lower, upper = robot.position_lower, robot.position_upper
     postures = np.random.default_rng(seed).uniform(lower, upper, (samples, robot.model.nv))
-    names = pair_names(robot.collision_model)
-    distances = np.zeros((samples, len(names)))
-    for i, q in enumerate(postures):
-        distances[i] = robot.distance_values(q)
+    search = _Search(robot, clearance)
+    for begin in range(0, samples, _BATCH):
+        search.look_at(postures[begin : begin + _BATCH])
+        if begin == _FEW * _BATCH:
+            # Most pairs that can meet do so here, and need no more samples.
+            search.go_downhill(1)
         if progress is not None:
-            progress("random postures", i + 1, samples)
+            progress("random postures", min(begin + _BATCH, samples), samples)
+    search.go_downhill(_STARTS, progress)
     nearest: dict[tuple[str, str], float] = {}
-    for p, (a, b) in enumerate(names):
-        starts = np.argsort(distances[:, p])[:_STARTS]
-        least = float(distances[starts[0], p])
-        for i in starts:
-            if least <= clearance:
-                break
-            least = min(least, _downhill(robot, p, postures[i]))
+    for (a, b), distance in zip(search.names, search.nearest.tolist(), strict=True):
         links = (link_of(a), link_of(b))
-        nearest[links] = min(nearest.get(links, np.inf), least)
-        if progress is not None:
-            progress("pairs followed downhill", p + 1, len(names))
+        nearest[links] = min(nearest.get(links, np.inf), distance)
     return sorted((PairReach(a, b, d) for (a, b), d in nearest.items()), key=lambda pair: pair.nearest)
+
+
+class _Search:
+    """The nearest postures found of each pair. A pair that has come as near as ``clearance`` [m] is looked at no more.
+
+    On a robot with thousands of pairs most are done with after a few hundred postures.
+    """
+
+    def __init__(self, robot: Robot, clearance: float) -> None:
+        self._model, self._geometry, self._clearance = robot.model, robot.collision_model.copy(), clearance
+        self._pairs = [pin.CollisionPair(pair.first, pair.second) for pair in self._geometry.collisionPairs]
+        self._bounds = Bounds(robot.position_lower, robot.position_upper)
+        self.names = pair_names(self._geometry)
+        self.nearest = np.full(len(self.names), np.inf)  # (pairs,) [m]
+        self._left = np.arange(len(self.names))
+        # Of each pair, the postures to go downhill from and their distances, nearest first.
+        self._starts = np.zeros((len(self.names), _STARTS, self._model.nv))
+        self._at = np.full((len(self.names), _STARTS), np.inf)
+        self._data, self._geometry_data = self._model.createData(), self._geometry.createData()
+
+    def look_at(self, postures: Array) -> None:
+        """Take the distances at ``postures`` (n, nv)."""
+        distances = np.empty((len(postures), len(self._left)))
+        for i, q in enumerate(postures):
+            pin.computeDistances(self._model, self._data, self._geometry, self._geometry_data, q)
+            distances[i] = [result.min_distance for result in self._geometry_data.distanceResults]
+        for p, column in zip(self._left, distances.T, strict=True):
+            found = np.concatenate([self._at[p], column])
+            best = np.argsort(found, kind="stable")[:_STARTS]
+            self._starts[p] = np.concatenate([self._starts[p], postures])[best]
+            self._at[p] = found[best]
+            self.nearest[p] = min(self.nearest[p], found[best[0]])
+        self._drop_the_near()
+
+    def go_downhill(self, starts: int, progress: Progress | None = None) -> None:
+        """Follow that many of the nearest postures of each pair downhill inside the limits."""
+        for k, p in enumerate(self._left):
+            for q in self._starts[p][np.isfinite(self._at[p])][:starts]:
+                if self.nearest[p] > self._clearance:
+                    self.nearest[p] = min(self.nearest[p], self._downhill(k, q))
+            if progress is not None:
+                progress("pairs followed downhill", k + 1, len(self._left))
+        self._drop_the_near()
+
+    def _downhill(self, k: int, q: Array) -> float:
+        """Least distance of the pair of number ``k`` among those left."""
+
+        def distance(posture: Array) -> tuple[float, Array]:
+            pin.computeJointJacobians(self._model, self._data, posture)
+            pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._geometry_data)
+            found = pin.computeDistance(self._geometry, self._geometry_data, k)
+            gradient = distance_gradient(self._model, self._data, self._geometry, self._geometry_data, k)
+            return float(found.min_distance), gradient
+
+        options = {"maxiter": _STEPS, "ftol": _FLAT}
+        return float(minimize(distance, q, method="L-BFGS-B", jac=True, bounds=self._bounds, options=options).fun)
+
+    def _drop_the_near(self) -> None:
+        self._left = np.flatnonzero(self.nearest > self._clearance)
+        self._geometry.removeAllCollisionPairs()
+        for p in self._left:
+            self._geometry.addCollisionPair(self._pairs[p])
+        self._geometry_data = self._geometry.createData()
 
 
 def srdf_of(robot: Robot, approaches: Sequence[PairReach], clearance: float, samples: int) -> str:
@@ -91,19 +151,3 @@ def srdf_text(name: str, comment: str, pairs: Iterable[tuple[str, str, str]], li
         ET.SubElement(root, "disable_collisions", link1=a, link2=b, reason=reason)
     ET.indent(root)
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
-
-
-def _downhill(robot: Robot, p: int, q: Array) -> float:
-    """Least distance of pair ``p`` going downhill from ``q`` inside the limits."""
-    data, geometry_data = robot.model.createData(), robot.collision_model.createData()
-
-    def distance(posture: Array) -> tuple[float, Array]:
-        pin.computeJointJacobians(robot.model, data, posture)
-        pin.updateGeometryPlacements(robot.model, data, robot.collision_model, geometry_data)
-        found = pin.computeDistance(robot.collision_model, geometry_data, p)
-        gradient = distance_gradient(robot.model, data, robot.collision_model, geometry_data, p)
-        return float(found.min_distance), gradient
-
-    bounds = list(zip(robot.position_lower, robot.position_upper, strict=True))
-    options = {"maxiter": _STEPS}
-    return float(minimize(distance, q, method="L-BFGS-B", jac=True, bounds=bounds, options=options).fun)

@@ -22,18 +22,22 @@ def test_its_yaml_and_its_commands_lead_from_a_urdf_to_arms_that_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    cell: Any = {}
+    doctor, new_cell, check, run = (shlex.split(block)[1:] for block in blocks_of(PAGE, "sh"))
+    assert doctor == ["doctor"]  # test_doctor.py looks at what it says
+    model = new_cell[new_cell.index("--left") + 1]
+    assert not any(model in file.read_text(encoding="utf-8") for file in SHIPPED.glob("*.yaml"))
+    written = q2r2(*new_cell)
+    assert written.exit_code == 0, written.output
+    file = Path("my_cell.yaml")
+    assert 15 <= len(file.read_text().splitlines()) <= 40
+    cell: Any = yaml.safe_load(file.read_text())
     for block in blocks_of(PAGE, "yaml"):
         cell = merged(cell, yaml.safe_load(block))
-    model = cell["arms"]["left"]["model"]
-    assert not any(model in file.read_text(encoding="utf-8") for file in SHIPPED.glob("*.yaml"))
-    Path("my_cell.yaml").write_text(yaml.safe_dump(cell))
-    doctor, check, run = (shlex.split(block)[1:] for block in blocks_of(PAGE, "sh"))
-    assert doctor == ["doctor"]  # test_doctor.py looks at what it says
+    file.write_text(yaml.safe_dump(cell))
     checked = q2r2(*check)
     assert checked.exit_code == 0, checked.output
     assert "NOTE" not in checked.stdout
     ran = q2r2(*run)
     assert ran.exit_code == 0, ran.output
     assert "at rest" in ran.stdout
-    assert os.listdir() == ["my_cell.yaml"]
+    assert sorted(os.listdir()) == ["my_cell.srdf", "my_cell.yaml"]

@@ -1,0 +1,305 @@
+"""``q2r2 new-cell``: the YAML of a cell for models that no cell has yet, with a home that passes the check."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pinocchio as pin
+import typer
+import yaml
+from rich.console import Console
+from typer import Argument, Exit, Option
+
+from q2r2_control.cli.cell_report import check_cell
+from q2r2_control.cli.output import Json, as_json_text, counting, say
+from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.robot.compose import compose
+from q2r2_control.robot.description import LinkTree, joint_limits, load_description
+from q2r2_control.robot.floor import FLOOR
+from q2r2_control.robot.home_search import find_home
+from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, lacks_of, tip_of, tips_by_side
+from q2r2_control.robot.near_pairs import spreads_of
+from q2r2_control.robot.pairs import CLEARANCE, link_of, pair_names
+from q2r2_control.robot.reachability import nearest_approaches, srdf_text
+from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.stop_torque import stop_torques
+from q2r2_control.types import Array
+from q2r2_control.viewer.tables import figure_table, print_table
+
+_FITS = 8  # capsules in the table
+_LEAST_JOINTS = 3  # of an arm
+_OFF_FLOOR = 0.03  # that each link can get at least [m]
+_BARELY = 0.003  # a pair that parts by no more than this beyond what it keeps hardly does [m]
+
+Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, package:// or example-robot-data:NAME.")]
+Tip = Annotated[str | None, Option(metavar="LINK", help="Last link of that arm, where the model leaves a doubt.")]
+Metres = Annotated[float | None, Option(min=-3, max=5, help="[m]")]
+
+
+@dataclass
+class _Draft:
+    """The cell so far, as its YAML has it, and what there is to say of it."""
+
+    file: Path
+    data: dict[str, Any]
+    faults: list[str] = field(default_factory=list)  # that the check of a cell does not look for
+    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # by model
+    always: list[tuple[str, str]] = field(default_factory=list)  # links that overlap by construction
+
+    def config(self) -> Config:
+        return parse_config(yaml.safe_dump(self.data), self.file, self.file.absolute().parent)
+
+
+def new_cell(
+    name: Annotated[str, Argument(metavar="NAME", help="Of the cell; NAME.yaml is written here.")],
+    left: Model = None,
+    right: Model = None,
+    robot: Annotated[str | None, Option(metavar="MODEL", help="Instead: one model that holds both arms.")] = None,
+    left_tip: Tip = None,
+    right_tip: Tip = None,
+    distance: Annotated[float | None, Option(min=0, max=5, help="Between the bases of both arms [m].")] = None,
+    height: Annotated[float | None, Option(min=-3, max=5, help="Of the bases above the floor [m].")] = None,
+    samples: Annotated[int, Option(help="Random postures that pairs of links are looked at in.")] = 2000,
+    yes: Annotated[bool, Option("--yes", help="Ask nothing: take what was found.")] = False,
+    json: Json = False,
+) -> None:
+    """Write the YAML of a cell for models of your own: tips, grippers, mounts, a home, pairs of links, accelerations.
+
+    Exit 1 where q2r2 check still finds faults in it, which are listed.
+    """
+    file, srdf = Path(f"{name}.yaml"), Path(f"{name}.srdf")
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        raise ConfigError(f"NAME = {name!r:.60}: allowed: letters, digits, _ and -; the file is written here")
+    for one in (file, srdf):
+        if one.exists():
+            raise ConfigError(f"{one}: exists; give another name")
+    if (robot is None) == (left is None and right is None):
+        raise ConfigError("--left, --right or --robot: allowed: a model for each arm, or one that holds both")
+    draft = _Draft(file, {"name": name})
+    tips = {"left": left_tip, "right": right_tip}
+    models = {side: model for side, model in (("left", left), ("right", right)) if model is not None}
+    _survey(draft, dict.fromkeys(tips, robot) if robot else models, tips, shared=robot)
+    _mount(draft, distance, height, yes)
+    _place(draft, yes)
+    with counting() as progress:
+        found = draft.config()
+        cell = Robot.from_config(found)
+        _limit_acceleration(draft, cell, found)
+        approaches = nearest_approaches(cell, samples, 0, CLEARANCE, progress)
+    always = dict.fromkeys([*draft.always, *((link_of(a), link_of(b)) for a, b in cell.ignored_pairs)])
+    never = [(pair.link_a, pair.link_b) for pair in approaches if pair.nearest > CLEARANCE]
+    if always or never:
+        comment = (
+            f"Found by q2r2 new-cell in {samples} random postures: these links stay more than {1e3 * CLEARANCE:g} mm "
+            "apart, or overlap by construction."
+        )
+        pairs = [*((a, b, "Always") for a, b in always), *((a, b, "Never") for a, b in never if (a, b) not in always)]
+        srdf.write_text(srdf_text(name, comment, pairs), encoding="utf-8")
+        draft.data["srdf"] = srdf.name
+    file.write_text(_text(draft, cell), encoding="utf-8")
+    result = check_cell(load_config(file))
+    faults = [*draft.faults, *result.faults]
+    if json:
+        print(as_json_text({"file": str(file), "capsules": draft.fits, "notes": result.notes, "faults": faults}))
+    else:
+        _print(draft, result.notes, faults)
+    raise Exit(1 if faults else 0)
+
+
+def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], shared: str | None) -> None:
+    """Arms, tips and grippers. Raises :class:`ConfigError` with all that the models lack."""
+    described = {}
+    for side, model in models.items():
+        try:
+            described[side] = load_description(model)
+        except Q2R2Error as error:
+            raise ConfigError(f"--{'robot' if shared else side} {model!r:.120}: {error}") from error
+    trees = {side: LinkTree(description.urdf, models[side]) for side, description in described.items()}
+    if shared is not None and not all(tips.values()):
+        tips |= tips_by_side(trees["left"], "--left-tip and --right-tip")
+    found = {side: tips[side] or tip_of(tree, f"--{side}-tip") for side, tree in trees.items()}
+    chains, lacks = {}, []
+    for side, tree in trees.items():
+        if (tip := found[side]) not in (tree.root, *tree.joint_to):
+            raise ConfigError(f"--{side}-tip {tip!r:.60}: no such link; links: {', '.join(tree.joint_to)}")
+        chains[side] = tree.chain(tip)
+        if len(chains[side]) < _LEAST_JOINTS:
+            moves = f"joints that move {tip}: {len(chains[side])}"
+            raise ConfigError(f"{models[side]!r:.120}: {moves}; allowed: an arm, of {_LEAST_JOINTS} or more")
+        limits, masses = lacks_of(described[side], tree, tip)
+        if limits:
+            lacks.append(f"{models[side]}: {', '.join(limits)}")
+        if masses:
+            draft.faults.append(
+                f"{side} arm: links that move without a mass, which simulation needs: {', '.join(masses)}"
+            )
+    if lacks:
+        raise ConfigError(f"{'; '.join(dict.fromkeys(lacks))}; to change: the <limit> of these joints in the model")
+    if shared is not None:
+        draft.data["robot"] = {"model": shared, "mount": {"position": [0.0, 0.0, 0.0]}}
+    arms = draft.data["arms"] = {}
+    for side, tree in trees.items():
+        others = [joint for other in chains if other != side and shared for joint in chains[other]]
+        names = {joint.get("name") for joint in others}
+        joints = [joint for joint in chains[side] if joint.get("name") not in names]
+        arms[side] = {} if shared else {"model": models[side], "mount": {"position": [0.0, 0.0, 0.0]}}
+        arms[side] |= {"tip": found[side], "home": [float(np.mean(joint_limits(joint))) for joint in joints]}
+        if gripper := gripper_of(described[side], tree, found[side]):
+            arms[side]["gripper"] = gripper
+    draft.fits = {model: capsule_fits(described[side]) for side, model in models.items()}
+
+
+def _mount(draft: _Draft, distance: float | None, height: float | None, yes: bool) -> None:
+    """Where the bases stand, which only the user knows."""
+    arms, shared = draft.data["arms"], draft.data.get("robot")
+    length = max(compose(draft.config()).arm_lengths().values())
+    usual = round(min(max(length, 0.3), 1.0), 1)
+    if distance is None:
+        apart = len(arms) == 2 and shared is None
+        distance = _asked("metres between the bases of both arms", usual, yes) if apart else 0.0
+    if height is None:
+        stand = _stand(Robot.from_config(draft.config()), has_feet=shared is not None)
+        height = _asked("height of the base above the floor in metres", stand, yes)
+    for side, part in {"robot": shared}.items() if shared is not None else arms.items():
+        y = 0.0 if side == "robot" or len(arms) == 1 else distance / 2 if side == "left" else -distance / 2
+        part["mount"]["position"] = [0.0, round(y, 4), height]
+
+
+def _stand(robot: Robot, has_feet: bool) -> float:
+    """Height of the root link at which feet stand on the floor, and at which no link is held up by it [m]."""
+    lowest = [0.0]
+    # Shapes as drawn: a capsule around a pedestal reaches far below it.
+    drawn = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+    for item in drawn.geometryObjects:
+        if has_feet and item.parentJoint == 0 and link_of(item.name) != FLOOR:
+            item.geometry.computeLocalAABB()
+            box = item.geometry.aabb_local
+            reach = np.abs(item.placement.rotation[2]) @ (box.max_ - box.min_) / 2
+            lowest.append(float(item.placement.act((box.max_ + box.min_) / 2)[2] - reach))
+    near = [pair for pair in pair_names(robot.collision_model) if FLOOR in map(link_of, pair)]
+    farthest = min((most for _, most in spreads_of(robot, near).values()), default=math.inf)
+    return math.ceil(100.0 * max(-min(lowest), _OFF_FLOOR - farthest)) / 100.0
+
+
+def _place(draft: _Draft, yes: bool) -> None:
+    """A home for each arm, apart from pairs that never part, which get a distance of their own or none."""
+    config = draft.config()
+    robot = Robot.from_config(config)
+    least = config.control.min_distance
+    own = [
+        pair
+        for pair in pair_names(robot.collision_model)
+        if robot.roles[link_of(pair[0])].arms & robot.roles[link_of(pair[1])].arms
+    ]
+    pairs = []
+    for links, (nearest, farthest) in spreads_of(robot, own).items():
+        if farthest < least + _BARELY and nearest > 1e-3:
+            pairs.append({"pair": list(links), "distance": math.floor(1e3 * nearest) / 1e3})
+        elif farthest < least + _BARELY:
+            draft.always.append(links)
+    if pairs:
+        draft.data["control"] = {"pairs": pairs}
+    kept = kept_distances(robot, draft.config().control).values
+    names = [(link_of(a), link_of(b)) for a, b in pair_names(robot.collision_model)]
+    kept[[names_of in draft.always for names_of in names]] = -np.inf
+    q = robot.home.copy()
+    placed: list[str] = []
+    for side, arm in robot.arms.items():
+        model = draft.data["arms"][side].get("model")
+        twins = [other for other in placed if model and draft.data["arms"][other]["model"] == model]
+        like = q[robot.arms[twins[0]].joints] if twins else None
+        found: Array = find_home(robot, side, q, kept, placed, like).round(3)
+        text = " ".join(f"{value:g}" for value in found)
+        answer = text if yes else typer.prompt(f"home of the {side} arm, found; or yours in radians", default=text)
+        try:
+            home = [float(part) for part in re.split(r"[,\s]+", answer.strip(" []"))]
+        except ValueError:
+            raise ConfigError(f"home of the {side} arm = {answer!r:.80}: allowed: {len(found)} numbers") from None
+        draft.data["arms"][side]["home"] = home
+        q[arm.joints] = home if len(home) == len(found) else found
+        placed.append(side)
+
+
+def _limit_acceleration(draft: _Draft, robot: Robot, config: Config) -> None:
+    """A limit that a full stop's torques bear, for models that have none."""
+    cap = config.control.acceleration_limit
+    if np.isfinite(robot.acceleration_limit).all():
+        return
+    share = min(stop.bearable for stop in stop_torques(robot, robot.capped_acceleration(cap)))
+    if 0.05 < share < 1.0:
+        draft.data.setdefault("control", {})["acceleration_limit"] = math.floor(10.0 * cap * share) / 10.0
+
+
+def _asked(question: str, usual: float, yes: bool) -> float:
+    return usual if yes else float(typer.prompt(question, default=usual, type=float))
+
+
+def _text(draft: _Draft, robot: Robot) -> str:
+    """The YAML with comments."""
+    data = draft.data
+    lines = [
+        "# Written by q2r2 new-cell; change what is not true. config/dual_iiwa7.yaml explains every key.",
+        f"name: {_flow(data['name'])}",
+        "",
+    ]
+    where = "# of the model's root link: x forwards, y left, z up, and rpy: [0, 0, 0] turns it; measure it [m]"
+    if "robot" in data:
+        lines += ["robot:", f"  model: {_flow(data['robot']['model'])}"]
+        lines += [f"  mount: {_flow(data['robot']['mount'])}   {where}", ""]
+    lines.append("arms:")
+    for side, arm in data["arms"].items():
+        tool = " ".join(f"{value:.2f}" for value in robot.tool_pose(robot.home, side).translation)
+        lines.append(f"  {side}:")
+        comments = {
+            "mount": where,
+            "tip": "# last link, which the operator moves",
+            "gripper": "# guessed: see it open and close [rad or m]",
+            "home": f"# found: tool at {tool} m [rad]",
+        }
+        for key in ("model", "mount", "tip", "gripper", "home"):
+            if key in arm:
+                comment = comments.get(key, "") if key == "home" or side == next(iter(data["arms"])) else ""
+                lines.append(f"    {key}: {_flow(arm[key])}   {comment}".rstrip())
+    cabinet = "{cabinet: {shape: box, size: [0.2, 1.4, 1.0], position: [-0.7, 0.0, 0.5]}}"
+    lines += ["", f"obstacles: {{}}   # what stands around [m], such as {cabinet}"]
+    if "srdf" in data:
+        lines.append(f"srdf: {_flow(data['srdf'])}   # pairs of links that cannot meet")
+    if control := data.get("control"):
+        lines += ["", "control:"]
+        if "acceleration_limit" in control:
+            why = "# the model has none; a full stop stays within its torques [rad/s^2]"
+            lines.append(f"  acceleration_limit: {control['acceleration_limit']}   {why}")
+        if "pairs" in control:
+            lines.append("  pairs:   # links that are as near as this in every posture [m]")
+            lines += [f"    - {_flow(pair)}" for pair in control["pairs"]]
+    return "\n".join(lines) + "\n"
+
+
+def _flow(value: Any) -> str:
+    """A value as YAML on one line."""
+    return str(yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=math.inf)).strip()[1:-1]
+
+
+def _print(draft: _Draft, notes: list[str], faults: list[str]) -> None:
+    console = Console(highlight=False, soft_wrap=True)
+    for model, fits in draft.fits.items():
+        rows = (
+            (fit.link, 1e3 * fit.radius, 1e3 * fit.length, 1e3 * fit.beyond, 100 * fit.wasted) for fit in fits[:_FITS]
+        )
+        columns = ("link", "radius [mm]", "length [mm]", "beyond the mesh [mm]", "empty [%]")
+        if fits:
+            title = f"{model}: capsules around {len(fits)} meshes, which none sticks out of; the worst first"
+            print_table(figure_table(title, columns, rows), console)
+    for note in notes:
+        say(f"NOTE {note}", console)
+    for fault in faults:
+        say(f"FAULT {fault}", console, "red")
+    done = "left to do: each FAULT above" if faults else "the check finds no fault"
+    say(f"{draft.file}: {done}; next: q2r2 {'check' if faults else 'run'} {draft.file}", console)

@@ -1,0 +1,112 @@
+"""A home that nobody has named: a posture to work from, found by sampling and then improved.
+
+Wanted are joints near their middles, a tool before and below the shoulder that points forwards and down, motion in all
+directions, torques to spare, and room between bodies. The last two are needed: where they are missing the cost jumps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+_SAMPLES, _BEST, _STEPS = 2000, 24, 150
+_INSIDE = 0.85  # of the half range that each joint may use
+_HALF = np.pi / 2  # of a joint that turns farther, as if that were half its range [rad]
+_WORK = np.array([0.62, 0.0, 0.05])  # of the tool from the shoulder, in reaches
+_AHEAD = np.array([0.8, 0.0, -0.6])  # where it points
+_LEAST_GAIN = 0.15  # of the weakest direction of motion, in reaches
+_BORNE = 0.7  # of the torque limits, by gravity
+_ROOM = 0.04  # more than a pair keeps; what is needed is a part of it [m]
+_NEEDED = 0.005  # [m]
+_FAULTY = 100.0  # cost of what is needed and missing
+
+
+def find_home(
+    robot: Robot, arm: str, q: Array, kept: Array, placed: Collection[str], like: Array | None = None
+) -> Array:
+    """Positions of the joints of ``arm`` to start from (n,), the others being at ``q`` (nv,) [rad].
+
+    ``kept`` (pairs,) [m]; pairs with arms that are not ``placed`` yet do not count. Positions ``like`` those of a twin
+    (n,) are taken as they are where they may. The result is the best found, which need not be free of faults.
+    """
+    search = _HomeSearch(robot, arm, q, kept, placed)
+    if like is not None and search.cost(like) < _FAULTY:
+        return like
+    return search.best(np.random.default_rng(0))
+
+
+class _HomeSearch:
+    def __init__(self, robot: Robot, arm: str, q: Array, kept: Array, placed: Collection[str]) -> None:
+        self._robot, self._q, self._kept = robot, q.copy(), kept
+        self._arm = robot.arms[arm]
+        self._joints = self._arm.joints.tolist()
+        lower, upper = robot.position_lower[self._joints], robot.position_upper[self._joints]
+        self._middle = (lower + upper) / 2
+        self._half = np.minimum((upper - lower) / 2, _HALF)
+        self._box = self._middle - _INSIDE * self._half, self._middle + _INSIDE * self._half
+        self._data = robot.model.createData()
+        arms_of = [[robot.roles[link_of(name)].arms for name in names] for names in pair_names(robot.collision_model)]
+        self._counts = np.array([all(not arms or arms & {arm, *placed} for arms in both) for both in arms_of], bool)
+        self._reach = 1.0  # [m]
+        # The first two joints turn and lift most arms: the shoulder is where the second is.
+        self._shoulder = int(self._joints[min(1, len(self._joints) - 1)]) + 1
+
+    def best(self, random: np.random.Generator) -> Array:
+        samples = random.uniform(*self._box, (_SAMPLES, len(self._joints)))
+        self._reach = float(np.quantile([np.linalg.norm(self._lever(x)) for x in samples], 0.95)) or 1.0
+        samples = samples[np.argsort([self._cost_of_posture(x) for x in samples])[:_BEST]]
+        costs = [self.cost(x) for x in samples]
+        x, cost, step = samples[int(np.argmin(costs))], min(costs), 0.3
+        for _ in range(_STEPS):
+            other = np.clip(x + random.normal(0.0, step, len(x)) * self._half, *self._box)
+            if (its := self.cost(other)) < cost:
+                x, cost, step = other, its, step * 1.2
+            else:
+                step = max(step * 0.97, 0.01)
+        return x
+
+    def _at(self, x: Array) -> Array:
+        self._q[self._joints] = x
+        return self._q
+
+    def _lever(self, x: Array) -> Array:
+        """The tool from the shoulder (3,) [m], with the model's data at ``x``."""
+        model, data = self._robot.model, self._data
+        pin.computeJointJacobians(model, data, self._at(x))
+        pin.updateFramePlacements(model, data)
+        return np.asarray(data.oMf[self._arm.frame_id].translation - data.oMi[self._shoulder].translation)
+
+    def _cost_of_posture(self, x: Array) -> float:
+        lever = self._lever(x)
+        model, data, frame = self._robot.model, self._data, self._arm.frame_id
+        tool = data.oMf[frame].translation
+        behind = (data.oMi[int(joint) + 1].translation for joint in self._joints[::-1])
+        hand = next((tool - place for place in behind if np.linalg.norm(tool - place) > 0.05 * self._reach), lever)
+        jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)[:, self._joints]
+        jacobian[:3] /= self._reach
+        gain = float(np.linalg.svd(jacobian, compute_uv=False)[min(len(x), 6) - 1])
+        torques = np.abs(pin.computeGeneralizedGravity(model, data, self._at(x))) / self._robot.torque_limit
+        return float(
+            np.mean(((x - self._middle) / self._half) ** 2)
+            + 3.0 * np.linalg.norm(lever / self._reach - _WORK)
+            + 0.5 * (1.0 - hand @ _AHEAD / max(float(np.linalg.norm(hand)), 1e-9))
+            + 5.0 * max(_LEAST_GAIN - gain, 0.0) / _LEAST_GAIN
+            + _beyond(float(torques[self._joints].max()) - _BORNE, 1.0 - _BORNE)
+        )
+
+    def cost(self, x: Array) -> float:
+        """With what bodies lack of their room."""
+        missing = self._kept + _ROOM - self._robot.distance_values(self._at(x))
+        most = float(missing[self._counts].max(initial=0.0))
+        return self._cost_of_posture(x) + _beyond(most, _ROOM - _NEEDED)
+
+
+def _beyond(excess: float, most: float) -> float:
+    """0 up to 0, and a jump at ``most``."""
+    return max(excess, 0.0) / most + (_FAULTY * (1.0 + excess) if excess > most else 0.0)

@@ -1,0 +1,177 @@
+"""Answers that a model gives by itself about arms, fingers and shapes, before a cell is written for it."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from scipy.spatial import ConvexHull
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.arm_chain import arm_ends, default_tip, end_of
+from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits
+from q2r2_control.robot.enclose import enclose_shapes
+from q2r2_control.robot.pairs import link_of, links_moved_by
+from q2r2_control.robot.urdf_parts import mimic_of
+from q2r2_control.types import Array
+
+_ARM_NAME = re.compile(r"arm|hand|grip|wrist|elbow|shoulder", re.IGNORECASE)
+_SIDE_NAMES = {side: re.compile(rf"{side}|(^|[_-]){side[0]}([_-]|$)", re.IGNORECASE) for side in ("left", "right")}
+_ON_SPHERE = 400  # points of a capsule's ends that are compared with its mesh
+_WIDEST, _STRONGEST, _FASTEST = 3.15, 500.0, 5.0  # that a cell's gripper may have
+
+
+def tip_of(tree: LinkTree, key: str) -> str:
+    """The last link of the model's arm: the one that leaves no doubt, or that of the only long chain.
+
+    Raises :class:`ConfigError` that begins with ``key`` and names the candidates.
+    """
+    try:
+        return default_tip(tree, (), key)
+    except ConfigError:
+        if len(tips := _tips(tree, key)) == 1:
+            return tips[0]
+        raise
+
+
+def tips_by_side(tree: LinkTree, key: str) -> dict[str, str]:
+    """The last link of each arm of a model that holds both. Raises :class:`ConfigError` as :func:`tip_of` does."""
+    tips = _tips(tree, key)
+    found = {
+        side: [tip for tip in tips if any(map(name.search, tree.path(tip)[-3:]))] for side, name in _SIDE_NAMES.items()
+    }
+    if any(len(ends) != 1 for ends in found.values()):
+        raise ConfigError(f"{key}: no left and right among the ends of its chains: {', '.join(tips) or 'none'}")
+    return {side: ends[0] for side, ends in found.items()}
+
+
+def _tips(tree: LinkTree, key: str) -> list[str]:
+    """Ends of long chains; of arms only, where names tell arms from legs."""
+    ends = arm_ends(tree)
+    named = [end for end in ends if any(map(_ARM_NAME.search, tree.path(end)))]
+    return [end_of(tree, end, key) for end in named or ends]
+
+
+def lacks_of(description: Description, tree: LinkTree, tip: str) -> tuple[list[str], list[str]]:
+    """Limits that joints of the arm lack, and links that move without a mass."""
+    limits, masses, links = [], [], description.urdf.findall("link")
+    for joint in tree.chain(tip):
+        limit, name = joint.find("limit"), joint.get("name", "")
+        written = {} if limit is None else limit.attrib
+        lacking = [what for what in ("velocity", "effort") if not float(written.get(what, "0")) > 0.0]
+        lower, upper = joint_limits(joint)
+        lacking += [] if lower < upper else ["lower and upper"]
+        limits += [f"{name} has no {' and no '.join(lacking)} limit"] if lacking else []
+        body = set(tree.fixed_to(child := joint_end(joint, "child")))
+        of_body = [mass for link in links if link.get("name") in body for mass in link.findall("inertial/mass")]
+        if not any(float(mass.get("value", "0")) > 0.0 for mass in of_body):
+            masses.append(child)
+    return limits, masses
+
+
+def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, Any]:
+    """Settings of a gripper beyond the arm's last joint, empty where there is none.
+
+    It is closed at the end of its travel where the fingers are nearer to the axis of the arm's last joint.
+    """
+    last = tree.chain(tip)[-1]
+    beyond = {
+        name: joint
+        for name, joint in tree.movable().items()
+        if joint is not last and joint_end(last, "child") in tree.path(joint_end(joint, "parent"))
+    }
+    driven = [name for name, joint in beyond.items() if mimic_of(joint) is None and joint.get("type") != "floating"]
+    if not driven:
+        return {}
+    # A cell drives all of them alike, so joints of one travel only: that of most.
+    travels = [joint_limits(beyond[name]) for name in driven]
+    ends = max(travels, key=travels.count)
+    driven = [name for name, travel in zip(driven, travels, strict=True) if travel == ends]
+    text = ET.tostring(description.urdf, encoding="unicode")
+    model = pin.buildModelFromXML(text)
+    geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+    enclose_shapes(geometry)
+    moved = links_moved_by(tree, driven)
+    shapes = [item for item in geometry.geometryObjects if link_of(item.name) in moved]
+    spans = [_span(model, shapes, last.get("name", ""), beyond, driven, end) for end in ends]
+    closed, opened = ends if spans[0] < spans[1] else ends[::-1]
+    limit = beyond[driven[0]].find("limit")
+    speed, force = (0.0 if limit is None else float(limit.get(what, "0")) for what in ("velocity", "effort"))
+    return {
+        "joints": driven,
+        "open_position": float(np.clip(opened, -_WIDEST, _WIDEST)),
+        "closed_position": float(np.clip(closed, -_WIDEST, _WIDEST)),
+        **({"speed": min(speed, _FASTEST)} if speed > 0.0 else {}),
+        **({"force": min(force, _STRONGEST)} if force > 0.0 else {}),
+    }
+
+
+def _span(
+    model: pin.Model,
+    shapes: Sequence[pin.GeometryObject],
+    axis_joint: str,
+    beyond: dict[str, ET.Element],
+    driven: Sequence[str],
+    end: float,
+) -> float:
+    """Mean distance of the fingers from the axis of the arm's last joint [m]."""
+    q, data = pin.neutral(model), model.createData()
+    for name, joint in beyond.items():
+        leader, by, beside = mimic_of(joint) or (name, 1.0, 0.0)
+        if leader in driven and model.joints[index := model.getJointId(name)].nq == 1:
+            q[model.joints[index].idx_q] = by * end + beside
+    pin.forwardKinematics(model, data, q)
+    last = model.getJointId(axis_joint)
+    along = pin.computeJointJacobian(model, data, q, last)[:, model.joints[last].idx_v][3:]
+    axis = data.oMi[last].rotation @ along
+    moved = {model.getJointId(name) for name in beyond}
+    places = [data.oMi[item.parentJoint].act(item.placement.translation) for item in shapes]
+    places = places or [data.oMi[joint].translation for joint in moved]
+    levers = [place - data.oMi[last].translation for place in places]
+    return float(np.mean([np.linalg.norm(lever - (lever @ axis) * axis) for lever in levers]))
+
+
+@dataclass(frozen=True, slots=True)
+class CapsuleFit:
+    """The capsule that stands for a mesh, which it holds wholly."""
+
+    link: str
+    radius: float  # [m]
+    length: float  # of its segment [m]
+    beyond: float  # how far it reaches beyond the mesh's convex hull, at least [m]
+    wasted: float  # share of its volume that the hull leaves empty
+
+
+def capsule_fits(description: Description) -> list[CapsuleFit]:
+    """How well capsules fit the collision meshes of a model, the worst first."""
+    text = ET.tostring(description.urdf, encoding="unicode")
+    model = pin.buildModelFromXML(text)
+    meshes = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+    capsules = meshes.copy()
+    enclose_shapes(capsules)
+    fits = []
+    for mesh, item in zip(meshes.geometryObjects, capsules.geometryObjects, strict=True):
+        if not isinstance(mesh.geometry, coal.BVHModelBase) or not isinstance(item.geometry, coal.Capsule):
+            continue
+        points = np.array(mesh.geometry.vertices())
+        hull = ConvexHull(points, qhull_options="QJ")  # QJ: flat ones too
+        radius, half = float(item.geometry.radius), float(item.geometry.halfLength)
+        surface = mesh.placement.actInv(item.placement)
+        on = [surface.act(point) for point in _on_capsule(radius, half)]
+        beyond = float((hull.equations[:, :3] @ np.array(on).T + hull.equations[:, 3:]).max())
+        volume = np.pi * radius**2 * (2.0 * half + 4.0 / 3.0 * radius)
+        fits.append(CapsuleFit(link_of(mesh.name), radius, 2.0 * half, beyond, 1.0 - float(hull.volume) / volume))
+    return sorted(fits, key=lambda fit: -fit.wasted)
+
+
+def _on_capsule(radius: float, half: float) -> Array:
+    """Points on the surface of a capsule along z (n, 3) [m]."""
+    points = np.random.default_rng(0).normal(size=(_ON_SPHERE, 3))
+    points *= radius / np.linalg.norm(points, axis=1, keepdims=True)
+    return points + np.outer(np.sign(points[:, 2]) * half, [0.0, 0.0, 1.0])

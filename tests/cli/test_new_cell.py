@@ -1,0 +1,88 @@
+"""q2r2 new-cell: cells for models that no shipped one names, and what it says of models that are no arms."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.config.cell import load_config
+from q2r2_control.config.resources import find_resource
+from tests.cli.command import one_object, q2r2
+
+IIWA = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
+ONE_JOINT = """<robot name="one"><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/>
+<child link="b"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "says"),
+    [
+        pytest.param(ONE_JOINT, "--left arm.urdf", "joints that move b: 1; allowed: an arm", id="a single joint"),
+        pytest.param("hello", "--left arm.urdf", "not XML", id="no robot"),
+        pytest.param("<mujoco/>", "--left arm.xml", "MJCF is not read; convert it", id="MJCF"),
+        pytest.param(
+            re.sub(r' (velocity|effort)="[^"]*"', "", IIWA),
+            "--left arm.urdf",
+            "A1 has no velocity and no effort limit, A2 has no velocity",
+            id="no limits, all of them named",
+        ),
+        pytest.param(IIWA, "--left missing.urdf", "missing.urdf: no such file", id="no file"),
+        pytest.param(IIWA, "--left arm.urdf --left-tip elbow", "--left-tip 'elbow': no such link", id="no such tip"),
+        pytest.param(IIWA, "--left arm.urdf --robot arm.urdf", "--left, --right or --robot", id="two ways at once"),
+        pytest.param(IIWA, "--robot arm.urdf", "no left and right among the ends", id="one arm that should be two"),
+        pytest.param("", "--left example-robot-data:go2", "branches at base", id="a robot of legs"),
+    ],
+)
+def test_a_model_that_makes_no_cell_gets_one_line_and_no_file(text: str, arguments: str, says: str) -> None:
+    Path("arm.urdf").write_text(text)
+    Path("arm.xml").write_text(text)
+    result = q2r2("new-cell", "cell", *arguments.split(), "--yes")
+    assert result.exit_code == 2
+    assert says in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not Path("cell.yaml").exists()
+
+
+def test_a_file_that_is_there_is_kept() -> None:
+    Path("cell.yaml").write_text("mine")
+    assert "cell.yaml: exists" in q2r2("new-cell", "cell", "--left", "iiwa7", "--yes").stderr
+    assert Path("cell.yaml").read_text() == "mine"
+
+
+def test_links_without_masses_are_left_to_do() -> None:
+    Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
+    result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
+    assert result.exit_code == 1
+    assert "FAULT left arm: links that move without a mass, which simulation needs: link_1, link_2" in result.stdout
+    assert "left to do" in result.stdout
+
+
+def test_answers_are_those_of_the_user(tmp_path: Path) -> None:
+    typed = "0.9\n0.1\n0 0.4 0 -1.6 0 1.1 0\n\n"
+    models = ("--left", "iiwa7", "--right", "iiwa7")
+    result = q2r2("new-cell", "cell", *models, "--samples", "100", typed=typed)
+    assert result.exit_code == 0, result.output
+    left, right = load_config(tmp_path / "cell.yaml").arms.values()
+    assert (left.mount.position, right.mount.position) == ((0.0, 0.45, 0.1), (0.0, -0.45, 0.1))
+    assert left.home == right.home == (0.0, 0.4, 0.0, -1.6, 0.0, 1.1, 0.0), "a twin's home is taken"
+
+
+def test_both_arms_of_one_model_are_found_with_their_fingers(tmp_path: Path) -> None:
+    made = one_object(
+        q2r2("new-cell", "cell", "--robot", "example-robot-data:baxter", "--yes", "--samples", "100", "--json").stdout
+    )
+    assert made["faults"] == []
+    fits = [fit["wasted"] for fit in made["capsules"]["example-robot-data:baxter"]]
+    assert fits == sorted(fits, reverse=True)
+    cell = load_config(tmp_path / "cell.yaml")
+    assert cell.robot is not None
+    assert cell.robot.mount.position[2] == pytest.approx(0.93, abs=0.02), "its feet stand on the floor"
+    for arm in cell.arms.values():
+        assert arm.gripper.open_position > arm.gripper.closed_position == 0.0
