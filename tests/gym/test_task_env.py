@@ -169,7 +169,7 @@ def test_pictures_are_observed_and_rendered_without_a_window() -> None:
         "env = gymnasium.make('q2r2_control.gym:q2r2/Stack-v0', pictures=True, render_mode='rgb_array')\n"
         "seen, _ = env.reset(seed=0)\n"
         "assert env.observation_space.contains(seen)\n"
-        "print((seen['observation.images.front'] == env.render()).all(), env.render().std() > 10)\n"
+        "print((seen['observation.images.above'] == env.render()).all(), env.render().std() > 10)\n"
     )
     environment = {"MUJOCO_GL": "egl", **os.environ}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
