@@ -59,7 +59,7 @@ def test_what_a_kernel_uses_is_covered_by_the_name_of_the_cache(source: Path) ->
         f"q2r2_control.{name}"
         for name in (
             *("types", "errors", "config.control", "control.geometry.finger_openings"),
-            *("robot.robot", "robot.pairs", "robot.kept_distances", "robot.turning_fingers"),
+            *("robot.robot", "robot.pairs", "robot.kept_distances", "robot.obstacle_bodies", "robot.turning_fingers"),
         )
     }
     imported = {
