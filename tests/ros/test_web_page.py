@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra web brings it")
 
+from tests.ros.cell import changed_cell
 from tests.ros.conftest import need_ros
 from tests.ros.processes import CONFIG, Processes, RosProcess, States, wait_until
 from tests.ros.test_processes import external_cell
@@ -27,7 +28,7 @@ from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
 from tests.support.page_client import PageClient
 from tests.support.processes import children
 
-CAMERA = "cameras: {front: {topic: /front/compressed}}  "
+CAMERA = {"front": {"topic": "/front/compressed"}}
 PATIENCE = 120.0  # for a whole set on a busy machine [s]
 
 
@@ -39,8 +40,16 @@ def url_of(process: RosProcess) -> str:
 def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
     node: Any, processes: Processes, tmp_path: Path
 ) -> None:
-    (cell := tmp_path / "cell.yaml").write_text(Path(CONFIG).read_text().replace("cameras: {} ", CAMERA))
-    command = ("ros", "up", str(cell), "--web", "--web-port", "0", "--record", str(tmp_path))
+    command = (
+        "ros",
+        "up",
+        changed_cell(tmp_path, cameras=CAMERA),
+        "--web",
+        "--web-port",
+        "0",
+        "--record",
+        str(tmp_path),
+    )
     up = processes.start(sys.executable, "-u", "-m", "q2r2_control", *command, name="up")
     with PageClient(url_of(up)) as page:
         page.wait_until(lambda: page.row("state") == ["engaged", "engaged"])
