@@ -61,6 +61,12 @@ class RunningRecorder:
             return [message.payload for messages in recording.messages((HAND,)) for message in messages]
         return []
 
+    def discarded(self) -> list[bool]:
+        """Of each episode in the file while it is being written."""
+        with suppress(RecordingError):  # in the middle of a write
+            return [span.discarded for span in read_spans(open_recording(self.folder))]
+        return []
+
     def end(self) -> Path:
         assert self.process.interrupt(60.0) == 0
         return self.folder
@@ -133,6 +139,7 @@ def test_hand_and_services_tell_of_episodes_to_each_other(node: Any, processes: 
     recorder.wait("episode_open", True)
     assert call(node, "/recorder/discard").success
     felt(rig, EPISODE_DISCARDED)
+    wait_until(lambda: recorder.discarded()[-1:] == [True], "the discard is in the file")
     kept, discarded = read_spans(open_recording(recorder.end()))
     assert (kept.discarded, discarded.discarded) == (False, True)
 
