@@ -40,16 +40,10 @@ def url_of(process: RosProcess) -> str:
 def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
     node: Any, processes: Processes, tmp_path: Path
 ) -> None:
-    command = (
-        "ros",
-        "up",
-        changed_cell(tmp_path, cameras=CAMERA),
-        "--web",
-        "--web-port",
-        "0",
-        "--record",
-        str(tmp_path),
-    )
+    cell = changed_cell(
+        tmp_path, cameras=CAMERA, teleop={"gate": {"timeout": 2.0}}
+    )  # no node is lost beside other load
+    command = ("ros", "up", cell, "--web", "--web-port", "0", "--record", str(tmp_path))
     up = processes.start(sys.executable, "-u", "-m", "q2r2_control", *command, name="up")
     with PageClient(url_of(up)) as page:
         page.wait_until(lambda: page.row("state") == ["engaged", "engaged"])

@@ -45,6 +45,7 @@ from q2r2_control.ros.watching.set_listener import node_views
 from q2r2_control.ros.watching.set_view import arm_views
 from q2r2_control.summary.tick import RunStart, Tick
 from q2r2_control.teleop.arm_states import HOLDING
+from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.types import SIDES, ArmTarget, Command, CommandMode, Reference, RobotState, StepReport
 from q2r2_control.viewer.web.exchange import Frame, PageRequest
 from q2r2_control.viewer.web.page import Page
@@ -83,6 +84,7 @@ class WebPage(BaseNode):
         self._row: Any = None  # newest tick; None: nothing to be shown was heard yet
         self._start: RunStart | None = None
         self._events: list[Event] = []
+        self._marks = EpisodeMarks()
         self._number, self._shown, self._slowest = -1, -1, 0.0  # newest tick, and the last one of a frame
         self._states, self._notice = NodeStates(self), ""
         self._trigger_clients: dict[str, Any] = {}
@@ -118,9 +120,10 @@ class WebPage(BaseNode):
     def _look(self) -> None:
         """Find the nodes, and their services before a button needs them."""
         self._states.look()
-        for name in {name for request in self._requests for name in self._services_of(request)} - set(
-            self._trigger_clients
-        ):
+        names = {name for request in self._requests for name in self._services_of(request)}
+        if PageRequest.RECORD in self._requests:
+            names |= {f"{RECORDER}/start", f"{RECORDER}/stop"}
+        for name in names - self._trigger_clients.keys():
             self._trigger_clients[name] = self.create_client(Trigger, name)
 
     def _services_of(self, request: PageRequest) -> list[str]:
@@ -132,7 +135,9 @@ class WebPage(BaseNode):
             case PageRequest.RESET:
                 return [f"{_CONTROLLER}/reset", *(f"{arm}/reset" for arm in arms)]
             case PageRequest.RECORD:
-                return [f"{RECORDER}/{'stop' if states.get(RECORDER, {}).get('episode_open') else 'start'}"]
+                # The node's state comes twice a second, later than what the page shows of an episode.
+                told = self._marks.open if self._marks.any else states.get(RECORDER, {}).get("episode_open")
+                return [f"{RECORDER}/{'stop' if told else 'start'}"]
             case PageRequest.MARK:
                 return [f"{RECORDER}/mark"]
         return [f"{_CONTROLLER}/{request}"]
@@ -161,7 +166,9 @@ class WebPage(BaseNode):
         except _UNREADABLE as error:
             self.drop("one of those that the page shows", f"{error!r:.60}")
             return
-        self._events += [event for events in chunk.events().values() for event in events]
+        for event in (event for events in chunk.events().values() for event in events):
+            self._events.append(event)
+            self._marks.follow(event.kind)
         if len(chunk.rows):
             self._row, self._number = chunk.rows[-1], int(chunk.numbers[-1])
             self._slowest = max(self._slowest, float(chunk.rows["compute_time"].max()))
