@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.config.moving_obstacle import MovingObstacle
+from q2r2_control import CartesianController, MovingObstacle, Robot, load_config
 
 config = load_config("config/dual_iiwa7.yaml")
 robot = Robot.from_config(config)

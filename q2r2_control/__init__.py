@@ -13,6 +13,7 @@ from q2r2_control._lazy import lazy_exports
 if TYPE_CHECKING:  # "as" says to type checkers that a name is public
     from q2r2_control.config.cell import load_config as load_config
     from q2r2_control.config.control import ControllerSettings as ControllerSettings
+    from q2r2_control.config.moving_obstacle import MovingObstacle as MovingObstacle
     from q2r2_control.control.controller import CartesianController as CartesianController
     from q2r2_control.errors import ConfigError as ConfigError
     from q2r2_control.errors import Q2R2Error as Q2R2Error
@@ -45,6 +46,7 @@ _MODULES = {
     "HandSample": "types",
     "HapticFeedback": "types",
     "Input": "inputs.base",
+    "MovingObstacle": "config.moving_obstacle",
     "Observation": "types",
     "Pipeline": "pipeline.pipeline",
     "Plant": "plants.base",
