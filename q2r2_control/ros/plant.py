@@ -34,7 +34,7 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
 _WAIT = 5.0  # for joint states and for whatever takes the commands [s]
-_QUIET = 0.3  # nobody else commands the arms for so long before [s]
+_QUIET = 1.0  # nobody else commands the arms for so long before, in which all others are discovered [s]
 _AWAY = 0.02  # from the measured joints: to a receiver that is new such a command is a jump [rad]
 
 

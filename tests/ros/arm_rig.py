@@ -97,6 +97,11 @@ class ArmRig:
             self.hand = offset(start, tuple(share * np.array(by)), share * turn)
             time.sleep(PERIOD / 2)
 
+    def let_the_hand_rest(self) -> None:
+        """Send a hand that stands still until the controller's filter, slowest at rest, has come to it."""
+        self.sent = 0
+        self.wait(lambda: self.sent > 2.0 / PERIOD, "the hand rests")
+
     def newest(self) -> pin.SE3:
         return target_of(self, -1)
 

@@ -48,6 +48,7 @@ def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_jump(rig:
     rig.pause()
     held = rig.wait_for_rest()
     rig.move((-0.3, 0.3, -0.2), turn=-0.8)
+    rig.let_the_hand_rest()
     assert_same(rig.newest(), held, 1e-12)
     rig.engage()
     before = len(rig.targets)
