@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.datasets import LeRobotDataset, add_features
-from lerobot.policies import make_pre_post_processors
+from lerobot.datasets.dataset_tools import add_features
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.factory import make_pre_post_processors
 
 from q2r2_control import Pipeline, Robot, load_config
 from q2r2_control.config.cell import Config
@@ -192,6 +193,7 @@ def main() -> None:
     for name, value in (("episodes", 50), ("steps", 3000), ("seeds", 20)):
         parser.add_argument(f"--{name}", type=int, default=value)
     given = parser.parse_args()
+    torch.set_num_threads(1)  # the policy is too small for more
     cell = coarse(load_config("config/dual_iiwa7.yaml"))
     record(cell, given.episodes, given.folder / "recordings")
     dataset = export(given.folder / "recordings", given.folder / "dataset")
