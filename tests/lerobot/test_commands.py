@@ -270,7 +270,8 @@ def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: P
         for key, answer in ((SPACE, "autonomous -> paused"), (TAB, "paused -> correcting"), (b"", hands.READY)):
             terminal.press(key)
             terminal.wait(answer)
-        for key, answer in ((TAB, "correcting -> paused"), (SPACE, "paused -> autonomous")):
+        given_back = "the policy has the arms"
+        for key, answer in ((TAB, "correcting -> paused"), (SPACE, "paused -> autonomous"), (b"", given_back)):
             terminal.press(key)
             terminal.wait(answer)
     terminal.press(ESCAPE)

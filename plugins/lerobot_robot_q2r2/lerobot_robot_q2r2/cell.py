@@ -5,6 +5,7 @@ Its features have the names and order of ``q2r2 export lerobot``, so a policy th
 
 from __future__ import annotations
 
+import logging
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ from q2r2_control.robot.robot import Robot as CellRobot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
 
+_logger = logging.getLogger(__name__)
 _BEGINS = 60.0  # how long the kernels of a new version take to compile at most, and more [s]
 
 
@@ -160,10 +162,11 @@ class Q2R2Cell(Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """An action that is not the hands' own is the policy's, which takes the arms from them."""
         self._check()
+        given_back = self.hands.open and not self._asked
+        if given_back:
+            self.hands.open = False
+            self.pipeline.give_back()
         if not self._asked:
-            if self.hands.open:
-                self.hands.open = False
-                self.pipeline.give_back()
             given = {name.removesuffix(POSITION): value for name, value in action.items()}
             self._policy.send([float(given[name]) for name in self._names], names=self._names)
         self._asked = False
@@ -173,6 +176,8 @@ class Q2R2Cell(Robot):
                 self.pipeline.tick_until(self._start + self._steps / self.config.rate)
             except Q2R2Error as error:
                 self._fault = error
+        if given_back:
+            _logger.info("the policy has the arms, no longer the hands")
         return action
 
     _asked = False  # whether the next action is the hands'
