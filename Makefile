@@ -91,6 +91,8 @@ $(LEROBOT)/.installed: pyproject.toml setup.py $(wildcard plugins/*/pyproject.to
 	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' 'lerobot$(LEROBOT_VERSION)' \
 		'pytest>=8' 'hypothesis>=6.100' $(LEROBOT_PLUGINS)
 	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # its loader needs torch, which is there
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[ros]' && $(LEROBOT)/bin/q2r2 ros build-interfaces \
+		|| echo 'No ROS 2 packages for this machine: going on without.'
 	touch $@
 
 lint: setup

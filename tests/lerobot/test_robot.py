@@ -6,6 +6,7 @@ Run by ``make test-lerobot``, in an environment of its own.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -29,9 +30,11 @@ from tests.export.files import record_step
 from tests.lerobot.test_commands import write_cell
 from tests.plants.fri.conftest import free_ports
 from tests.recording.runs import ROOT
+from tests.ros.processes import EXECUTABLES, as_arguments, environment_of
 
 register_third_party_plugins()
 MOVED, NEAR, TRIES = 0.02, 0.004, 1800  # [rad], [rad] or of an opening, of a thirtieth of a second each at least
+ROS_RATE = 200  # [Hz]
 
 
 def made(folder: Path, **options: Any) -> Robot:
@@ -79,14 +82,30 @@ def test_arms_behind_cabinets_follow_actions_as_simulated_ones_do(tmp_path: Path
     file.write_text(yaml.safe_dump(data))
     robot = made(tmp_path, cell=str(file))
     assert list(robot.observation_features) == list(made(tmp_path).observation_features)
-    cabinets = subprocess.Popen([sys.executable, "-m", "q2r2_control", "fri-cabinet", str(file)], cwd=ROOT)
+    assert_follows_behind(robot, "q2r2_control", "fri-cabinet", str(file))
+
+
+def test_arms_behind_ros_follow_actions_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rclpy", reason="ROS 2 cannot be installed for this Python")
+    coordinator = pytest.importorskip("domain_coordinator")
+    cell = write_cell(tmp_path, {"loop_rate_hz: 1000.0": f"loop_rate_hz: {ROS_RATE}.0"})
+    node = as_arguments(f"config:={cell}", f"rate:={ROS_RATE}")
+    with coordinator.domain_id() as domain:
+        for name, value in environment_of(domain, tmp_path).items():
+            monkeypatch.setenv(name, value)
+        assert_follows_behind(made(tmp_path, cell=str(cell), plant="ros"), EXECUTABLES, "mujoco_robot", *node)
+
+
+def assert_follows_behind(robot: Robot, module: str, *arguments: str) -> None:
+    """Arms that another program has, which is started here and takes its time."""
+    program = subprocess.Popen([sys.executable, "-m", module, *arguments], cwd=ROOT, env=os.environ)
     try:
-        for _ in range(TRIES):  # until the cabinets are there
+        for _ in range(TRIES):
             with suppress(DeviceNotConnectedError):
                 robot.connect()
                 break
         assert_follows(robot)
     finally:
         robot.disconnect()
-        cabinets.terminate()
-        assert cabinets.wait() == 0
+        program.terminate()
+        assert program.wait() == 0
