@@ -217,10 +217,10 @@ class Teleop:
         elif self._arms[arm].state not in HOLDING:
             self._stop({arm: reason}, now)
 
-    def press_to_engage(self) -> None:
-        """As if both hands had pressed what engages their arms; where a dead man does, nothing happens."""
-        for arm in self._arms.values():
-            arm.press_to_engage()
+    def press_to_engage(self, arm: str | None = None) -> None:
+        """As if the hand of an arm, or both, had pressed what engages it; where a dead man does, nothing happens."""
+        for name in self._arms if arm is None else (arm,):
+            self._arms[name].press_to_engage()
 
     def give_back(self, now: float) -> None:
         """No hand drives an arm or is waited for: the policy may go on, until a hand is heard of again."""

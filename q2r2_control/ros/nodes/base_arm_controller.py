@@ -127,6 +127,7 @@ class BaseArmController(BaseNode):
         self.gripper = GripperClient(self, values.gripper_topic, values.gripper, grants)
         self._live = LiveArmParameters(self, values.teleop, values.guard, self._change)
         self.add_post_set_parameters_callback(self._share_parameters)
+        self.create_service(Trigger, "~/engage", self._on_engage)
         self.create_service(Trigger, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.loop.connect(self)
@@ -274,6 +275,14 @@ class BaseArmController(BaseNode):
             changed = [one for one in shared if node.get_parameter(one.name).value != one.value]
             if changed:
                 node.set_parameters_atomically(changed)
+
+    def _on_engage(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Press for the hand, with all that a press needs and does; an arm that follows already is left alone."""
+        response.success = not self.engaged
+        response.message = f"{self.arm_name} follows its hand already" if self.engaged else f"{self.arm_name}: pressed"
+        if not self.engaged:
+            self.loop.teleop.press_to_engage(self.arm_name)
+        return response
 
     def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.loop.teleop.hold(self.now, Reason(ReasonKind.PAUSE_SERVICE), self.arm_name)

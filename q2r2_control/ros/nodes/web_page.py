@@ -1,6 +1,6 @@
 """``web_page``: shows in browsers what the nodes of a cell publish. It listens as the recorder does, to no command.
 
-Its buttons call services that anybody may call, and none of them engages an arm.
+Its buttons call services that anybody may call.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class WebPage(BaseNode):
         self._number, self._shown, self._slowest = -1, -1, 0.0  # newest tick, and the last one of a frame
         self._states, self._notice = NodeStates(self), ""
         self._trigger_clients: dict[str, Any] = {}
-        requests = [PageRequest.STOP, PageRequest.RESET, PageRequest.PAUSE, PageRequest.HOME]
+        requests = [PageRequest.STOP, PageRequest.RESET, PageRequest.ENGAGE, PageRequest.PAUSE, PageRequest.HOME]
         self._requests = (*requests, *((PageRequest.RECORD, PageRequest.MARK) if recorded else ()))
         url = self._page.open(self._robot, self._cell, config.name, self._requests)
         shown = self._ticks.topics - {hand_pose(hand) for hand in SIDES}
@@ -130,6 +130,8 @@ class WebPage(BaseNode):
         states = {name: state for name, (state, _) in self._states.newest.items()}
         arms = [name for name, state in states.items() if "arm" in state]
         match request:
+            case PageRequest.ENGAGE:
+                return [f"{arm}/engage" for arm in arms]
             case PageRequest.PAUSE:  # the way home too
                 return [f"{_CONTROLLER}/hold", *(f"{arm}/pause" for arm in arms)]
             case PageRequest.RESET:
