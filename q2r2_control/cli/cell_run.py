@@ -232,9 +232,10 @@ def _run(
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         if isinstance(pipeline.plant, MujocoPlant):
-            for name, most, show in _lookers(pipeline, page):
+            for name, most, show, watched in _lookers(pipeline, page):
                 camera = pipeline.config.simulated_cameras[name]
-                pipeline.listeners.append(stack.enter_context(LivePictures(pipeline.plant, name, camera, most, show)))
+                pictures = LivePictures(pipeline.plant, name, camera, most, show, watched)
+                pipeline.listeners.append(stack.enter_context(pictures))
         if options.real_time and (refused := stack.enter_context(real_time())):
             say(refused, console, "yellow")
         if recorder is not None:
@@ -256,10 +257,14 @@ def _run(
         return pipeline.run(options.duration, realtime=not options.fast)
 
 
-def _lookers(pipeline: Pipeline, page: PageView | None) -> Iterator[tuple[str, float, Callable[[bytes], object]]]:
-    """Cameras whose pictures are shown, how many a second at most, and where."""
-    names = list(pipeline.config.simulated_cameras)
-    if isinstance(pipeline.input, DisplayInput):
-        yield from ((name, _IN_HEADSET, pipeline.input.show_picture) for name in names[:1])
+def _lookers(
+    pipeline: Pipeline, page: PageView | None
+) -> Iterator[tuple[str, float, Callable[[bytes], object], Callable[[], bool]]]:
+    """Cameras whose pictures are shown, how many a second at most, where, and whether somebody looks."""
+    names, source = list(pipeline.config.simulated_cameras), pipeline.input
+    if isinstance(source, DisplayInput):
+        yield from ((name, _IN_HEADSET, source.show_picture, lambda: source.connected) for name in names[:1])
     if page is not None:
-        yield from ((name, _ON_PAGE / len(names), partial(page.show_picture, name)) for name in names)
+        yield from (
+            (name, _ON_PAGE / len(names), partial(page.show_picture, name), lambda: page.watched) for name in names
+        )

@@ -48,10 +48,16 @@ class LivePictures(AbstractContextManager["LivePictures"]):
     """A listener of one run, as a context around it. Where it fails, a line says so and the run goes on."""
 
     def __init__(
-        self, plant: MujocoPlant, name: str, camera: CameraConfig, most: float, show: Callable[[bytes], object]
+        self,
+        plant: MujocoPlant,
+        name: str,
+        camera: CameraConfig,
+        most: float,
+        show: Callable[[bytes], object],
+        watched: Callable[[], bool],
     ) -> None:
-        """``show`` gets ``most`` pictures a second, in a thread of its own. Raises :class:`OSError`."""
-        self._plant, self._period = plant, 1.0 / min(camera.rate, most)
+        """``show`` gets ``most`` pictures a second while ``watched``, in its own thread. Raises :class:`OSError`."""
+        self._plant, self._period, self._watched = plant, 1.0 / min(camera.rate, most), watched
         self._due = 0.0  # by the clock on the wall [s]
 
         def pass_on(jpeg: bytes) -> None:
@@ -64,7 +70,7 @@ class LivePictures(AbstractContextManager["LivePictures"]):
 
     def __call__(self, tick: Tick) -> None:
         now = time.monotonic()
-        if now >= self._due and self._process.send(self._plant.observed_qpos.tobytes(), 1):
+        if now >= self._due and self._watched() and self._process.send(self._plant.observed_qpos.tobytes(), 1):
             self._due = now + self._period
         elif not self._process.alive and not self._told:
             self._told = True

@@ -19,9 +19,13 @@ def test_a_picture_of_the_cell_comes_and_a_lost_process_is_one_line(caplog: pyte
     loop = Pipeline.from_config(cell().model_copy(update={"cameras": {"front": camera}}), plant="mujoco")
     assert isinstance(loop.plant, MujocoPlant)
     got: list[bytes] = []
-    with LivePictures(loop.plant, "front", camera, 30.0, got.append) as pictures:
+    watched = False
+    with LivePictures(loop.plant, "front", camera, 30.0, got.append, lambda: watched) as pictures:
         loop.begin()
         tick = loop.tick()
+        pictures(tick)
+        assert pictures._due == 0.0, "nobody looks, so nothing was asked for"
+        watched = True
 
         def taken() -> bool:
             pictures(tick)

@@ -63,6 +63,12 @@ class Ready(NamedTuple):
     url: str
 
 
+class PageWatched(NamedTuple):
+    """Browsers came or went."""
+
+    pages: int  # that are open now
+
+
 class PageHand(NamedTuple):
     """A hand that a page moves; the numbers are a browser's, and nothing has checked them."""
 

@@ -13,7 +13,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.robot.robot import Robot
-from q2r2_control.viewer.web.exchange import Frame, PageRequest, PageSetting, PageSetup, Ready
+from q2r2_control.viewer.web.exchange import Frame, PageRequest, PageSetting, PageSetup, PageWatched, Ready
 
 _READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
 _PATIENCE = 2.0  # for it to end [s]
@@ -32,6 +32,7 @@ class Page:
         self._host, self._port, self._on_request = host, port, on_answer
         self._ready = Flag()
         self.url: str | None = None  # None: not begun
+        self.watched = False  # by any browser
         self._pictures: dict[str, bytes] = {}  # by camera, that wait for a frame
         try:
             # Room for one frame: a newer one is better than a queue.
@@ -106,6 +107,8 @@ class Page:
         if isinstance(answer, Ready):
             self.url = answer.url
             self._ready.set()
+        elif isinstance(answer, PageWatched):
+            self.watched = answer.pages > 0
         else:
             self._on_request(answer)
 

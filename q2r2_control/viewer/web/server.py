@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from threading import Condition, Lock, Thread
 from typing import Any
 
@@ -13,7 +14,7 @@ import viser
 
 from q2r2_control.viewer.web.door import Door
 from q2r2_control.viewer.web.driving import Driving
-from q2r2_control.viewer.web.exchange import Frame, PageLost, PageRequest, PageSetup, Ready
+from q2r2_control.viewer.web.exchange import Frame, PageLost, PageRequest, PageSetup, PageWatched, Ready
 from q2r2_control.viewer.web.panel import Panel
 from q2r2_control.viewer.web.scene import CellScene
 
@@ -75,6 +76,14 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
     door, newest = Door(setup.host, setup.port), _Newest()
     with door.guards():
         server = viser.ViserServer(host=setup.host, port=door.port, verbose=False)
+    open_pages: set[int] = set()
+
+    async def count(client: viser.ClientHandle, change: Callable[[int], None]) -> None:
+        change(client.client_id)
+        answer(PageWatched(len(open_pages)))
+
+    server.on_client_connect(partial(count, change=open_pages.add))
+    server.on_client_disconnect(partial(count, change=open_pages.discard))
     scene = CellScene(server, setup)
     limited = LimitedAnswers(answer)
     driving = Driving(server, setup, limited) if setup.driven else None
