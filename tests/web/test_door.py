@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from http.client import HTTPConnection
+from urllib.parse import urlsplit
 
 import pytest
 import viser
 from websockets.exceptions import InvalidStatus
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from q2r2_control.errors import ConfigError
@@ -32,12 +33,21 @@ def status(door: Door, path: str = "/", **headers: str) -> int:
     return connection.getresponse().status
 
 
-def admitted(door: Door, origin: str, cookie: str = "") -> bool:
-    """Whether a page of ``origin`` may connect."""
+def token_of(door: Door) -> str:
+    """Empty on loopback."""
+    return urlsplit(door.url).path.strip("/")
+
+
+def connected(door: Door, origin: str, token: str) -> ClientConnection:
+    """As viser's page connects, to the path that it came from."""
     protocol = [Subprotocol(f"viser-v{viser.__version__}")]
-    url = f"ws://127.0.0.1:{door.port}"
+    return connect(f"ws://127.0.0.1:{door.port}/{token}", origin=Origin(origin), subprotocols=protocol)
+
+
+def admitted(door: Door, origin: str, token: str) -> bool:
+    """Whether a page of ``origin`` may connect."""
     try:
-        connect(url, origin=Origin(origin), subprotocols=protocol, additional_headers={"Cookie": cookie}).close()
+        connected(door, origin, token).close()
     except InvalidStatus as error:
         return error.response.status_code != 403
     return True
@@ -45,29 +55,23 @@ def admitted(door: Door, origin: str, cookie: str = "") -> bool:
 
 def test_only_the_own_page_connects(door: Door) -> None:
     own = f"http://127.0.0.1:{door.port}"
-    _, _, query = door.url.partition("?token=")
-    cookie = f"q2r2_page={query}"
-    assert admitted(door, own, cookie)
-    assert not admitted(door, "http://example.org", cookie)
-    assert not admitted(door, "null", cookie)
-    if query:
-        assert not admitted(door, own)
-        assert not admitted(door, own, "q2r2_page=guess")
-        assert (status(door), status(door, f"/?token={query}")) == (403, 200)
+    token = token_of(door)
+    assert admitted(door, own, token)
+    assert not admitted(door, "http://example.org", token)
+    assert not admitted(door, "null", token)
+    if token:
+        assert not admitted(door, own, "")
+        assert not admitted(door, own, "guess")
+        assert (status(door), status(door, f"/{token}")) == (403, 200)
     else:
         assert status(door) == 200
         assert status(door, Host=f"example.org:{door.port}") == 403  # a name that was made to lead here
 
 
 def test_no_more_pages_than_a_few_connect(door: Door) -> None:
-    _, _, query = door.url.partition("?token=")
-    protocol = [Subprotocol(f"viser-v{viser.__version__}")]
-    origin, headers = Origin(f"http://127.0.0.1:{door.port}"), {"Cookie": f"q2r2_page={query}"}
-    pages = [
-        connect(f"ws://127.0.0.1:{door.port}", origin=origin, subprotocols=protocol, additional_headers=headers)
-        for _ in range(12)
-    ]
-    assert not admitted(door, origin, headers["Cookie"])
+    origin, token = f"http://127.0.0.1:{door.port}", token_of(door)
+    pages = [connected(door, origin, token) for _ in range(12)]
+    assert not admitted(door, origin, token)
     for page in pages:
         page.close()
 

@@ -70,16 +70,22 @@ def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open
     assert run.end()["at_rest"]
 
 
-def test_a_replay_has_a_time_line(open_page: Open, start: Start, tmp_path: Path) -> None:
+def test_a_replay_has_a_time_line_and_a_page_with_a_token_comes_back_when_it_is_loaded_anew(
+    open_page: Open, start: Start, tmp_path: Path
+) -> None:
     loop = pipeline()
     with Recorder(tmp_path, "circle", waits=True) as recorder:
         recorder.begin(About.of(loop, False, {}), loop.robot)
         loop.listeners.append(recorder)
         loop.run(3.0, realtime=False)
     assert recorder.file is not None
-    run = start("q2r2_control", "replay", str(recorder.file), "--json", "--web", "--web-port", "0")
-    page = open_page(run.url)
+    address = ("--web-port", "0", "--web-host", "0.0.0.0")
+    run = start("q2r2_control", "replay", str(recorder.file), "--json", "--web", *address)
+    url = urlsplit(run.url)
+    page = open_page(url._replace(netloc=f"127.0.0.1:{url.port}").geturl())
     wait_for(page, "3.0 s")  # the end, where it stands still
+    page.reload()
+    wait_for(page, "3.0 s")
     number = page.locator("input:visible").first
 
     def stands_at(seconds: str) -> bool:

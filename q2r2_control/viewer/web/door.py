@@ -6,7 +6,6 @@ import http
 import secrets
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
 import websockets.asyncio.server
@@ -16,17 +15,17 @@ from websockets.http11 import Request, Response
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.page_door import PageDoor, text_response
 
-_COOKIE = "q2r2_page"
 _MOST_CLIENTS = 12
 _LONGEST_MESSAGE = 1 << 20  # from a browser [bytes]
 
 
 class Door(PageDoor):
-    """The page gets the token back as a cookie, with which its own connection comes."""
+    """The token is the path of the page's URL, since that is where viser's page connects to."""
 
     def __init__(self, host: str, port: int) -> None:
         """Raises :class:`ConfigError` where the address cannot be bound."""
         super().__init__(host, port, "--web", secrets.token_urlsafe(16))
+        self.url = self.url.replace("?token=", "")
         self._clients = 0
 
     def refusal(self, request: Request, *, with_token: bool = True) -> str | None:
@@ -36,12 +35,8 @@ class Door(PageDoor):
         return reason
 
     def _is_known(self, request: Request) -> bool:
-        try:
-            morsel = SimpleCookie(request.headers.get("Cookie", "")).get(_COOKIE)
-        except CookieError:
-            morsel = None
-        known = morsel is not None and secrets.compare_digest(morsel.value.encode(), str(self.token).encode())
-        return known or super()._is_known(request)
+        path, _, _ = request.path.partition("?")
+        return secrets.compare_digest(path.strip("/").encode(), str(self.token).encode())
 
     @contextmanager
     def guards(self) -> Iterator[None]:
@@ -59,11 +54,10 @@ class Door(PageDoor):
             def checked(connection: ServerConnection, request: Request) -> Response | None:
                 if (reason := self.refusal(request)) is not None:
                     return text_response(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
+                request.path = "/"  # the page is all that viser serves
                 response: Response | None = answer(connection, request)
                 if response is not None:
                     response.headers["X-Frame-Options"] = "DENY"  # a page around this one could steal a click
-                    if self.token is not None:
-                        response.headers["Set-Cookie"] = f"{_COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
                 return response
 
             async def counted(connection: ServerConnection) -> None:
