@@ -45,7 +45,7 @@ test-ros-slow: setup
 test-soak: setup
 	$(BIN)/python -m pytest --ignore tests/lerobot --ignore tests/web -m soak
 
-# The page of a run in a real browser. Debian's Chromium, since the browsers of playwright are downloads of its own.
+# The page of a run in a real browser: a Chrome that is there, or Debian's Chromium, since the browsers of playwright are downloads of its own.
 # Meta's emulator of headsets comes from npm, under a licence of its own; it is no part of this project.
 IWER := $(VENV)/iwer
 
@@ -58,8 +58,8 @@ $(IWER)/package:
 	cd $(IWER) && npm pack --silent iwer@2.5.0 && tar xzf iwer-2.5.0.tgz
 
 chromium:
-	@command -v /usr/bin/chromium > /dev/null || { apt-get update -qq && apt-get install -y -qq chromium; } > /dev/null \
-		|| { echo 'the page needs /usr/bin/chromium: apt-get install chromium'; exit 1; }
+	@command -v chromium > /dev/null || command -v google-chrome > /dev/null || { apt-get update -qq && apt-get install -y -qq chromium; } > /dev/null \
+		|| { echo 'the page needs a browser: apt-get install chromium'; exit 1; }
 
 $(VENV)/.installed-web: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[web]' 'playwright>=1.49'
