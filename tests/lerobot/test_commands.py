@@ -267,11 +267,10 @@ def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: P
     terminal = Terminal(command("lerobot-rollout", seen, *options), seen)
     terminal.wait("continuous recording started")
     for _ in range(TAKEOVERS):
-        for key, answer in ((SPACE, "autonomous -> paused"), (TAB, "paused -> correcting"), (b"", hands.READY)):
-            terminal.press(key)
-            terminal.wait(answer)
-        given_back = "the policy has the arms"
-        for key, answer in ((TAB, "correcting -> paused"), (SPACE, "paused -> autonomous"), (b"", given_back)):
+        for key, answer in (
+            *((SPACE, "autonomous -> paused"), (TAB, "paused -> correcting"), (b"", hands.READY)),
+            *((TAB, "correcting -> paused"), (b"", "the policy has the arms"), (SPACE, "paused -> autonomous")),
+        ):
             terminal.press(key)
             terminal.wait(answer)
     terminal.press(ESCAPE)
