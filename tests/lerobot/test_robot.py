@@ -34,7 +34,7 @@ from tests.ros.processes import EXECUTABLES, as_arguments, environment_of
 
 register_third_party_plugins()
 MOVED, NEAR, TRIES = 0.02, 0.004, 1800  # [rad], [rad] or of an opening, of a thirtieth of a second each at least
-ROS_RATE = 200  # [Hz]
+ROS_RATE = 200.0  # [Hz]
 
 
 def made(folder: Path, **options: Any) -> Robot:
@@ -88,7 +88,7 @@ def test_arms_behind_cabinets_follow_actions_as_simulated_ones_do(tmp_path: Path
 def test_arms_behind_ros_follow_actions_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rclpy", reason="ROS 2 cannot be installed for this Python")
     coordinator = pytest.importorskip("domain_coordinator")
-    cell = write_cell(tmp_path, {"loop_rate_hz: 1000.0": f"loop_rate_hz: {ROS_RATE}.0"})
+    cell = write_cell(tmp_path, {"loop_rate_hz: 1000.0": f"loop_rate_hz: {ROS_RATE}"})
     node = as_arguments(f"config:={cell}", f"rate:={ROS_RATE}")
     with coordinator.domain_id() as domain:
         for name, value in environment_of(domain, tmp_path).items():
@@ -100,12 +100,13 @@ def assert_follows_behind(robot: Robot, module: str, *arguments: str) -> None:
     """Arms that another program has, which is started here and takes its time."""
     program = subprocess.Popen([sys.executable, "-m", module, *arguments], cwd=ROOT, env=os.environ)
     try:
-        for _ in range(TRIES):
+        while not robot.is_connected:
+            assert program.poll() is None
             with suppress(DeviceNotConnectedError):
                 robot.connect()
-                break
         assert_follows(robot)
     finally:
-        robot.disconnect()
+        with suppress(DeviceNotConnectedError):
+            robot.disconnect()
         program.terminate()
         assert program.wait() == 0
