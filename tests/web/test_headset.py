@@ -158,10 +158,9 @@ def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: A
 def test_the_first_headset_drives_and_another_is_told_so(enter: Any, start: Start, open_page: Open) -> None:
     run = start(*RUN)
     page = enter(run.url, "ar")
-    press(page, LOWER)
-    wait_for(page, "engaged")
     other = open_page(run.url, "")
     wait_until(lambda: "drives" in other.inner_text("#link"))
+    press(page, LOWER)
     wait_for(page, "engaged")
     run.interrupt()
     assert run.end()["at_rest"]
