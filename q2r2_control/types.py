@@ -143,6 +143,7 @@ class Command:
     tau: Array  # (nv,) [Nm]; of torque mode
     grippers: dict[str, float]  # arm -> opening, 0 closed .. 1 fully open
     deceleration: Array | None = None  # (nv,) of the certified stop from q and v [rad/s^2]; None: none is known
+    gravity_only: bool = False  # tau bears the arms at an unsure posture: a plant that measures by itself brakes them
 
 
 @dataclass(frozen=True, slots=True)

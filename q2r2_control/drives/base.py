@@ -169,7 +169,7 @@ class TorqueDrive(Drive):
 
     **Without a state to trust.** A spring about a posture that was measured long ago could push anywhere. A plant with
     position servos (``has_servos``), which measure by themselves, follows the reference by those. Otherwise the command
-    is gravity's torque at the newest measured posture: many drivers repeat the last command for ever.
+    is gravity's torque at the newest measured posture, and says so: many drivers repeat the last command for ever.
     """
 
     mode = CommandMode.TORQUE
@@ -205,7 +205,7 @@ class TorqueDrive(Drive):
             if self._has_servos:
                 return position_command(reference, grippers)
             gravity = self.impedance.gravity(self._posture(state))
-            return Command(self.mode, reference.q, reference.v, gravity, grippers)
+            return Command(self.mode, reference.q, reference.v, gravity, grippers, gravity_only=True)
         wall = self.wall.update(state.q, state.v)
         torque = self.impedance.step(reference, state, dt, wall.tau)
         self.report = DriveReport(torque.report, wall)
@@ -223,7 +223,7 @@ class TorqueDrive(Drive):
         if self._has_servos:
             return holding_command(state.q if np.isfinite(state.q).all() else self._reference, grippers)
         q = self._posture(state)
-        return Command(self.mode, q, np.zeros_like(q), self.impedance.gravity(q), grippers)
+        return Command(self.mode, q, np.zeros_like(q), self.impedance.gravity(q), grippers, gravity_only=True)
 
     def _posture(self, state: RobotState) -> Array:
         """The newest measured posture that was a posture."""

@@ -85,6 +85,7 @@ def test_without_a_state_to_trust_the_torque_is_that_of_gravity(robot: Robot) ->
     command = drive.command(reference, state, {}, DT, trusted=False)
     assert command.mode is CommandMode.TORQUE
     np.testing.assert_allclose(command.tau, gravity, atol=1e-9)
+    assert command.gravity_only
     lost = drive.command(reference, replace(state, q=np.full_like(state.q, np.nan)), {}, DT, trusted=False)
     np.testing.assert_allclose(lost.tau, gravity, atol=1e-9)
     last = drive.last_command(state, {})

@@ -87,7 +87,8 @@ class FriCell:
             if gripper is not None and opening is not None:
                 its.outputs = {gripper.output: opening >= 0.5 if gripper.digital else float(opening)}
             if is_torque:
-                its.tau, its.damping = joints_of(overlay[joints]), joints_of(damping[joints])
+                its.tau = None if command.gravity_only else joints_of(overlay[joints])
+                its.damping = joints_of(damping[joints])
         return sent
 
     def fault(self) -> Reason | None:

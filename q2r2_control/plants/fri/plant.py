@@ -94,8 +94,9 @@ class FriPlant:
         lines: list[Line] = []
         for arm, its in self._cabinets.items():
             source = f"cabinet {its.address} on port {its.port}"
-            limit = self._robot.torque_limit[self._robot.arms[arm].joints]
-            session = ArmSession(arm, source, its.version, _KINDS[self._mode], limit)
+            joints = self._robot.arms[arm].joints
+            limits = self._robot.torque_limit[joints], self._robot.velocity_limit[joints]
+            session = ArmSession(arm, source, its.version, _KINDS[self._mode], *limits)
             try:
                 lines.append(Line(session, its.address, open_socket(its.address, its.port).detach()))
             except OSError as error:

@@ -47,13 +47,22 @@ class ArmSession:
         version: int | None = None,
         wanted: CommandKind = CommandKind.POSITION,
         torque_limit: Array | None = None,
+        velocity_limit: Array | None = None,
     ) -> None:
-        """``source``: the cabinet in words; ``version`` of FRI, None: either; ``torque_limit`` (n,): of overlays."""
+        """``source``: the cabinet in words; ``version`` of FRI, None: either.
+
+        ``torque_limit`` (n,): of overlays; ``velocity_limit`` (n,): none is measured beyond. A position that jumps once
+        lets the damping then push a joint back by the way of one period at that speed, and no further.
+        """
         self.state, self._version = SessionState(arm, source, wanted), version
         self.path = ReferencePath(0.0, np.zeros(JOINTS))
-        self._tau, self._tau_came = np.zeros(JOINTS), -math.inf  # overlay [Nm], and when it was decided on [s]
+        # Overlay [Nm], or None: the damping; and when that was decided on [s].
+        self._tau: Array | None = None
+        self._tau_came = -math.inf
         self._damping = np.zeros(JOINTS)  # that brakes where no overlay comes [Nm s/rad]
-        self._torque_limit = np.full(JOINTS, math.inf) if torque_limit is None else torque_limit
+        none = np.full(JOINTS, math.inf)
+        self._torque_limit = none if torque_limit is None else torque_limit
+        self._velocity_limit = joints_of(none if velocity_limit is None else velocity_limit)
         self._outputs: dict[str, IoValue] = {}
         self._answers = 0
         self._times: AnswerTimes | None = None
@@ -83,8 +92,9 @@ class ArmSession:
             self.path.extend(command.end, there, speed, deceleration, command.start)
             state.rest = joints_of(self.path.rest)
         self._outputs |= command.outputs
-        if command.tau is not None and command.damping is not None:
-            self._tau, self._damping, self._tau_came = np.array(command.tau), np.array(command.damping), command.now
+        if command.damping is not None:
+            self._tau = None if command.tau is None else np.array(command.tau)
+            self._damping, self._tau_came = np.array(command.damping), command.now
 
     def _begins(self, command: ArmCommand) -> bool:
         """Whether the reference was at rest a tick ago, where the arm is."""
@@ -148,9 +158,11 @@ class ArmSession:
             self._clock.update(now, passed * message.period)
         if passed > 0 and before is not None:
             state.lost += passed - 1
-            share = 0.5 / (passed * message.period)
-            moved = zip(state.velocity, message.q, before.q, strict=True)
-            state.velocity = tuple(0.5 * v + share * (now_at - was_at) for v, now_at, was_at in moved)
+            time = passed * message.period
+            moved = zip(state.velocity, message.q, before.q, self._velocity_limit, strict=True)
+            state.velocity = tuple(
+                0.5 * (v + min(max((now_at - was_at) / time, -limit), limit)) for v, now_at, was_at, limit in moved
+            )
         elif passed == 0 and before is not None and message.counter != before.counter:
             state.velocity = (0.0,) * JOINTS
         state.newest, state.arrival = message, now
@@ -197,11 +209,9 @@ class ArmSession:
         age = now - self._tau_came
         if self.state.is_too_slow or (message.session is Session.COMMANDING_ACTIVE and age > _TORQUE_GONE):
             return None
-        wanted = (
-            self._tau
-            if self.state.following and age <= _TORQUE_LASTS
-            else -self._damping * np.array(self.state.velocity)
-        )
+        wanted = self._tau
+        if wanted is None or not self.state.following or age > _TORQUE_LASTS:
+            wanted = -self._damping * np.array(self.state.velocity)
         tau = joints_of(np.clip(wanted, -self._torque_limit, self._torque_limit))
         return FriCommand(self._answers, message.counter, message.ipo_q or message.q, tau, self._outputs)
 

@@ -102,5 +102,5 @@ class ArmCommand:
     v: Joints  # [rad/s]
     deceleration: Joints  # of the stop [rad/s^2]
     outputs: dict[str, IoValue] = field(default_factory=dict)  # of the cabinet, by name; those that are set
-    tau: Joints | None = None  # overlay [Nm]; None: positions
-    damping: Joints | None = None  # that brakes where no overlay comes [Nm s/rad]
+    tau: Joints | None = None  # overlay [Nm]; None: positions, or the damping brakes
+    damping: Joints | None = None  # that brakes where no overlay comes [Nm s/rad]; None: positions

@@ -15,8 +15,8 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.answers import ReferencePath
 from q2r2_control.plants.fri.cabinet import Trip
-from q2r2_control.plants.fri.cabinet_server import SimulatedArms
-from q2r2_control.plants.fri.wire import Session
+from q2r2_control.plants.fri.cabinet_server import SimulatedArm, SimulatedArms
+from q2r2_control.plants.fri.wire import Joints, Session, joints_of
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
@@ -162,6 +162,42 @@ def test_arms_follow_as_well_as_without_cabinets(config: Config, mode: CommandMo
     for arm in SIDES:
         assert summary.arms[arm].engaged_s > 3.0
         assert error(summary, arm) < 1.3 * error(direct, arm)
+
+
+class ShiftedArm(SimulatedArm):
+    """Its joints are measured ``shift`` [rad] away from where they are."""
+
+    shift = 0.0
+
+    @property
+    def q(self) -> Joints:
+        return joints_of(np.add(super().q, self.shift))
+
+
+def test_arms_with_a_state_that_is_not_believed_are_braked_at_every_tick(config: Config, robot: Robot) -> None:
+    arms = SimulatedArms(robot, config)
+    arms.arms["left"] = left = ShiftedArm(arms, "left")
+    pipeline = make_loop(config, mode=CommandMode.TORQUE, jitter=0.0004, arms=arms)
+    plant = started(pipeline)
+    brakings: list[list[float]] = []
+
+    def look(tick: Tick) -> None:
+        fastest, believed = float(np.abs(arms.state.v).max()), pipeline.supervisor.measured
+        if not believed and brakings:
+            brakings[-1].append(fastest)
+        elif fastest > 0.5 and (not brakings or brakings[-1]):
+            brakings.append([])
+            left.shift = 0.3 - left.shift
+
+    pipeline.listeners.append(look)
+    pipeline.run(5.0, realtime=False)
+    assert trips(plant) == []
+    assert len(brakings) > 4
+    for speeds in brakings[:-1]:
+        assert max(speeds) < speeds[0] + 0.2, "a jump of what is measured is hardly a push"
+        later = np.array(speeds[20:])  # after periods of both cabinets, and of the filter of the jump
+        assert (np.diff(later) < 0.01 * later[:-1] + 1e-3).all(), "no arm gets faster"
+        assert later[-1] < 0.02, "and both rest before they are believed again"
 
 
 def test_the_reference_brakes_as_the_path_does(robot: Robot) -> None:

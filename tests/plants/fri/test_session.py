@@ -108,6 +108,25 @@ def test_a_torque_without_a_newer_one_becomes_one_that_brakes_and_ends_with_the_
     assert torques == [1.0] * 4 + [-4.0] * 16 + [None] * 5
 
 
+def test_commands_without_an_overlay_brake_as_long_as_they_come() -> None:
+    cabinet = torque_cabinet()
+    active = begin_torques(cabinet)
+    for q in np.linspace(Q, np.add(Q, 0.1), 101)[1:]:  # at 0.2 rad/s
+        now, still = cabinet.now, (0.0,) * 7
+        cabinet.session.follow(ArmCommand(now, now, now + 0.005, Q, still, (1.0,) * 7, {}, None, (20.0,) * 7))
+        answer = cabinet.ask(replace(active, q=tuple(q.tolist())))
+        assert answer is not None
+        assert answer.tau == pytest.approx((-4.0,) * 7)
+
+
+def test_a_measured_jump_is_no_velocity_beyond_the_limit() -> None:
+    limits = np.full(7, 100.0), np.full(7, 2.0)
+    cabinet = Cabinet(ArmSession("left", "cabinet", None, CommandKind.TORQUE, *limits))
+    for q in (Q, np.add(Q, 0.5), np.add(Q, -0.5)):
+        cabinet.ask(replace(MONITORING, q=tuple(np.asarray(q).tolist())))
+    assert cabinet.session.state.velocity == pytest.approx((0.5 * (0.5 * 2.0 - 2.0),) * 7)
+
+
 def test_no_torque_is_beyond_the_limit() -> None:
     cabinet = torque_cabinet(limit=0.5)
     active = begin_torques(cabinet)

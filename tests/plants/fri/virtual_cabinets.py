@@ -65,8 +65,11 @@ class VirtualCabinets:
         self._mode = mode
 
     def reset(self, q: Array | None = None) -> None:
-        limits = {arm: self._robot.torque_limit[self._robot.arms[arm].joints] for arm in self.cabinets}
-        self.lines = {arm: ArmSession(arm, "cabinet", None, _KINDS[self._mode], limit) for arm, limit in limits.items()}
+        self.lines = {}
+        for arm in self.cabinets:
+            joints = self._robot.arms[arm].joints
+            limits = self._robot.torque_limit[joints], self._robot.velocity_limit[joints]
+            self.lines[arm] = ArmSession(arm, "cabinet", None, _KINDS[self._mode], *limits)
         self.cell = FriCell(
             self._robot, [copy(session.state) for session in self.lines.values()], self._period, self._grippers
         )
