@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,9 +23,20 @@ from tests.pipeline.loops import FreezingLoop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 ACCELERATION = 4.0  # of the reference [rad/s^2]
-# After the braking time, in which arms that get torques settle [s], and what counts as rest: a held joint may creep.
-_ALLOWANCE = {CommandMode.POSITION: 0.05, CommandMode.TORQUE: 0.4}
-_REST = {CommandMode.POSITION: 1e-3, CommandMode.TORQUE: 0.02}  # [rad/s]
+_ALLOWANCE, _STILL = 0.05, 1e-3  # after the braking time the reference rests [s], [rad/s]
+
+
+class Rest(NamedTuple):
+    """The promise for measured arms. Times are after the reference rests [s], speeds of the fastest joint [rad/s]."""
+
+    slow_after: float
+    slow: float
+    settled_after: float
+    settled: float
+
+
+# Torques settle arms on their springs. The slowest has a time constant of 0.4 s; a held joint may creep.
+_RESTS = {CommandMode.POSITION: Rest(0.0, _STILL, 0.0, _STILL), CommandMode.TORQUE: Rest(0.35, 0.15, 1.95, 0.02)}
 _ENDS = ("pendant", "back at once", "safety stop", "loop freezes", "computer freezes", "garbage")
 _ASKED = {Trip.STOPPED, Trip.SAFETY}
 _MUTATED = 250  # datagrams with wrong bytes before a session ends so
@@ -103,7 +114,8 @@ class Soak:
             self._late.add("loop freezes")
         self._moving_since: float | None = None
         self._lasts = 0.3
-        self._rest_by, self._start_at = math.inf, 0.0
+        self._rest = _RESTS[self.pipeline.drive.mode]
+        self._braked_by, self._slow_by, self._start_at = math.inf, math.inf, 0.0
         self._seen, self._end = dict.fromkeys(SIDES, 0), "start"
         self.pipeline.listeners.append(self.look)
 
@@ -121,25 +133,42 @@ class Soak:
             self._seen[arm] = len(cabinet.trips)
         speed = float(np.abs(tick.reference.v).max())
         self.moved = max(self.moved, speed)
-        if now > self._rest_by:
-            self._rest_by = math.inf
-            for arm, heard in self.plant.heard.items() if not any(tick.engaged.values()) else ():
-                way = np.diff(heard[-2:], axis=0)  # of the newest period only: before that it may still brake
-                fastest = np.abs(way[np.isfinite(way)]).max(initial=0.0) / cabinets[arm].settings.period
-                if fastest > _REST[self.pipeline.drive.mode]:
-                    moves = f"{arm} moves at {fastest:.4f} rad/s after the time to brake"
-                    self.faults.append(f"{now:.3f} s, {self._end}: {moves}")
-            self._start_at = now + float(self.random.uniform(0.05, 0.3))
+        held = not any(tick.engaged.values())
+        if now > self._braked_by:
+            self._braked_by = math.inf
+            if held and speed > _STILL:
+                self.faults.append(f"{now:.3f} s, {self._end}: the reference moves at {speed:.4f} rad/s")
+        if now > self._slow_by:
+            self._look_at_rest(now, held)
         if now >= self._start_at:
             self._start_at, self._moving_since = math.inf, None
             for cabinet in cabinets.values():
                 cabinet.safety_stop(Safety.NORMAL)
                 cabinet.start_overlay()
-        if all(tick.engaged.values()) and self._moving_since is None and self._rest_by == math.inf:
+        if all(tick.engaged.values()) and self._moving_since is None and self._slow_by == math.inf:
             self._moving_since, self._lasts = now, float(self.random.uniform(0.2, 1.2))
         if self._moving_since is not None and now - self._moving_since >= self._lasts:
             self._moving_since = None
             self._end_session(now, tick)
+
+    def _look_at_rest(self, now: float, held: bool) -> None:
+        """Wait until the arms have settled, or move faster than they may by now."""
+        rest, passed = self._rest, now - self._slow_by + self._rest.slow_after
+        settled = passed >= rest.settled_after
+        allowed = rest.settled if settled else rest.slow
+        speeds = {arm: self._fastest(arm) for arm in self.plant.cabinets} if held else {}
+        for arm, fastest in speeds.items():
+            if fastest > allowed:
+                moves = f"{arm} moves at {fastest:.4f} rad/s, {passed:.2f} s after the reference rests"
+                self.faults.append(f"{now:.3f} s, {self._end}: {moves}")
+        if settled or not rest.settled < max(speeds.values(), default=0.0) <= rest.slow:
+            self._slow_by = math.inf
+            self._start_at = now + float(self.random.uniform(0.05, 0.3))
+
+    def _fastest(self, arm: str) -> float:
+        """Of the joints [rad/s], in the newest period of a cabinet that is commanded."""
+        way = np.diff(self.plant.heard[arm][-2:], axis=0)
+        return float(np.abs(way[np.isfinite(way)]).max(initial=0.0)) / self.plant.cabinets[arm].settings.period
 
     def _end_session(self, now: float, tick: Tick) -> None:
         self.ended += 1
@@ -165,7 +194,8 @@ class Soak:
             self._send_garbage()
             cabinet.stop()
         braking = np.abs(tick.reference.v) / self.pipeline.controller.stop_deceleration
-        self._rest_by = now + float(braking.max()) + _ALLOWANCE[self.pipeline.drive.mode]
+        self._braked_by = now + float(braking.max()) + _ALLOWANCE
+        self._slow_by = self._braked_by + self._rest.slow_after
 
     def _send_garbage(self) -> None:
         """Some bytes of each datagram are wrong, or missing."""
