@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
+from q2r2_control.errors import ConfigError, shown
 from q2r2_control.events import Reason
 
 POSE_FIELDS = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -131,6 +132,10 @@ class CommandMode(StrEnum):
     POSITION = "position"
     VELOCITY = "velocity"
     TORQUE = "torque"
+
+    @classmethod
+    def _missing_(cls, value: object) -> CommandMode:
+        raise ConfigError(f"mode = {shown(value)}: allowed: {', '.join(cls)}")
 
 
 @dataclass(slots=True)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,14 @@ import pytest
 
 from q2r2_control import (
     CartesianController,
+    Command,
+    CommandMode,
     ConfigError,
     ControllerSettings,
+    HandSample,
+    MovingObstacle,
     Pipeline,
+    PolicyInput,
     Q2R2Error,
     RelativeMotion,
     Robot,
@@ -22,6 +28,8 @@ from q2r2_control import (
 )
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import RobotError
+from q2r2_control.plants.base import Plant, make_plant
+from q2r2_control.types import QUEST_CONTROLS
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 WRONG: Any = None  # kinds that a type checker would not let pass
@@ -29,6 +37,7 @@ FIVE: Any = 5
 NO_SETTINGS: Any = {}
 A_CELL: Any = CONFIG
 TEXT: Any = "long"
+SETTINGS = tuple(ControllerSettings.model_fields)
 ARMS = "arms: left, right"
 NUMBERS = "expected 14 finite numbers"
 POSE = "allowed: a pin.SE3 with a proper rotation"
@@ -188,3 +197,154 @@ def test_relative_motion_takes_finite_poses_only(pose: Any) -> None:
         said = one_line(Q2R2Error, call)
         assert said.startswith(f"RelativeMotion.{where} = ")
         assert said.endswith(allowed)
+
+
+KINDS: tuple[Any, ...] = (
+    *(None, "foo", 5, -1.0, math.nan, b"x", [], (1, 2), {}, {5: 3}, object(), int, np.zeros(3), np.array(["a"])),
+    pin.SE3.Identity(),
+)
+A_BALL: dict[str, Any] = {"shape": "sphere", "size": (0.1,), "speed": 1.0}
+BALL = MovingObstacle(**A_BALL)
+COMMAND = Command(CommandMode.POSITION, np.zeros(14), np.zeros(14), np.zeros(14), {})
+SAMPLE = HandSample("left", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), 0.0)
+TOOL = {"left": "left_tool_frame"}
+RELATIVE = ("stance", "scale", "rotation_frame", "rotation_scale", "axes", "axis_scales")
+PARTS = ("config", "robot", "input", "plant", "mode")
+STAMPS = ("pose_stamp", "inputs", "inputs_stamp", "fault")
+COMMANDED = ("mode", "q", "v", "grippers")
+MEASURED = ("q", "v", "tau_external", "stamp")
+
+
+class Device:
+    """An input and a plant of a program's own, which may return what they should not."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.controls, self.connected, self.modes = QUEST_CONTROLS, True, plant.modes
+        self.reset, self.apply, self.advance = plant.reset, plant.apply, plant.advance
+        self.gripper_openings = plant.gripper_openings
+        self.start = self.close = lambda: None
+        self.send_haptic = lambda feedback: None
+        self.returned: dict[str, Any] = {}
+        self.poll = lambda now: self.returned.get("samples", [])
+        self.state = lambda: self.returned.get("state", plant.state())
+
+
+class Program:
+    """One right argument of each kind."""
+
+    def __init__(self, robot: Robot, controller: CartesianController) -> None:
+        self.robot, self.controller, self.policy = robot, controller, PolicyInput()
+        self.plant = make_plant("kinematic", robot, CONFIG)
+        self.state, self.device = self.plant.state(), Device(self.plant)
+        self.pipeline, self.unused = self.pipeline_of(), self.pipeline_of()
+
+    def run(self, **returned: Any) -> None:
+        self.device.returned = returned
+        self.pipeline.run(0.005, realtime=False)
+
+    def pipeline_of(self, **parts: Any) -> Pipeline:
+        right: dict[str, Any] = {"config": CONFIG, "robot": self.robot, "input": self.device, "plant": self.device}
+        return Pipeline(**right | parts)
+
+
+Call = Callable[[Program, Any], object]
+
+
+def each(what: str, names: Iterable[str], call: Callable[[Program, str, Any], object]) -> dict[str, Call]:
+    """Calls with one of these keywords each."""
+
+    def of(name: str) -> Call:
+        return lambda own, x: call(own, name, x)
+
+    return {f"{what} {name}": of(name) for name in names}
+
+
+CALLS: dict[str, Call] = {
+    "load_config": lambda own, x: load_config(x),
+    **each("ControllerSettings", SETTINGS, lambda own, by, x: ControllerSettings(**{by: x})),
+    "ControllerSettings.model_validate": lambda own, x: ControllerSettings.model_validate(x),
+    "ControllerSettings.model_validate_json": lambda own, x: ControllerSettings.model_validate_json(x),
+    "ControllerSettings.changed": lambda own, x: CONFIG.control.changed(x),
+    **each("MovingObstacle", A_BALL, lambda own, by, x: MovingObstacle(**A_BALL | {by: x})),
+    "Robot.from_config": lambda own, x: Robot.from_config(x),
+    "Robot.from_urdf": lambda own, x: Robot.from_urdf(x, TOOL),
+    "Robot.from_urdf arms": lambda own, x: Robot.from_urdf(own.robot.urdf, x),
+    "Robot.from_urdf srdf": lambda own, x: Robot.from_urdf(own.robot.urdf, TOOL, FIVE if x is None else x),
+    "Robot.from_urdf home": lambda own, x: Robot.from_urdf(own.robot.urdf, TOOL, home={"left_A1": x}),
+    "Robot.arm": lambda own, x: own.robot.arm(x),
+    "Robot.tool_pose": lambda own, x: own.robot.tool_pose(own.robot.home, x),
+    "Robot.distances": lambda own, x: own.robot.distances(x),
+    "Robot.closest_points": lambda own, x: own.robot.closest_points(own.robot.home, x),
+    "Robot.capped_acceleration": lambda own, x: own.robot.capped_acceleration(x),
+    "CartesianController": lambda own, x: CartesianController(x),
+    "CartesianController settings": lambda own, x: CartesianController(own.robot, FIVE if x is None else x),
+    "CartesianController solver": lambda own, x: CartesianController(own.robot, solver=FIVE if x is None else x),
+    "CartesianController.reset": lambda own, x: own.controller.reset(own.robot.home, FIVE if x is None else x),
+    "CartesianController.step": lambda own, x: own.controller.step(x, 0.001),
+    "CartesianController.hold_at": lambda own, x: own.controller.hold_at(FIVE if x is None else x),
+    "CartesianController.withdraw": lambda own, x: own.controller.withdraw(x),
+    "CartesianController.tool_pose": lambda own, x: own.controller.tool_pose(x),
+    "CartesianController.set_holding": lambda own, x: own.controller.set_holding(x, True),
+    "CartesianController.set_opening": lambda own, x: own.controller.set_opening("left", x, 1.0),
+    "CartesianController.move_obstacle": lambda own, x: own.controller.move_obstacle(x, BALL),
+    **each(
+        "RelativeMotion",
+        ("stance", "scale", "rotation_frame", "rotation_scale", "axes", "axis_scales"),
+        lambda own, by, x: RelativeMotion(**{by: x}),
+    ),
+    "RelativeMotion.of": lambda own, x: RelativeMotion.of(x),
+    **each("Pipeline", PARTS, lambda own, by, x: own.pipeline_of(**{by: x})),
+    "Pipeline.from_config": lambda own, x: Pipeline.from_config(x),
+    "Pipeline.tick_until": lambda own, x: own.unused.tick_until(x),
+    "Pipeline.change_control": lambda own, x: own.pipeline.change_control(x),
+    "Pipeline.change_teleop": lambda own, x: own.pipeline.change_teleop(x),
+    "Pipeline.move_obstacle": lambda own, x: own.pipeline.move_obstacle(x, BALL),
+    "Pipeline.mark": lambda own, x: own.pipeline.mark(x),
+    "Pipeline.record_outcome": lambda own, x: own.pipeline.record_outcome(x),
+    "PolicyInput": lambda own, x: PolicyInput(FIVE if x is None else x),
+    "PolicyInput space": lambda own, x: PolicyInput(space=FIVE if x is None else x),
+    "PolicyInput rate": lambda own, x: PolicyInput(rate=FIVE * -1 if x is None else x),
+    "PolicyInput operator": lambda own, x: PolicyInput(operator=FIVE if x is None else x),
+    "PolicyInput.observe": lambda own, x: own.policy.observe(x),
+    "CommandMode": lambda own, x: CommandMode(str(x)),
+    "Plant.apply": lambda own, x: own.plant.apply(x),
+    **each(
+        "Plant.apply",
+        ("mode", "q", "v", "grippers"),
+        lambda own, by, x: own.plant.apply(replace(COMMAND, **{by: x})),
+    ),
+    "Plant.advance": lambda own, x: own.plant.advance(x),
+    "Plant.reset": lambda own, x: own.plant.reset(FIVE if x is None else x),
+    "Input.poll": lambda own, x: own.run(samples=x),
+    "Input.poll of samples": lambda own, x: own.run(samples=[x]),
+    **each(
+        "Input.poll",
+        ("pose_stamp", "inputs", "inputs_stamp", "fault"),
+        lambda own, by, x: own.run(samples=[replace(SAMPLE, **{by: x})]),
+    ),
+    "Plant.state": lambda own, x: own.run(state=x),
+    **each(
+        "Plant.state",
+        ("q", "v", "tau_external", "stamp"),
+        lambda own, by, x: own.run(state=replace(own.state, **{by: x})),
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def program(robot: Robot, controller: CartesianController) -> Program:
+    return Program(robot, controller)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_an_argument_of_a_wrong_kind_gets_one_line_of_the_family(program: Program, name: str) -> None:
+    refused = []
+    for value in KINDS:
+        try:
+            CALLS[name](program, value)
+        except Q2R2Error as error:
+            refused.append(str(error))
+        except Exception as error:
+            raise AssertionError(f"{value!r}: {type(error).__name__}: {error}") from error
+    assert not any("\n" in said for said in refused)
+    assert len(refused) > len(KINDS) / 2

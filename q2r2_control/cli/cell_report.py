@@ -16,7 +16,8 @@ from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
-from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.kept_distances import kept_distances, near_at_home
+from q2r2_control.robot.near_pairs import lines_to_paste
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.robot.stop_torque import StopTorque, stop_torques
 from q2r2_control.supervision.homing import preflight_faults
@@ -64,6 +65,7 @@ class CellCheck:
     contacts: tuple[ContactPair, ...]  # that may touch, in torque mode
     nearest: list[KeptPair]  # nearest first
     faults: tuple[str, ...]
+    remedies: list[str]  # lines to paste for pairs among these, with lines that say where
     stop_torques: tuple[StopTorque, ...]  # by arm
     driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
     controls: dict[str, str]  # what those of each hand do
@@ -82,8 +84,9 @@ def check_cell(config: Config) -> CellCheck:
         CartesianController(robot, config.control)
         settings = config.control.without_contact()
         controller = CartesianController(robot, settings)
-    kept = kept_distances(robot, settings).values.tolist()
-    distances = sorted(zip(robot.distances(robot.home), kept, strict=True), key=lambda found: found[0].distance)
+    kept = kept_distances(robot, settings)
+    pairs = zip(robot.distances(robot.home), kept.values.tolist(), strict=True)
+    distances = sorted(pairs, key=lambda found: found[0].distance)
     arms = [_arm_check(config, robot, name) for name in robot.arms]
     stops = stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit))
     notes = [f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in arms if arm.object]
@@ -103,6 +106,7 @@ def check_cell(config: Config) -> CellCheck:
         contacts=tuple(config.control.contact_allowed),
         nearest=[KeptPair(pair.name_a, pair.name_b, pair.distance, least) for pair, least in distances[:_NEAREST]],
         faults=preflight_faults(robot, settings, controller),
+        remedies=lines_to_paste(robot, config, near_at_home(robot, kept)),
         stop_torques=stops,
         driven={} if config.external is None else describe(config.external),
         controls=config.teleop.bindings.meanings(),

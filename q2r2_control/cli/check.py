@@ -93,6 +93,8 @@ def _print_cell(cell: CellCheck) -> None:
         console.print(f"NOTE {note}", markup=False)
     for fault in cell.faults:
         console.print(f"FAULT {fault}", style="red", markup=False)
+    for line in cell.remedies:
+        console.print(line, markup=False)
 
 
 def _cell_tables(cell: CellCheck) -> Iterator[Table]:

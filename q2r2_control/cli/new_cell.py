@@ -22,7 +22,7 @@ from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, load_description
 from q2r2_control.robot.floor import FLOOR
-from q2r2_control.robot.home_search import find_home
+from q2r2_control.robot.home_search import find_home, mirrored_home
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, lacks_of, tip_of, tips_by_side
 from q2r2_control.robot.near_pairs import spreads_of
@@ -52,6 +52,12 @@ class _Draft:
     faults: list[str] = field(default_factory=list)  # that the check of a cell does not look for
     fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # by model
     always: list[tuple[str, str]] = field(default_factory=list)  # links that overlap by construction
+    xacro_args: dict[str, str] = field(default_factory=dict)  # of each model that is one of xacro
+
+    def part(self, model: str) -> dict[str, Any]:
+        """The block of a model, which stands at the world's origin yet."""
+        args = {"xacro_args": self.xacro_args} if self.xacro_args and model.endswith(".xacro") else {}
+        return {"model": model, **args, "mount": {"position": [0.0, 0.0, 0.0]}}
 
     def config(self) -> Config:
         return parse_config(yaml.safe_dump(self.data), self.file, self.file.absolute().parent)
@@ -62,6 +68,9 @@ def new_cell(
     left: Model = None,
     right: Model = None,
     robot: Annotated[str | None, Option(metavar="MODEL", help="Instead: one model that holds both arms.")] = None,
+    xacro_arg: Annotated[
+        list[str] | None, Option(metavar="NAME=VALUE", help="Argument of the xacro models; may be repeated.")
+    ] = None,
     left_tip: Tip = None,
     right_tip: Tip = None,
     distance: Annotated[float | None, Option(min=0, max=5, help="Between the bases of both arms [m].")] = None,
@@ -82,7 +91,9 @@ def new_cell(
             raise ConfigError(f"{one}: exists; give another name")
     if (robot is None) == (left is None and right is None):
         raise ConfigError("--left, --right or --robot: allowed: a model for each arm, or one that holds both")
-    draft = _Draft(file, {"name": name})
+    draft = _Draft(file, {"name": name}, xacro_args=_xacro_args(xacro_arg or []))
+    if xacro_arg and not any(model.endswith(".xacro") for model in (left, right, robot) if model is not None):
+        raise ConfigError("--xacro-arg: allowed with a model that ends in .xacro")
     tips = {"left": left_tip, "right": right_tip}
     models = {side: model for side, model in (("left", left), ("right", right)) if model is not None}
     _survey(draft, dict.fromkeys(tips, robot) if robot else models, tips, shared=robot)
@@ -113,12 +124,20 @@ def new_cell(
     raise Exit(1 if faults else 0)
 
 
+def _xacro_args(given: list[str]) -> dict[str, str]:
+    """Values by name. Raises :class:`ConfigError`."""
+    for text in given:
+        if not text.partition("=")[0].strip() or "=" not in text:
+            raise ConfigError(f"--xacro-arg {text!r:.80}: allowed: NAME=VALUE")
+    return {name: value for name, _, value in (text.partition("=") for text in given)}
+
+
 def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], shared: str | None) -> None:
     """Arms, tips and grippers. Raises :class:`ConfigError` with all that the models lack."""
     described = {}
     for side, model in models.items():
         try:
-            described[side] = load_description(model)
+            described[side] = load_description(model, draft.part(model).get("xacro_args"))
         except Q2R2Error as error:
             raise ConfigError(f"--{'robot' if shared else side} {model!r:.120}: {error}") from error
     trees = {side: LinkTree(description.urdf, models[side]) for side, description in described.items()}
@@ -143,13 +162,13 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
     if lacks:
         raise ConfigError(f"{'; '.join(dict.fromkeys(lacks))}; to change: the <limit> of these joints in the model")
     if shared is not None:
-        draft.data["robot"] = {"model": shared, "mount": {"position": [0.0, 0.0, 0.0]}}
+        draft.data["robot"] = draft.part(shared)
     arms = draft.data["arms"] = {}
     for side, tree in trees.items():
         others = [joint for other in chains if other != side and shared for joint in chains[other]]
         names = {joint.get("name") for joint in others}
         joints = [joint for joint in chains[side] if joint.get("name") not in names]
-        arms[side] = {} if shared else {"model": models[side], "mount": {"position": [0.0, 0.0, 0.0]}}
+        arms[side] = {} if shared else draft.part(models[side])
         arms[side] |= {"tip": found[side], "home": [float(np.mean(joint_limits(joint))) for joint in joints]}
         if gripper := gripper_of(described[side], tree, found[side]):
             arms[side]["gripper"] = gripper
@@ -213,8 +232,10 @@ def _place(draft: _Draft, yes: bool) -> None:
     placed: list[str] = []
     for side, arm in robot.arms.items():
         model = draft.data["arms"][side].get("model")
-        twins = [other for other in placed if model and draft.data["arms"][other]["model"] == model]
+        twins = [other for other in placed if draft.data["arms"][other].get("model") == model]
         like = q[robot.arms[twins[0]].joints] if twins else None
+        if twins and "robot" in draft.data:
+            like = mirrored_home(robot, side, twins[0], q)
         found: Array = find_home(robot, side, q, kept, placed, like).round(3)
         text = " ".join(f"{value:g}" for value in found)
         answer = text if yes else typer.prompt(f"home of the {side} arm, found; or yours in radians", default=text)
@@ -251,7 +272,7 @@ def _text(draft: _Draft, robot: Robot) -> str:
     ]
     where = "# of the model's root link: x forwards, y left, z up, and rpy: [0, 0, 0] turns it; measure it [m]"
     if "robot" in data:
-        lines += ["robot:", f"  model: {_flow(data['robot']['model'])}"]
+        lines += ["robot:", *(f"  {key}: {_flow(value)}" for key, value in data["robot"].items() if key != "mount")]
         lines += [f"  mount: {_flow(data['robot']['mount'])}   {where}", ""]
     lines.append("arms:")
     for side, arm in data["arms"].items():
@@ -263,7 +284,7 @@ def _text(draft: _Draft, robot: Robot) -> str:
             "gripper": "# guessed: see it open and close [rad or m]",
             "home": f"# found: tool at {tool} m [rad]",
         }
-        for key in ("model", "mount", "tip", "gripper", "home"):
+        for key in ("model", "xacro_args", "mount", "tip", "gripper", "home"):
             if key in arm:
                 comment = comments.get(key, "") if key == "home" or side == next(iter(data["arms"])) else ""
                 lines.append(f"    {key}: {_flow(arm[key])}   {comment}".rstrip())

@@ -27,7 +27,6 @@ from itertools import compress
 
 import numpy as np
 import pinocchio as pin
-from pydantic import ValidationError
 
 from q2r2_control.compliance.impedance_law import (
     BoolArray,
@@ -38,6 +37,7 @@ from q2r2_control.compliance.impedance_law import (
     impedance_torque,
 )
 from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
+from q2r2_control.config.strict import validated
 from q2r2_control.control.geometry.kinematics import chain_of
 from q2r2_control.control.jit import bound, pointer_to
 from q2r2_control.control.tasks.frame import tools_of
@@ -205,11 +205,7 @@ def check_springs(values: Mapping[str, float]) -> None:
     for name in values.keys() - set(LIVE_IMPEDANCE):
         allowed = ", ".join(LIVE_IMPEDANCE)
         raise ConfigError(f"impedance: {name} = {values[name]!r:.40}: while a controller runs: {allowed}")
-    try:
-        ImpedanceSettings.model_validate(dict(values), strict=True)
-    except ValidationError as error:
-        fault = error.errors()[0]
-        raise ConfigError(f"{fault['loc'][0]} = {fault['input']!r:.40}: {fault['msg']}") from error
+    validated(ImpedanceSettings, "impedance: ", dict(values), strict=True)
 
 
 def _those(names: tuple[str, ...], which: BoolArray | Array) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from q2r2_control.config.arms import (
     ArmConfig,
@@ -38,7 +38,7 @@ from q2r2_control.config.external import ControllerKind, ExternalConfig, check_e
 from q2r2_control.config.fri import MODBUS_DELAY, CabinetConfig, ModbusGripperConfig
 from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSettings
 from q2r2_control.config.resources import find_resource
-from q2r2_control.config.strict import Network, StrictModel, first_fault, network_of
+from q2r2_control.config.strict import Network, StrictModel, network_of, validated
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 
@@ -229,12 +229,10 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
     try:
         # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
         content = json.dumps(data, default=str)
-        config = Config.model_validate_json(content, strict=True, context={"folder": folder})
+        config = validated(Config, "", content, as_json=True, strict=True, context={"folder": folder})
         return _within_driver_limits(config)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-    except ValidationError as error:
-        raise ConfigError(f"{path}: {first_fault(error, Config)}") from error
     except (ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
 

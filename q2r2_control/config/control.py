@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
-from q2r2_control.config.strict import StrictModel, first_fault
+from q2r2_control.config.strict import StrictModel, validated
 from q2r2_control.errors import ConfigError, check_kind
 
 EQUAL = "equal"
@@ -149,10 +149,7 @@ class ControllerSettings(StrictModel):
         for name, value in values.items():
             if name not in LIVE:
                 raise ConfigError(f"control.{name} = {value!r:.60}: while a controller runs: {', '.join(LIVE)}")
-        try:
-            return ControllerSettings.model_validate(self.model_dump() | dict(values))
-        except ValidationError as error:
-            raise ConfigError(f"control.{first_fault(error, ControllerSettings)}") from error
+        return validated(ControllerSettings, "control.", self.model_dump() | dict(values))
 
     @property
     def largest_distance(self) -> tuple[str, float]:

@@ -44,7 +44,7 @@ class MovingObstacle(ObstacleConfig):
 
 def check_obstacle(name: str, obstacle: MovingObstacle | None, names: Collection[str]) -> None:
     """Raises :class:`ConfigError` for a name that ``control.moving_obstacles`` lacks and for what is no obstacle."""
-    if name not in names:
+    if not isinstance(name, str) or name not in names:
         allowed = ", ".join(names) or "none; control.moving_obstacles names them"
         raise ConfigError(f"moving obstacle {shown(name)}: allowed: {allowed}")
     if obstacle is not None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from ipaddress import IPv4Network, IPv6Network, ip_network
-from typing import Any, get_args
+from typing import Any, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Tag, ValidationError
 
 from q2r2_control.errors import ConfigError, shown
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class StrictModel(BaseModel):
@@ -24,6 +26,14 @@ class StrictModel(BaseModel):
         except ValidationError as error:
             raise ConfigError(f"{type(self).__name__}: {first_fault(error, type(self))}") from error
 
+    @classmethod
+    def model_validate(cls, obj: Any, **options: Any) -> Self:
+        return validated(cls, f"{cls.__name__}: ", obj, **options)
+
+    @classmethod
+    def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Self:
+        return validated(cls, f"{cls.__name__}: ", json_data, as_json=True, **options)
+
     # By this pydantic knows its own initialiser. It would call another one for settings within settings too, and an
     # error from there could not name their key in full.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
@@ -31,6 +41,19 @@ class StrictModel(BaseModel):
     def __setattr__(self, name: str, value: object) -> None:
         kind = type(self).__name__
         raise ConfigError(f"{kind}.{name} = {shown(value)}: settings do not change; allowed: another {kind}")
+
+
+def validated(model: type[Model], where: str, values: object, *, as_json: bool = False, **options: Any) -> Model:
+    """Settings made of ``values``, or of a JSON text; ``options`` as ``pydantic.BaseModel.model_validate`` has them.
+
+    Raises :class:`ConfigError` that begins with ``where``.
+    """
+    validator: Any = model.__pydantic_validator__
+    try:
+        made: Model = (validator.validate_json if as_json else validator.validate_python)(values, **options)
+    except ValidationError as error:
+        raise ConfigError(f"{where}{first_fault(error, model)}") from error
+    return made
 
 
 def first_fault(error: ValidationError, model: type[BaseModel]) -> str:

@@ -24,7 +24,7 @@ from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
 from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.control.tasks.external import add_costs, load_tasks
-from q2r2_control.errors import ConfigError, RobotError, check_kind
+from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.obstacle_bodies import roles_with_obstacles, with_obstacle_bodies
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
@@ -56,7 +56,9 @@ class CartesianController:
         self.robot = robot
         self._nv = robot.model.nv
         self._arms = tuple(robot.arms)
-        self._solver = solver or DaqpSolver(self._nv, settings.solve_time_limit)
+        if solver is not None and not callable(getattr(solver, "solve", None)):
+            raise ConfigError(f"solver = {shown(solver)}: allowed: a Solver, or None for DAQP")
+        self._solver = DaqpSolver(self._nv, settings.solve_time_limit) if solver is None else solver
         model = kernel_model_of(robot, settings)
         data = KernelData.empty(model)
         self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(data)
@@ -210,8 +212,10 @@ class CartesianController:
     def withdraw(self, reference: Reference) -> None:
         """Undo the last step, whose ``reference`` came too late for the plant: be where the arms went on braking from.
 
-        The state and the certified stop are those before the step, and ``reference`` becomes that state.
+        The state and the certified stop are those before the step, and ``reference`` becomes that state. Raises
+        :class:`RobotError` for what is no reference.
         """
+        check_kind("reference", reference, Reference, "the Reference that the last step returned", RobotError)
         for array, kept in zip((self._state.q, self._state.v, self._stop), self._before, strict=True):
             array[:] = kept
         reference.q[:], reference.v[:] = self._state.q, self._state.v

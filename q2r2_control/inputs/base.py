@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
+from types import NoneType
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import check_kind
+from q2r2_control.errors import InputError, check_kind
 from q2r2_control.plugins import INPUTS, load_class
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import ActionChunk, DeviceControls, HandSample, HapticFeedback, Observation
+from q2r2_control.types import (
+    ActionChunk,
+    DeviceControls,
+    HandFault,
+    HandInputs,
+    HandSample,
+    HapticFeedback,
+    Observation,
+)
+
+_SAMPLE: tuple[tuple[str, type | tuple[type, ...], str], ...] = (
+    ("pose_stamp", (float, int, np.number), "a time [s]"),
+    ("inputs", HandInputs, "HandInputs"),
+    ("inputs_stamp", (float, int, np.number), "a time [s]"),
+    ("fault", (HandFault, NoneType), "a HandFault, or None"),
+)
 
 
 @runtime_checkable
@@ -57,6 +75,16 @@ class PolicySource(Input, Protocol):
 
     def observe(self, observation: Observation) -> None:
         """The state of a tick, for the policy; its numbers stay as they are. In real time this never waits."""
+
+
+def check_samples(samples: list[HandSample]) -> list[HandSample]:
+    """The ``samples`` of a poll. Raises :class:`InputError` for what is none; their numbers may be any."""
+    check_kind("poll() of the input", samples, list, "a list of HandSample", InputError)
+    for sample in samples:
+        check_kind("a sample of the input", sample, HandSample, "a HandSample", InputError)
+        for name, kind, allowed in _SAMPLE:
+            check_kind(f"{name} of a sample of the input", getattr(sample, name), kind, allowed, InputError)
+    return samples
 
 
 def options_of(source: str) -> tuple[str, ...]:

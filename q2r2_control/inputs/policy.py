@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import ConfigError, shown
+from q2r2_control.errors import ConfigError, check_kind, shown
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input, make_input
 from q2r2_control.robot.robot import Robot
@@ -77,10 +78,13 @@ class PolicyInput:
     ) -> None:
         space = getattr(policy, "space", ActionSpace.JOINTS) if space is None else space
         rate = getattr(policy, "rate", 30.0) if rate is None else rate
-        if space not in list(ActionSpace):
+        if not isinstance(space, str) or space not in list(ActionSpace):
             raise ConfigError(f"space = {shown(space)}: allowed: {', '.join(ActionSpace)}")
         if not (isinstance(rate, float | int) and _GAPS[0] <= 1.0 / max(rate, 1e-9) <= _GAPS[1]):
             raise ConfigError(f"rate = {shown(rate)}: allowed: {1.0 / _GAPS[1]:g} to {1.0 / _GAPS[0]:g} Hz")
+        if policy is not None and not callable(policy):
+            raise ConfigError(f"policy = {shown(policy)}: allowed: a function of an Observation, or None")
+        check_kind("operator", operator, (Input, NoneType), "an object with all methods of Input, or None")
         self.space, self.period, self._policy, self.operator = ActionSpace(space), 1.0 / float(rate), policy, operator
         self.controls = QUEST_CONTROLS if operator is None else operator.controls
         self.observation: Observation | None = None  # the newest one
@@ -129,6 +133,7 @@ class PolicyInput:
 
     def observe(self, observation: Observation) -> None:
         """See :class:`PolicySource`."""
+        check_kind("observation", observation, Observation, "an Observation")
         self.observation = observation
         if not self._realtime:
             self._ask()
@@ -193,6 +198,8 @@ class PolicyInput:
         values = np.atleast_2d(_numbers("actions", actions))
         expected = action_names(robot, self.space)
         grippers = tuple(f"{arm}_gripper" for arm in robot.arms)
+        if not isinstance(names, list | tuple):
+            raise _UnusableError(f"names = {shown(names)}; allowed: a list of names")
         allowed = tuple(names) if names else (*expected, *grippers)[: values.shape[-1]]
         _check_names(allowed, expected, grippers)
         size = len(allowed)
@@ -278,6 +285,7 @@ def _check_names(names: Sequence[str], expected: Sequence[str], grippers: Sequen
 
 def _loaded(where: str) -> Policy:
     """The policy at "module:name", of this folder or installed. Raises :class:`ConfigError` where there is none."""
+    check_kind("--policy", where, str, "MODULE:NAME")
     module, _, name = where.partition(":")
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)

@@ -18,7 +18,7 @@ from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.inputs.base import Input, PolicySource
+from q2r2_control.inputs.base import Input, PolicySource, check_samples
 from q2r2_control.loop.control_loop import ArmConditions
 from q2r2_control.pipeline.requests import change_of, changed
 from q2r2_control.summary.tick import Tick
@@ -62,7 +62,7 @@ class OperatorSide:
 
     def poll(self, now: float) -> list[HandSample]:
         """Samples of the hands; a connection that is lost stops the arms that hands drive."""
-        samples = self._input.poll(now)
+        samples = check_samples(self._input.poll(now))
         self.chunks = [] if self._policy is None else self._policy.chunks()
         was_connected, self.connected = self.connected, self._input.connected
         if was_connected and not self.connected:

@@ -14,7 +14,7 @@ import pinocchio as pin
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive, permitted
-from q2r2_control.errors import ConfigError, PlantError, shown
+from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input, PolicySource, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
@@ -23,7 +23,7 @@ from q2r2_control.pipeline.operator_side import OperatorSide
 from q2r2_control.pipeline.requests import RequestedRun
 from q2r2_control.pipeline.run_recorder import RunRecorder
 from q2r2_control.pipeline.target_lead import TargetLead
-from q2r2_control.plants.base import Plant, SessionPlant, check_mode, make_plant
+from q2r2_control.plants.base import Plant, SessionPlant, check_mode, check_state, make_plant
 from q2r2_control.process.scheduling import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
@@ -56,6 +56,10 @@ class Pipeline(RequestedRun):
         self, config: Config, robot: Robot, input: Input, plant: Plant, mode: CommandMode | str = CommandMode.POSITION
     ) -> None:
         super().__init__()
+        check_kind("config", config, Config, "a Config, as load_config returns")
+        check_kind("robot", robot, Robot, "a Robot, as Robot.from_config returns")
+        check_kind("input", input, Input, "an object with all methods of Input")
+        check_kind("plant", plant, Plant, "an object with all methods of Plant")
         config.teleop.bindings.check_device(input.controls)
         self.config, self.robot, self.input, self.plant = config, robot, input, plant
         # A session is of one mode: its arms follow no positions while torques are not safe.
@@ -130,8 +134,12 @@ class Pipeline(RequestedRun):
     def tick_until(self, end: float) -> None:
         """Take the ticks of a run that has begun, up to the newest one at or before ``end`` [s] on the loop's clock.
 
-        Raises :class:`PlantError` where supervision has stopped the arms.
+        Raises :class:`PlantError` where supervision has stopped the arms. Raises :class:`ConfigError` for no time, and
+        before a run.
         """
+        check_kind("end", end, (float, int, np.number), "a time [s]")
+        if not hasattr(self, "_clock"):
+            raise ConfigError("Pipeline.tick_until: call begin() first")
         while self._clock.now <= end - self._clock.period + _ROUNDING:
             self.tick()
             self.check()
@@ -184,7 +192,7 @@ class Pipeline(RequestedRun):
         if sessions is not None:
             sessions.begin(self.drive.mode)
         self.plant.reset()
-        self._state = self.plant.state()  # the newest one
+        self._state = check_state(self.plant.state(), self.robot)  # the newest one
         self._clock = self.make_clock(realtime)
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)

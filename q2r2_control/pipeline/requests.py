@@ -13,7 +13,7 @@ from q2r2_control.config.control import LIVE_IMPEDANCE
 from q2r2_control.config.moving_obstacle import MovingObstacle, check_obstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.drives.base import Drive, TorqueDrive
-from q2r2_control.errors import check_kind
+from q2r2_control.errors import ConfigError, check_kind, shown
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input
 
@@ -50,7 +50,12 @@ class RequestedRun:
         self.requests.append(Reason(ReasonKind.POLICY_REQUESTED))
 
     def mark(self, action: Action) -> None:
-        """Begin, end or mark an episode of the recording, as an operator may; from any thread."""
+        """Begin, end or mark an episode of the recording, as an operator may; from any thread.
+
+        Raises :class:`ConfigError` for what is no action.
+        """
+        if not isinstance(action, str) or action not in list(Action):
+            raise ConfigError(f"action = {shown(action)}: allowed: {', '.join(Action)}")
         self.requests.append(Reason.of(ReasonKind.RECORDING_REQUESTED, action=str(action)))
 
     def change_teleop(self, settings: TeleopSettings) -> None:
@@ -88,6 +93,7 @@ class RequestedRun:
 
     def record_outcome(self, reason: Reason) -> None:
         """Let the operator know what became of the recording or of an episode in it; from any thread."""
+        check_kind("reason", reason, Reason, "a Reason")
         self.requests.append(reason)
 
 
@@ -106,7 +112,7 @@ def change_of(old: TeleopSettings, new: TeleopSettings) -> Reason:
 
 
 def changed(settings: TeleopSettings, changes: Mapping[str, Any]) -> TeleopSettings:
-    """The settings that such a request asks for. Raises ValueError for changes that are none."""
+    """The settings that such a request asks for. Raises :class:`ConfigError` for changes that are none."""
     return TeleopSettings.model_validate(_merged(settings.model_dump(mode="json"), changes))
 
 

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import ConfigError, PlantError, check_kind
+from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
@@ -111,14 +111,16 @@ def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
 
 def check_mode(mode: CommandMode | str, plant: Plant) -> CommandMode:
     """``mode`` as one that ``plant`` follows. Raises :class:`ConfigError` for any other."""
-    if mode not in plant.modes:
+    if not isinstance(mode, str) or mode not in plant.modes:
         allowed = ", ".join(plant.modes)
-        raise ConfigError(f"mode {mode!s:.40}: {type(plant).__name__} follows {allowed} commands only")
+        raise ConfigError(f"mode {shown(mode)}: {type(plant).__name__} follows {allowed} commands only")
     return CommandMode(mode)
 
 
 def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]) -> None:
     """Raise :class:`PlantError` unless a plant with ``modes`` can follow ``command``."""
+    check_kind("command", command, Command, "a Command", PlantError)
+    check_kind("command mode", command.mode, str, ", ".join(modes), PlantError)
     if command.mode not in modes:
         allowed = ", ".join(modes)
         raise PlantError(f"command mode {command.mode!s:.40}: this plant follows {allowed} commands only")
@@ -126,27 +128,44 @@ def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]
     check_joints("command v", command.v, robot)
     if command.mode is CommandMode.TORQUE:
         check_joints("command tau", command.tau, robot)
+    check_kind("command grippers", command.grippers, dict, "openings by arm", PlantError)
     for arm, opening in command.grippers.items():
         if arm not in robot.arms:
             raise PlantError(f"command grippers: no arm {arm!r:.40}; arms: {', '.join(robot.arms)}")
-        if not 0 <= opening <= 1:
+        if not (isinstance(opening, float | int | np.number) and 0 <= opening <= 1):
             raise PlantError(f"command gripper of arm {arm} = {opening!r:.40}: allowed: 0 (closed) .. 1 (fully open)")
 
 
 def check_joints(what: str, values: Array, robot: Robot) -> None:
     """Raise :class:`PlantError` unless ``values`` has one finite number for each joint of the robot."""
-    count = len(robot.joint_names)
-    if values.shape != (count,):
-        raise PlantError(f"{what} has shape {values.shape}; expected ({count},), one value for each joint")
+    _check_shape(what, values, robot)
     # A product is fast; squares of finite numbers may overflow.
     if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():
         joint = int(np.flatnonzero(~np.isfinite(values))[0])
         raise PlantError(f"{what}: {robot.joint_names[joint]} = {values[joint]}: allowed: finite numbers")
 
 
+def _check_shape(what: str, values: Array, robot: Robot) -> None:
+    count = len(robot.joint_names)
+    check_kind(what, values, np.ndarray, f"an array ({count},)", PlantError)
+    if values.shape != (count,):
+        raise PlantError(f"{what} has shape {values.shape}; expected ({count},), one value for each joint")
+
+
+def check_state(state: RobotState, robot: Robot) -> RobotState:
+    """The first ``state`` of a plant, of any numbers. Raises :class:`PlantError` for what is none."""
+    check_kind("state() of the plant", state, RobotState, "a RobotState", PlantError)
+    check_kind("stamp of the plant's state", state.stamp, (float, int, np.number), "a time [s]", PlantError)
+    _check_shape("q of the plant's state", state.q, robot)
+    _check_shape("v of the plant's state", state.v, robot)
+    if state.tau_external is not None:
+        _check_shape("tau_external of the plant's state", state.tau_external, robot)
+    return state
+
+
 def check_duration(dt: float) -> None:
     """Raise :class:`PlantError` unless ``dt`` is a time that a plant may be advanced by."""
-    if not (math.isfinite(dt) and 0 <= dt <= MAX_ADVANCE):
+    if not (isinstance(dt, float | int | np.number) and math.isfinite(dt) and 0 <= dt <= MAX_ADVANCE):
         raise PlantError(f"advance by dt = {dt!r:.40} s: allowed: 0 .. {MAX_ADVANCE:g} s")
 
 

@@ -7,12 +7,13 @@ directions, torques to spare, and room between bodies. The last two are needed: 
 from __future__ import annotations
 
 from collections.abc import Collection
+from itertools import product
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.robot.pairs import link_of, pair_names
-from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.robot import Arm, Robot
 from q2r2_control.types import Array
 
 _SAMPLES, _BEST, _STEPS = 2000, 24, 150
@@ -24,6 +25,8 @@ _LEAST_GAIN = 0.15  # of the weakest direction of motion, in reaches
 _BORNE = 0.7  # of the torque limits, by gravity
 _ROOM = 0.04  # more than a pair keeps; what is needed is a part of it [m]
 _NEEDED = 0.005  # [m]
+_MIRROR = np.array([1.0, -1.0, 1.0])
+_ALONG_X, _ALONG_Z = np.diag([0.01, 0.0, 0.01])[[0, 2]]  # in the tool's frame [m]
 _FAULTY = 100.0  # cost of what is needed and missing
 
 
@@ -39,6 +42,35 @@ def find_home(
     if like is not None and search.cost(like) < _FAULTY:
         return like
     return search.best(np.random.default_rng(0))
+
+
+def mirrored_home(robot: Robot, arm: str, placed: str, q: Array) -> Array | None:
+    """Positions of ``arm`` (n,) that mirror those of the arm ``placed`` at ``q`` (nv,) in the plane y = 0 [rad].
+
+    Joints of mirrored arms differ in their signs only, so the signs are taken that mirror the joints' places best. None
+    for arms of different numbers of joints.
+    """
+    own, other = robot.arms[arm], robot.arms[placed]
+    if len(own.joints) != len(other.joints):
+        return None
+    data = robot.model.createData()
+
+    def points(posture: Array, of: Arm) -> Array:
+        """Places of joints and tool, and those of points a little along the tool's axes (n, 3) [m]."""
+        pin.forwardKinematics(robot.model, data, posture)
+        tool = pin.updateFramePlacement(robot.model, data, of.frame_id)
+        places = [data.oMi[int(joint) + 1].translation.copy() for joint in of.joints]
+        return np.array([*places, tool.translation, *(tool.act(point) for point in (_ALONG_X, _ALONG_Z))])
+
+    wanted = points(q, other) * _MIRROR
+    angles, posture = q[other.joints], q.copy()
+
+    def error(signs: tuple[float, ...]) -> float:
+        posture[own.joints] = np.multiply(signs, angles)
+        return float(np.square(points(posture, own) - wanted).sum())
+
+    best = np.multiply(min(product((-1.0, 1.0), repeat=len(angles)), key=error), angles)
+    return np.clip(best, robot.position_lower[own.joints], robot.position_upper[own.joints])
 
 
 class _HomeSearch:

@@ -9,7 +9,7 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.near_pairs import remedy
+from q2r2_control.robot.near_pairs import NearPair, remedy
 from q2r2_control.robot.obstacle_bodies import roles_with_obstacles, with_obstacle_bodies
 from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
 from q2r2_control.robot.robot import Robot
@@ -46,19 +46,23 @@ def kept_by_obstacles(robot: Robot, settings: ControllerSettings) -> KeptDistanc
     return _of_all_pairs(robot, settings)[2]
 
 
+def near_at_home(robot: Robot, kept: KeptDistances) -> list[NearPair]:
+    """Pairs that are nearer at home than they have to be, the nearest first."""
+    pairs = zip(robot.distances(robot.home), kept.values.tolist(), kept.keys, strict=True)
+    found = [NearPair((pair.name_a, pair.name_b), pair.distance, least, key) for pair, least, key in pairs]
+    return sorted((pair for pair in found if pair.distance < pair.kept), key=lambda pair: pair.distance)
+
+
 def too_close_at_home(robot: Robot, kept: KeptDistances, *, remedies: bool = False) -> list[str]:
-    """A line for each pair that is nearer at home than it has to be, the nearest first.
+    """A line for each of :func:`near_at_home`.
 
     ``remedies``: with what to write into the cell's YAML, for which postures are sampled.
     """
-    pairs = zip(robot.distances(robot.home), kept.values.tolist(), kept.keys, strict=True)
     lines = []
-    for pair, least, key in sorted(pairs, key=lambda found: found[0].distance):
-        if pair.distance < least:
-            apart = f"{pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart"
-            names = pair.name_a, pair.name_b
-            hint = f"; {remedy(robot, names, pair.distance, least)}" if remedies else ""
-            lines.append(f"home: {apart}; allowed: at least {key}, {1e3 * least:.1f} mm{hint}")
+    for pair in near_at_home(robot, kept):
+        apart = f"{' and '.join(pair.names)} are {1e3 * pair.distance:.1f} mm apart"
+        hint = f"; {remedy(robot, pair)}" if remedies else ""
+        lines.append(f"home: {apart}; allowed: at least {pair.key}, {1e3 * pair.kept:.1f} mm{hint}")
     return lines
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.pairs import link_of
@@ -47,20 +49,73 @@ def spreads_of(robot: Robot, pairs: Sequence[Pair]) -> dict[Pair, Interval]:
     return spreads
 
 
-def remedy(robot: Robot, pair: Pair, distance: float, kept: float) -> str:
-    """Lines for the YAML of a cell in which a ``pair`` is ``distance`` apart at home and has to keep ``kept`` [m]."""
-    links = link_of(pair[0]), link_of(pair[1])
-    if FLOOR in links:
+class NearPair(NamedTuple):
+    """A pair of bodies that is nearer at home than it has to be; distances in metres."""
+
+    names: Pair
+    distance: float
+    kept: float
+    key: str  # in the block ``control``, that says so
+
+
+class _Ways(NamedTuple):
+    """Ways out for a pair that belongs to one robot."""
+
+    links: Pair
+    parts: bool  # somewhere it keeps its distance
+    nearer: float | None  # that it could keep instead, as control.pairs may have it [m]
+
+
+def _ways_out(robot: Robot, pair: NearPair) -> _Ways | None:
+    """None for bodies of two arms, obstacles and the floor, which have to keep their distance."""
+    links = link_of(pair.names[0]), link_of(pair.names[1])
+    if FLOOR in links or not robot.roles[links[0]].arms & robot.roles[links[1]].arms:
+        return None
+    least, greatest = spreads_of(robot, [pair.names])[links]
+    nearer = _whole_millimetres(pair.distance if greatest >= pair.kept else least)
+    return _Ways(links, greatest >= pair.kept, nearer if nearer >= 0.0 else None)
+
+
+def remedy(robot: Robot, pair: NearPair) -> str:
+    """The change that lets a ``pair`` be, or another home."""
+    if FLOOR in map(link_of, pair.names):
         return "the key floor takes another height, or null for no floor"
-    if not robot.roles[links[0]].arms & robot.roles[links[1]].arms:
+    ways = _ways_out(robot, pair)
+    if ways is None:
         return "to change: another home"
-    least, greatest = spreads_of(robot, [pair])[links]
-    nearer = _whole_millimetres(distance if greatest >= kept else least)
-    by_name = f"control.pairs: [{{pair: [{', '.join(links)}], distance: {nearer:g}}}]" if nearer >= 0.0 else ""
-    if greatest >= kept:
+    by_name = "" if ways.nearer is None else f"control: {{pairs: [{_pair_entry(ways.links, ways.nearer)}]}}"
+    if ways.parts:
         return f"to change: {', or '.join(filter(None, ('another home', by_name)))}"
-    in_file = f"a file for srdf, such as q2r2 check --pairs writes, with the line {_srdf_line(links)}"
+    in_file = f"a file for srdf, such as q2r2 check --pairs writes, with the line {_srdf_line(ways.links)}"
     return f"they hardly part anywhere; to change: {', or '.join(filter(None, (by_name, in_file)))}"
+
+
+def lines_to_paste(robot: Robot, config: Config, near: Iterable[NearPair]) -> list[str]:
+    """Lines that let ``near`` pairs of a robot's own links be as near as they are, and lines that say where they go."""
+    nearer: dict[Pair, float] = {}
+    disabled: dict[Pair, str] = {}
+    for ways in (_ways_out(robot, pair) for pair in near):
+        if ways is not None and ways.nearer is not None:
+            nearer[ways.links] = min(ways.nearer, nearer.get(ways.links, math.inf))
+        elif ways is not None and not ways.parts:
+            disabled[ways.links] = f"  {_srdf_line(ways.links)}"
+    entries = [f"    - {_pair_entry(links, least)}" for links, least in nearer.items() if links not in disabled]
+    lines = []
+    if entries:
+        # A block that the file has already cannot be given twice.
+        above = [
+            key for key in ("control", "pairs") if key in config.model_fields_set | config.control.model_fields_set
+        ]
+        where = f"below {'.'.join(above)} in" if above else "at the end of"
+        lines += [f"Links of one robot that may be as near as they are, {where} the cell's YAML:"]
+        lines += ["control:", "  pairs:"][len(above) :] + entries
+    if disabled and config.srdf is not None:
+        lines += [f"Links that hardly part, before </robot> in {config.srdf}:", *disabled.values()]
+    elif disabled:
+        file = f"{re.sub(r'[^A-Za-z0-9_-]', '_', config.name)}.srdf"
+        lines += ["Links that hardly part, at the end of the cell's YAML:", f"srdf: {file}"]
+        lines += [f"and beside it, in a new file {file}:", '<robot name="cell">', *disabled.values(), "</robot>"]
+    return lines
 
 
 def warning_at_home(robot: Robot) -> str | None:
@@ -90,8 +145,10 @@ def warning_at_home(robot: Robot) -> str | None:
     text = f"{robot.name}: at home, with min_distance {1e3 * kept:g} mm: {'; '.join([*lines.values()][:_NAMED])}{more}"
     remedies = [] if len(never) == len(lines) else ["home={joint: position, ...} where pairs are apart"]
     if never:
-        disabled = "".join(map(_srdf_line, never[:_NAMED]))
-        pairs = [{"pair": links, "distance": _whole_millimetres(spreads[links][0])} for links in never[:_NAMED]]
+        # With an SRDF, links that overlap at home only are no longer left out by themselves.
+        overlapping = [(link_of(a), link_of(b)) for a, b in robot.ignored_pairs]
+        disabled = "".join(map(_srdf_line, dict.fromkeys([*never, *overlapping])))
+        pairs = [{"pair": links, "distance": _whole_millimetres(spreads[links][0])} for links in never]
         remedies.append(f"srdf='<robot name=\"{robot.name}\">{disabled}</robot>'")
         if all(spreads[links][0] >= 0.0 for links in never):
             remedies.append(f"ControllerSettings(pairs={pairs})")
@@ -104,3 +161,7 @@ def _whole_millimetres(distance: float) -> float:
 
 def _srdf_line(links: Pair) -> str:
     return f'<disable_collisions link1="{links[0]}" link2="{links[1]}" reason="Never"/>'
+
+
+def _pair_entry(links: Pair, distance: float) -> str:
+    return f"{{pair: [{', '.join(links)}], distance: {distance:g}}}"

@@ -163,7 +163,7 @@ class Robot:
         exclusions = None if srdf is None else parse_srdf(*_text_of(srdf, "SRDF text")[:2])
         names = [*arms, *arms.values()] if isinstance(arms, Mapping) else []
         if not names or not all(isinstance(name, str) and name for name in names):
-            given = f"arms = {shown(arms)}" if arms else "no arms given"
+            given = f"arms = {shown(arms)}"
             raise RobotError(f"{where}: {given}; expected a mapping such as {{'left': 'left_tool_frame'}}")
         if len(set(arms.values())) < len(arms):
             raise RobotError(f"{where}: arms = {shown(arms, 200)}: allowed: a tool frame of its own for each arm")
@@ -224,6 +224,7 @@ class Robot:
 
     def closest_points(self, q: npt.ArrayLike, pair: tuple[str, str]) -> Array | None:
         """The nearest points (2, 3) [m] of a monitored pair in the world at ``q`` (nv,); None where it is none."""
+        check_kind("pair", pair, tuple, "the names of two bodies", RobotError)
         names = pair_names(self.collision_model)
         if pair not in names:
             return None

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
-from pydantic import ValidationError
 
-from q2r2_control.config.strict import first_fault
+from q2r2_control.config.strict import validated
 from q2r2_control.config.teleop import RotationFrame, Stance, TeleopSettings, axes_matrix
-from q2r2_control.errors import ConfigError, Q2R2Error, shown
+from q2r2_control.errors import Q2R2Error, check_kind, shown
 from q2r2_control.quaternions import (
     IDENTITY,
     Quaternion,
@@ -47,6 +46,8 @@ class RelativeMotion:
     Every rotation has a second, longer rotation vector. The one that continues the previous call's is used. With a
     scale other than 1 the tool then does not flip when the hand passes half a turn.
 
+    Methods that take floats are those of the loop, and check nothing.
+
     Raises :class:`ConfigError` for a value that is not allowed in :class:`TeleopSettings`.
     """
 
@@ -61,10 +62,7 @@ class RelativeMotion:
     ) -> None:
         given = {"stance": stance, "position_scale": scale, "rotation_scale": rotation_scale}
         given |= {"rotation_frame": rotation_frame, "axes": axes, "axis_scales": axis_scales}
-        try:
-            settings = TeleopSettings.model_validate(given)
-        except ValidationError as error:
-            raise ConfigError(f"RelativeMotion: {first_fault(error, TeleopSettings)}") from error
+        settings = validated(TeleopSettings, "RelativeMotion: ", given)
         self._scale, self._rotation_scale = self._full = settings.position_scale, settings.rotation_scale
         self._in_tool_frame = settings.rotation_frame is RotationFrame.TOOL
         self._axis_scales = np.array(settings.axis_scales)
@@ -81,6 +79,7 @@ class RelativeMotion:
 
     @classmethod
     def of(cls, settings: TeleopSettings) -> RelativeMotion:
+        check_kind("settings", settings, TeleopSettings, "TeleopSettings, which a Config has as config.teleop")
         scales = settings.rotation_scale, settings.axes, settings.axis_scales
         return cls(settings.stance, settings.position_scale, settings.rotation_frame, *scales)
 

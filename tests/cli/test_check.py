@@ -12,6 +12,7 @@ from q2r2_control.config.bindings import Action, BindingSettings
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.robot.description import load_description
 from q2r2_control.verification.fault_injection import FINGERS, with_contact
 from tests.cli.command import CELL, changed_cell, external_cell, one_object, q2r2
 from tests.robot.conftest import one_arm
@@ -77,6 +78,45 @@ def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old:
     assert shown.exit_code == data.exit_code == 1
     assert f"FAULT home: {fault}" in shown.stdout
     assert any(fault in line for line in one_object(data.stdout)["faults"])
+
+
+@pytest.mark.parametrize(
+    ("written", "says"),
+    [
+        pytest.param("", "at the end of the cell's YAML:", id="no block of that name"),
+        pytest.param(
+            "control:\n  min_distance: 0.02\n", "below control in the cell's YAML:", id="a block without pairs"
+        ),
+        pytest.param(
+            "control:\n  pairs:\n    - {pair: ['*_forearm_link', '*_wrist_3_link'], distance: 0.001}\n",
+            "below control.pairs in the cell's YAML:",
+            id="other pairs",
+        ),
+        pytest.param("srdf: mine.srdf\ncontrol:\n  min_distance: 0.02\n", "/mine.srdf:", id="an SRDF"),
+    ],
+)
+def test_the_lines_that_check_prints_for_links_that_are_too_near_make_the_cell_green_where_they_say(
+    tmp_path: Path, written: str, says: str
+) -> None:
+    bare = load_description("example-robot-data:ur5").file  # by this path the model has no SRDF
+    arm = f"{{model: {bare}, tip: tool0, mount: {{position: [0, 0, 0.1]}}, home: [-0.6, -1.1, 1.0, -1.4, -0.6, 0]}}"
+    (cell := tmp_path / "cell.yaml").write_text(f"name: my cell\narms:\n  left: {arm}\n{written}", encoding="utf-8")
+    (tmp_path / "mine.srdf").write_text('<robot name="cell">\n</robot>\n', encoding="utf-8")
+    refused = q2r2("check", str(cell))
+    assert refused.exit_code == 1
+    assert says in refused.stdout
+    lines = refused.stdout.splitlines()
+    last_fault = max(number for number, line in enumerate(lines) if line.startswith("FAULT"))
+    for line in lines[last_fault + 1 :]:
+        if line.endswith(".srdf:"):
+            file, end = tmp_path / line.split()[-1].rstrip(":"), "</robot>\n" if "before" in line else None
+        elif line.endswith("YAML:"):
+            file, end = cell, None
+        else:
+            before = file.read_text(encoding="utf-8") if file.exists() else ""
+            before, tail = before.removesuffix(end or ""), end or ""
+            file.write_text(f"{before}{line}\n{tail}", encoding="utf-8")
+    assert q2r2("check", str(cell)).exit_code == 0
 
 
 def test_check_says_how_to_do_without_the_floor_that_is_in_the_way(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
+from q2r2_control.robot.robot import Robot
 from tests.cli.command import one_object, q2r2
 
 IIWA = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
@@ -74,6 +75,29 @@ def test_answers_are_those_of_the_user(tmp_path: Path) -> None:
     assert left.home == right.home == (0.0, 0.4, 0.0, -1.6, 0.0, 1.1, 0.0), "a twin's home is taken"
 
 
+def test_arguments_of_xacro_go_into_the_cell(tmp_path: Path) -> None:
+    argument = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="arm"><xacro:arg name="fast" default="1.0"/>'
+    text = re.sub(r"<robot[^>]*>", argument, re.sub(r'velocity="[^"]*"', 'velocity="$(arg fast)"', IIWA))
+    Path("arm.urdf.xacro").write_text(text)
+    model = ("--left", "arm.urdf.xacro", "--xacro-arg", "fast=1.25")
+    result = q2r2("new-cell", "cell", *model, "--yes", "--samples", "100")
+    assert result.exit_code == 0, result.output
+    cell = load_config(tmp_path / "cell.yaml")
+    assert cell.arms["left"].xacro_args == {"fast": "1.25"}
+    assert Robot.from_config(cell).velocity_limit.tolist() == [1.25] * 7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--left", "arm.urdf.xacro", "--xacro-arg", "fast"), "--xacro-arg 'fast': allowed: NAME=VALUE"),
+        (("--left", "iiwa7", "--xacro-arg", "fast=1"), "--xacro-arg: allowed with a model that ends in .xacro"),
+    ],
+)
+def test_an_argument_of_xacro_that_is_none_is_refused(arguments: tuple[str, ...], says: str) -> None:
+    assert says in q2r2("new-cell", "cell", *arguments, "--yes").stderr
+
+
 def test_both_arms_of_one_model_are_found_with_their_fingers(tmp_path: Path) -> None:
     made = one_object(
         q2r2("new-cell", "cell", "--robot", "example-robot-data:baxter", "--yes", "--samples", "100", "--json").stdout
@@ -84,5 +108,8 @@ def test_both_arms_of_one_model_are_found_with_their_fingers(tmp_path: Path) -> 
     cell = load_config(tmp_path / "cell.yaml")
     assert cell.robot is not None
     assert cell.robot.mount.position[2] == pytest.approx(0.93, abs=0.02), "its feet stand on the floor"
+    made_robot = Robot.from_config(cell)
+    left, right = (made_robot.tool_pose(made_robot.home, side).translation for side in ("left", "right"))
+    assert right == pytest.approx(left * [1.0, -1.0, 1.0], abs=0.005), "their homes mirror each other"
     for arm in cell.arms.values():
         assert arm.gripper.open_position > arm.gripper.closed_position == 0.0

@@ -7,9 +7,9 @@ from typing import ClassVar
 import numpy as np
 import pinocchio as pin
 import pytest
-from pydantic import ValidationError
 
 from q2r2_control.config.bindings import HELD, Action, BindingSettings
+from q2r2_control.errors import ConfigError
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.gestures import HeldControls, travel
 from q2r2_control.types import SIDES, HandInputs
@@ -202,6 +202,6 @@ def test_every_control_moves_from_0_to_1_and_no_other_with_it(control: str) -> N
     ],
 )
 def test_bindings_that_mean_two_things_or_nothing_are_refused(given: dict[str, str], said: str) -> None:
-    with pytest.raises(ValidationError) as error:
+    with pytest.raises(ConfigError) as error:
         BindingSettings.model_validate(given)
     assert said in str(error.value)

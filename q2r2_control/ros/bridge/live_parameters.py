@@ -9,11 +9,12 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
 from q2r2_control.config.control import LIVE, LIVE_IMPEDANCE, ControllerSettings, ImpedanceSettings
+from q2r2_control.config.strict import Model, validated
 from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.ros.base_node import BaseNode
-from q2r2_control.ros.bridge.parameters import Model, may_be_none, range_of, stance_of, validated
+from q2r2_control.ros.bridge.parameters import may_be_none, range_of, stance_of
 
 if TYPE_CHECKING:  # arms' nodes have no controller, and need not wait for its kernels
     from q2r2_control.compliance.impedance import ImpedanceController
@@ -144,4 +145,4 @@ def _changed(settings: Model, prefix: str, changes: Mapping[str, Any]) -> Model:
         for each in path:
             part, model = part[each], model.model_fields[each].annotation  # type: ignore[assignment]
         part[last] = value or None if may_be_none(model.model_fields[last]) else value
-    return validated(type(settings), prefix, values)
+    return validated(type(settings), f"parameter {prefix}.", values)

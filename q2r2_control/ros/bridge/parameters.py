@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import GripperSettings, GuardLimits
 from q2r2_control.config.presets import BUILTIN, Mode, Preset, preset_of
-from q2r2_control.config.strict import STREAM_TIMEOUT
+from q2r2_control.config.strict import STREAM_TIMEOUT, Model, validated
 from q2r2_control.config.teleop import GuardSettings, Stance, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.types import QUEST_CONTROLS
-
-Model = TypeVar("Model", bound=BaseModel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,18 +173,8 @@ def settings_from_parameters(
     node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str] = frozenset(), *, read_only: bool = True
 ) -> Model:
     """Declare ``prefix.field`` for every field of ``default`` but those left out; returns the settings they make."""
-    return validated(type(default), prefix, _values(node, prefix, default, leave_out, read_only))
-
-
-def validated(model: type[Model], prefix: str, values: dict[str, Any]) -> Model:
-    """The settings of parameters under ``prefix``. Raises :class:`ConfigError` that names the parameter."""
-    try:
-        return model.model_validate(values)
-    except ValidationError as error:
-        fault = error.errors()[0]
-        name = ".".join([prefix, *map(str, fault["loc"])])
-        why = fault["msg"].removeprefix("Value error, ")
-        raise ConfigError(f"parameter {name} = {fault['input']!r:.60}: {why}") from error
+    values = _values(node, prefix, default, leave_out, read_only)
+    return validated(type(default), f"parameter {prefix}.", values)
 
 
 def _values(

@@ -9,8 +9,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from pydantic import ValidationError
-
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
@@ -166,8 +164,7 @@ def _changes_of(pipeline: Pipeline) -> dict[PageSetting, Callable[[float], None]
         pipeline.change_control({"damping_ratio": ratio})
 
     def scale(factor: float) -> None:
-        with suppress(ValidationError):
-            pipeline.change_teleop(TeleopSettings.model_validate(teleop.model_dump() | {"position_scale": factor}))
+        pipeline.change_teleop(TeleopSettings.model_validate(teleop.model_dump() | {"position_scale": factor}))
 
     return {
         PageSetting.SPEED: limit_speed,
