@@ -211,13 +211,13 @@ def test_a_message_that_cannot_be_the_cabinets_changes_nothing(wrong: bytes) -> 
     assert cabinet.session.state.unreadable == 1
 
 
-def test_a_hundred_thousand_wrong_datagrams_raise_nothing() -> None:
+def test_twenty_thousand_wrong_datagrams_raise_nothing() -> None:
     random = np.random.default_rng(0)
     session = ArmSession("left", "cabinet")
     whole = [write_monitoring(replace(message, version=version)) for message in (WAITING, ACTIVE) for version in (1, 2)]
-    for index in range(100_000):
+    for index in range(20_000):
         wrong = bytearray(whole[index % 4])
         for place in random.integers(0, len(wrong), 1 + index % 3):
             wrong[place] = random.integers(0, 256)
         session.answer(bytes(wrong[: None if index % 5 else random.integers(0, len(wrong))]), 1e-3 * index)
-    assert session.state.unreadable > 50_000
+    assert session.state.unreadable > 10_000
