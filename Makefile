@@ -25,12 +25,15 @@ $(VENV)/.installed: pyproject.toml setup.py
 demo: setup
 	$(BIN)/q2r2 demo
 
+# Each worker gets tests that stand one after the other, so a file's recordings and robots are made by one worker.
+LOCAL_TESTS := $(BIN)/python -m pytest -n auto --dist worksteal --ignore tests/ros --ignore tests/lerobot --ignore tests/web
+
 test: setup
-	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot --ignore tests/web -m 'not slow and not soak'
+	$(LOCAL_TESTS) -m 'not slow and not soak'
 
 # Tests that play minutes of motion, or whole runs again and again.
 test-slow: setup
-	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot --ignore tests/web -m 'slow and not soak'
+	$(LOCAL_TESTS) -m 'slow and not soak'
 
 # Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
 test-ros: setup

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -171,7 +172,9 @@ def test_wrong_parts_are_refused_where_they_come_in(robot: Robot, controller: Ca
 
 
 def test_a_pipeline_refuses_a_wrong_duration_and_wrong_settings(pipeline: Pipeline) -> None:
-    assert "allowed: a positive number of seconds" in one_line(ConfigError, lambda: pipeline.run(TEXT))
+    for duration in (TEXT, 0.0, -1.0, math.nan, math.inf):
+        said = one_line(ConfigError, partial(pipeline.run, duration))
+        assert "allowed: a positive number of seconds" in said
     assert "allowed: new values by name" in one_line(ConfigError, lambda: pipeline.change_control(WRONG))
     assert "allowed: TeleopSettings" in one_line(ConfigError, lambda: pipeline.change_teleop(WRONG))
 

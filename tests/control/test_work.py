@@ -51,9 +51,8 @@ def test_the_contract_holds_at_every_tick_of_work_without_fallback_and_it_ends_i
     assert contract.tail_acceleration() < 0.1
 
 
-@pytest.mark.parametrize("speed", ["0.15", "0.50"])
-def test_arms_that_carry_something_close_together_follow_as_they_do_in_free_air(speed: str) -> None:
-    name = f"carry-0.20-{speed}"
+def test_arms_that_carry_something_close_together_follow_as_they_do_in_free_air() -> None:
+    name = "carry-0.20-0.50"
     assert rms(name) <= 1.5 * rms(name, free=True)
     assert figures_of(name).fallback_percent == 0.0
 

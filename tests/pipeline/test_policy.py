@@ -60,7 +60,7 @@ def with_operator() -> Pipeline:
 
 
 def test_takeovers_make_no_target_jump_and_every_tick_says_who_acted() -> None:
-    loop, count = with_operator(), 25
+    loop, count = with_operator(), 8
     watch = Watch(loop)
     summary = loop.run((count + 1) * CYCLE, realtime=False)
     for arm in SIDES:

@@ -27,14 +27,14 @@ LONGEST = 60.0  # [s]
 
 
 class World:
-    """A supervisor whose arms are where its references are; its contract is checked at every tick that is asked for."""
+    """A supervisor whose arms are where its references are; the contract is checked at every tick."""
 
-    def __init__(self, robot: Robot, controller: CartesianController, q: Array, checked: bool = False) -> None:
+    def __init__(self, robot: Robot, controller: CartesianController, q: Array) -> None:
         self.controller = controller
         self.supervisor = Supervisor(robot, controller, StreamSettings(), STRICT)
         self.state = RobotState(q.copy(), np.zeros_like(q), np.zeros_like(q), None, 0.0)
         self.supervisor.activate(self.state, 0.0)
-        self.contract = Contract(controller, q) if checked else None
+        self.contract = Contract(controller, q)
         self.now = 0.0
         self.fastest = 0.0  # of any joint [rad/s]
 
@@ -43,8 +43,7 @@ class World:
         self.supervisor.update_state(self.state, self.now)
         reference = self.supervisor.tick(self.now, DT)
         assert reference is not None
-        if self.contract is not None:
-            self.contract.check(reference, DT)
+        self.contract.check(reference, DT)
         assert reference.report.certified
         assert reference.report.margin > -1e-9
         self.fastest = max(self.fastest, float(np.abs(reference.v).max()))
@@ -78,8 +77,8 @@ def postures(robot: Robot, controller: CartesianController, count: int, seed: in
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("reached", "count"), [(14, 15), pytest.param(48, 50, marks=pytest.mark.soak)])
-def test_from_nearly_all_random_postures_all_joints_come_home(
+@pytest.mark.parametrize(("reached", "count"), [(6, 6), pytest.param(48, 50, marks=pytest.mark.soak)])
+def test_from_nearly_all_random_postures_all_joints_come_home_and_keep_the_contract(
     robot: Robot, controller: CartesianController, reached: int, count: int
 ) -> None:
     ends = []
@@ -92,13 +91,8 @@ def test_from_nearly_all_random_postures_all_joints_come_home(
     assert ends.count("homing_arrived") >= reached, ends
 
 
-def test_the_contract_holds_at_every_tick_of_the_way(robot: Robot, controller: CartesianController) -> None:
-    for q in postures(robot, controller, 2, seed=3):
-        World(robot, controller, q, checked=True).go_home()
-
-
 def test_a_motion_is_braked_before_the_way_home_begins(robot: Robot, controller: CartesianController) -> None:
-    world = World(robot, controller, robot.home, checked=True)
+    world = World(robot, controller, robot.home)
     tool = controller.tool_pose("left")
     for step in range(100):
         raised = tool.copy()
@@ -119,7 +113,7 @@ def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
     robot: Robot, controller: CartesianController, how: str, arguments: tuple[object, ...]
 ) -> None:
     (q,) = postures(robot, controller, 1, seed=6)
-    world = World(robot, controller, q, checked=True)
+    world = World(robot, controller, q)
     assert world.supervisor.go_home() is None
     world.run(3.0)
     at = world.state.q

@@ -99,14 +99,14 @@ def test_fingers_that_open_without_a_proof_are_found(monkeypatch: pytest.MonkeyP
         return -1
 
     monkeypatch.setattr(CartesianController, "_observe_again", accepted)
-    report = run_soak(CONFIG, 5000, 1)
+    report = run_soak(CONFIG, 2000, 3)
     assert report.counts["openings"] > 100
     assert report.counts["openings_refused"] == 0
     assert "distance - kept distance, at ticks" in {found.promise for found in report.broken}
 
 
 def test_the_same_seed_gives_the_same_run() -> None:
-    first, second, other = (run_soak(CONFIG, 500, seed) for seed in (5, 5, 6))
+    first, second, other = (run_soak(CONFIG, 150, seed) for seed in (5, 5, 6))
     assert first.margins == second.margins
     assert first.margins != other.margins
 
@@ -152,13 +152,13 @@ def test_a_broken_promise_is_found_at_its_tick(change: Callable[[Reference], Ref
 
 
 def test_a_wrong_reported_distance_is_found_by_coal() -> None:
-    report = soak(_report(closest_distance=1.0), first=0, ticks=600)
+    report = soak(_report(closest_distance=1.0), first=0, ticks=200)
     assert [found.promise for found in report.broken] == ["reported distance off Coal's"]
 
 
 def test_arms_that_come_too_close_are_found_at_ticks_between_them_and_in_stops() -> None:
     """The controller keeps 20 mm where 150 mm are asked for."""
-    report = soak(lambda reference: reference, 0, 3000, settings=SETTINGS.model_copy(update={"min_distance": 0.15}))
+    report = soak(lambda reference: reference, 0, 1000, settings=SETTINGS.model_copy(update={"min_distance": 0.15}))
     promises = {found.promise for found in report.broken}
     assert {f"distance - kept distance, {when}" for when in ("at ticks", "between ticks", "full stops")} <= promises
 
@@ -167,7 +167,7 @@ def test_a_stop_that_is_due_and_not_executed_is_found() -> None:
     """The faults go to a solver that the controller does not have."""
     elsewhere = FaultySolver(DaqpSolver(14), np.random.default_rng(0))
     controller_and_solver()[1].fault = None
-    report = soak(lambda reference: reference, 0, 3000, solver=elsewhere)
+    report = soak(lambda reference: reference, 0, 300, solver=elsewhere)
     assert {found.promise for found in report.broken} == {
         "solver failed: off the stop",
         "solver failed: stop not reported",
