@@ -146,9 +146,9 @@ def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: A
     frames(page, 30)
     page.reload()  # in the middle of a motion
     begin(page)
+    frames(page, 20)
     wait_for(page, "lost", "connection lost")
-    press(page, LOWER)
-    wait_for(page, "engaged")
+    engage()
     page.evaluate("headset.activeSession.end()")
     wait_for(page, "lost", "does not see the hand")
     run.interrupt()
