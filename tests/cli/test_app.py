@@ -30,7 +30,7 @@ def test_the_help_lists_every_command_whose_own_has_an_example(command: str) -> 
         (("run", CELL, "--input", "mind"), "'mind'"),
         (
             ("run", CELL, "--plant", "kinematic", "--mode", "torque", "--duration", "1"),
-            "mode torque: KinematicPlant follows position, velocity commands only",
+            "mode 'torque': KinematicPlant follows position, velocity commands only",
         ),
         (("run", CELL, "--duration", "nan"), "--duration nan: allowed"),
         (("run", CELL, "--fast"), "--fast needs --duration"),

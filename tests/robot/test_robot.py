@@ -138,7 +138,7 @@ BARE = """<robot name="rod"><link name="base"/><link name="rod"/><joint name="hi
 
 @pytest.mark.parametrize(
     ("arms", "complaint"),
-    [({}, "no arms"), ({"left": "l9"}, "'l9'; links: l0, l1"), ({"left": "l0"}, "carries l0")],
+    [({}, "expected a mapping such as"), ({"left": "l9"}, "'l9'; links: l0, l1"), ({"left": "l0"}, "carries l0")],
 )
 def test_arms_that_the_urdf_does_not_have_are_refused(arms: dict[str, str], complaint: str) -> None:
     with pytest.raises(RobotError, match=complaint):
