@@ -265,7 +265,8 @@ def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: P
     )
     options = (*dagger, *teleop, *dataset_options(seen, "rollout_corrected"), "--play_sounds=false")
     terminal = Terminal(command("lerobot-rollout", seen, *options), seen)
-    terminal.wait("continuous recording started")
+    for line in ("continuous recording started", "the policy has the arms"):
+        terminal.wait(line)
     for _ in range(TAKEOVERS):
         for key, answer in (
             *((SPACE, "autonomous -> paused"), (TAB, "paused -> correcting"), (b"", hands.READY)),

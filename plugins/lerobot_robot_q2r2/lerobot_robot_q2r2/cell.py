@@ -162,8 +162,8 @@ class Q2R2Cell(Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """An action that is not the hands' own is the policy's, which takes the arms from them."""
         self._check()
-        given_back = self.hands.open and not self._asked
-        if given_back:
+        before, self._by_policy = self._by_policy, not self._asked
+        if self._by_policy and self.hands.open:
             self.hands.open = False
             self.pipeline.give_back()
         if not self._asked:
@@ -176,11 +176,12 @@ class Q2R2Cell(Robot):
                 self.pipeline.tick_until(self._start + self._steps / self.config.rate)
             except Q2R2Error as error:
                 self._fault = error
-        if given_back:
-            _logger.info("the policy has the arms, no longer the hands")
+        if self._by_policy and not before:
+            _logger.info("the policy has the arms")
         return action
 
     _asked = False  # whether the next action is the hands'
+    _by_policy = False  # whether the last one was not
 
     def hands_action(self) -> dict[str, Any]:
         """The reference, which the hands drive until an action comes that is not theirs."""
