@@ -290,11 +290,7 @@ CALLS: dict[str, Call] = {
     "CartesianController.set_holding": lambda own, x: own.controller.set_holding(x, True),
     "CartesianController.set_opening": lambda own, x: own.controller.set_opening("left", x, 1.0),
     "CartesianController.move_obstacle": lambda own, x: own.controller.move_obstacle(x, BALL),
-    **each(
-        "RelativeMotion",
-        ("stance", "scale", "rotation_frame", "rotation_scale", "axes", "axis_scales"),
-        lambda own, by, x: RelativeMotion(**{by: x}),
-    ),
+    **each("RelativeMotion", RELATIVE, lambda own, by, x: RelativeMotion(**{by: x})),
     "RelativeMotion.of": lambda own, x: RelativeMotion.of(x),
     **each("Pipeline", PARTS, lambda own, by, x: own.pipeline_of(**{by: x})),
     "Pipeline.from_config": lambda own, x: Pipeline.from_config(x),
@@ -311,26 +307,14 @@ CALLS: dict[str, Call] = {
     "PolicyInput.observe": lambda own, x: own.policy.observe(x),
     "CommandMode": lambda own, x: CommandMode(str(x)),
     "Plant.apply": lambda own, x: own.plant.apply(x),
-    **each(
-        "Plant.apply",
-        ("mode", "q", "v", "grippers"),
-        lambda own, by, x: own.plant.apply(replace(COMMAND, **{by: x})),
-    ),
+    **each("Plant.apply", COMMANDED, lambda own, by, x: own.plant.apply(replace(COMMAND, **{by: x}))),
     "Plant.advance": lambda own, x: own.plant.advance(x),
     "Plant.reset": lambda own, x: own.plant.reset(FIVE if x is None else x),
     "Input.poll": lambda own, x: own.run(samples=x),
     "Input.poll of samples": lambda own, x: own.run(samples=[x]),
-    **each(
-        "Input.poll",
-        ("pose_stamp", "inputs", "inputs_stamp", "fault"),
-        lambda own, by, x: own.run(samples=[replace(SAMPLE, **{by: x})]),
-    ),
+    **each("Input.poll", STAMPS, lambda own, by, x: own.run(samples=[replace(SAMPLE, **{by: x})])),
     "Plant.state": lambda own, x: own.run(state=x),
-    **each(
-        "Plant.state",
-        ("q", "v", "tau_external", "stamp"),
-        lambda own, by, x: own.run(state=replace(own.state, **{by: x})),
-    ),
+    **each("Plant.state", MEASURED, lambda own, by, x: own.run(state=replace(own.state, **{by: x}))),
 }
 
 
