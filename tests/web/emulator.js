@@ -50,8 +50,13 @@ window.press = async (button, frames = 8) => {
   }
 };
 
+window.full = false; // whether the socket takes nothing at the moment
 const Socket = window.WebSocket;
 window.WebSocket = class extends Socket {
+  get bufferedAmount() {
+    return window.full ? 1 : super.bufferedAmount;
+  }
+
   constructor(...all) {
     super(...all);
     this.addEventListener("message", ({ data }) => {

@@ -136,7 +136,10 @@ def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: A
     frames(page, 20)
     wait_for(page, "lost")
     engage()
-    page.evaluate("headset.updateVisibilityState('hidden')")  # by the headset's menu, or taken off
+    # Hidden by the headset's menu, or taken off, at a moment when the socket takes nothing.
+    page.evaluate("full = true, headset.updateVisibilityState('hidden')")
+    frames(page, 5)
+    page.evaluate("full = false")
     wait_for(page, "lost", "does not see the hand")
     page.evaluate("headset.updateVisibilityState('visible')")
     frames(page, 20)

@@ -2,6 +2,7 @@
 
 const RETRY = 2000; // after a closed socket [ms]
 const ALIVE = 500; // between messages without hands [ms]
+const AGAIN = 10; // after lost hands that had to wait [ms]
 const REMEMBERED = 64; // messages whose time of sending is known
 
 // The same number after a reload, by which the run knows the page again.
@@ -49,17 +50,23 @@ export class Link {
     this.socket = socket;
   }
 
-  // Send the hands, unless earlier ones still wait here. `virtual` ones are moved by keys.
+  // Send the hands, unless earlier ones still wait here, and return whether they are sent. Keys move `virtual` ones.
   send(hands, virtual = false) {
     const now = performance.now();
     const waits = !this.open || this.socket.bufferedAmount > 0;
     this.loss += 0.02 * ((waits ? 1 : 0) - this.loss);
-    if (waits) return;
+    if (waits) return false;
     this.sequence += 1;
     this.socket.send(JSON.stringify({ seq: this.sequence, hands, virtual }));
     this.last = now;
     this.sent.set(this.sequence, now);
     this.sent.delete(this.sequence - REMEMBERED);
+    return true;
+  }
+
+  // Say that hands are gone. No frame says so again, therefore this is not left out, but sent as soon as it can be.
+  sendLost(hands, virtual = false) {
+    if (!this.send(hands, virtual)) setTimeout(() => this.sendLost(hands, virtual), AGAIN);
   }
 
   receive(data) {

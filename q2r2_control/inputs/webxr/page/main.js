@@ -56,10 +56,10 @@ async function enter(mode) {
     space = null;
   };
   entered.onvisibilitychange = () => {
-    if (entered.visibilityState !== "visible") link.send(hands.lost());
+    if (entered.visibilityState !== "visible") link.sendLost(hands.lost());
   };
   entered.onend = () => {
-    link.send(hands.lost());
+    link.sendLost(hands.lost());
     session = null;
     show();
   };
@@ -94,7 +94,7 @@ function fly() {
 // No hand is flown any more, which stops the arms.
 function land() {
   if (!flying) return;
-  link.send(flying.lost(), true);
+  link.sendLost(flying.lost(), true);
   flying.end();
   flying = null;
   document.body.classList.remove("flying");
