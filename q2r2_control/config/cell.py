@@ -103,6 +103,9 @@ class ObjectConfig(StrictModel):
     mass: float = Field(0.2, gt=0, le=100, description="of all of it [kg]")
     boxes: tuple[BoxConfig, ...] = Field((), description="further boxes fixed to it, as the walls of a hole")
     friction: float = Field(1.0, ge=0, le=1.5, description="against other objects; pads and obstacles have theirs")
+    stiffness: float | None = Field(
+        None, ge=100, le=1e5, description="of a soft one where it stands on an obstacle; none: as hard as wood [N/m]"
+    )
     colour: Colour = (0.2, 0.45, 0.8, 1.0)
 
 

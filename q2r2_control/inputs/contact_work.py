@@ -58,7 +58,7 @@ CARRY = HandWork(
 )
 
 _SPONGE_X, _SPONGE_Y, _SPONGE_HELD = 0.60, 0.42, 0.248
-_WIPING = _SPONGE_HELD - 0.005  # the spring of the impedance presses with what is left of it [m]
+_WIPING = _SPONGE_HELD - 0.012  # the springs of the impedance and of the sponge press with it [m]
 _STROKES = ((0.72, 0.42), (0.72, 0.39), (0.60, 0.39), (0.60, 0.36), (0.72, 0.36))
 WIPE = HandWork(
     duration=19.4,
@@ -71,8 +71,7 @@ WIPE = HandWork(
             (6.6, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD + 0.01, 0.0, 0.0),
             (8.2, _SPONGE_X, _SPONGE_Y, _WIPING, 0.0, 0.0),  # press
             *((10.0 + 1.5 * i, *place, _WIPING, 0.0, 0.0) for i, place in enumerate(_STROKES)),
-            (16.6, *_STROKES[-1], _SPONGE_HELD, 0.0, 0.0),
-            (17.4, *_STROKES[-1], _SPONGE_HELD, 0.0, 0.0),  # let go
+            (17.4, *_STROKES[-1], _WIPING, 0.0, 0.0),  # let go, where it cannot fall
             (18.2, *_STROKES[-1], 0.33, 0.0, 0.0),
             (19.4, *LEFT_HOME),
         )

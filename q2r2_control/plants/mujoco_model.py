@@ -27,6 +27,7 @@ from q2r2_control.plants.scene import (
     VISUAL_GROUP,
     furnish,
     let_fingers_slide,
+    let_objects_yield,
     set_obstacles,
 )
 from q2r2_control.robot.pairs import ENVELOPE, link_of, pair_names
@@ -71,6 +72,7 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
         _exclude_contacts(spec, robot)
         let_fingers_slide(spec, config)
         _add_objects(spec, config.mujoco)
+        let_objects_yield(spec, config)
         add_cameras(spec, config.simulated_cameras)
         furnish(spec, floor=config.floor is not None)
         return spec.compile()

@@ -120,9 +120,32 @@ def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
                 finger = pad.parent.name
                 if any(spec.exclude("|".join(pair)) is not None for pair in ((finger, name), (name, finger))):
                     continue
-                for shape in (pad, geom):  # a pair needs names
-                    number = next(i for i, other in enumerate(shape.parent.geoms) if other == shape)
-                    shape.name = shape.name or f"{shape.parent.name}_shape_{number}"
-                pair = spec.add_pair(geomname1=pad.name, geomname2=geom.name)
-                pair.condim, pair.friction = 4, (friction, friction, TORSION, ROLLING, ROLLING)
+                pair = _add_pair(spec, pad, geom, friction)
                 pair.solref, pair.solreffriction = _STIFFNESS, _SLIDING
+
+
+# Of the contacts of soft objects: share of MuJoCo's rigid answer, time in which foam takes its shape again [s], and
+# points at which a box stands.
+_SHARE, _RECOVERY, _CORNERS = 0.9, 0.02, 4
+
+
+def let_objects_yield(spec: mujoco.MjSpec, config: Config) -> None:
+    """Contacts of soft objects with obstacles, in MuJoCo's terms: per mass and corner (its documentation, solref)."""
+    for name, thing in config.mujoco.objects.items():
+        if thing.stiffness is None:
+            continue
+        stiffness = thing.stiffness * (1.0 - _SHARE) / (_CORNERS * thing.mass)  # [1/s^2]
+        for shape in spec.body(name).geoms:
+            for geom in (geom for obstacle in config.obstacles for geom in spec.body(obstacle).geoms if geom.contype):
+                pair = _add_pair(spec, shape, geom, config.mujoco.obstacle_friction)
+                pair.solref = -stiffness, -stiffness * _RECOVERY
+                pair.solimp[:2] = _SHARE, _SHARE
+
+
+def _add_pair(spec: mujoco.MjSpec, one: mujoco.MjsGeom, other: mujoco.MjsGeom, friction: float) -> mujoco.MjsPair:
+    for shape in (one, other):  # a pair needs names
+        number = next(i for i, geom in enumerate(shape.parent.geoms) if geom == shape)
+        shape.name = shape.name or f"{shape.parent.name}_shape_{number}"
+    pair = spec.add_pair(geomname1=one.name, geomname2=other.name)
+    pair.condim, pair.friction = 4, (friction, friction, TORSION, ROLLING, ROLLING)
+    return pair

@@ -24,13 +24,27 @@ def test_every_pad_and_the_table_are_named_with_the_cells_friction(robot: Robot,
         for index in range(model.ngeom)
         if model.geom_contype[index] and "_finger_" in model.body(model.geom_bodyid[index]).name
     }
+    sponge = model.geom("sponge").id
     named = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
     assert len(pads) >= 4
-    assert named == {frozenset((pad, table)) for pad in pads}
+    assert named == {frozenset((shape, table)) for shape in (*pads, sponge)}
     np.testing.assert_array_equal(model.pair_friction[:, :2], 0.3)
     assert model.geom_friction[table, 0] == 0.3
     # How the table bears a finger is what it is for everything else.
-    np.testing.assert_array_equal(model.pair_solref, np.tile(model.geom_solref[table], (model.npair, 1)))
+    of_pads = model.pair_solref[(model.pair_geom1 != sponge) & (model.pair_geom2 != sponge)]
+    np.testing.assert_array_equal(of_pads, np.tile(model.geom_solref[table], (len(pads), 1)))
+
+
+def test_a_soft_object_yields_by_its_stiffness_where_it_stands(robot: Robot, config: Config) -> None:
+    plant = MujocoPlant(robot, config)
+    sponge, heights = plant.model.body("sponge").id, []
+    for force in (0.0, 5.0, 10.0):
+        plant.data.xfrc_applied[sponge, 2] = -force
+        mujoco.mj_step(plant.model, plant.data, 1000)
+        heights.append(plant.data.xpos[sponge, 2])
+    stiffness = config.mujoco.objects["sponge"].stiffness
+    assert stiffness is not None
+    np.testing.assert_allclose(-np.diff(heights), 5.0 / stiffness, rtol=0.05)
 
 
 def depths(config: Config, speed: float, named: bool) -> Array:
