@@ -45,6 +45,12 @@ _ALL = (
         lambda parts: tuple(map(LiftJudge, parts)),
     ),
     AssemblyTask(
+        "clash",
+        "as meet, but the hands lead the arms into each other, and the arms refuse",
+        ("blue_block", "yellow_block"),
+        lambda parts: tuple(map(LiftJudge, parts)),
+    ),
+    AssemblyTask(
         "grasp",
         "a block of 15 mm is taken from the table and put back",
         ("flat_block",),

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
-TASKS = ("carry", "grasp", "handover", "meet", "peg", "stack", "wipe")
+TASKS = ("carry", "clash", "grasp", "handover", "meet", "peg", "stack", "wipe")
 _MOST_STEPS = 900  # half a minute at 30 Hz
 
 for _task in TASKS:

@@ -7,27 +7,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 from q2r2_control.inputs.contact_work import CARRY, PEG, WIPE
-from q2r2_control.inputs.way_points import LEFT_HOME, RIGHT_HOME, HandWork
+from q2r2_control.inputs.way_points import LEFT_HOME, RIGHT_HOME, HandWork, WayPoint
 
 # A block of 60 mm, held 17 mm above its middle.
 _GRIP, _OVER = 0.243, 0.33
-_MEET = (
-    (1.4, 0.55, 0.25, 0.35, 0.0, 0.0),  # over the block
-    (3.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # down around it
-    (4.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # grasp
-    (5.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # lift
-    (9.0, 0.55, 0.065, 0.40, -0.25, 0.0),  # to the middle, wrists outwards: the grippers nearly touch
-    (10.0, 0.55, 0.065, 0.40, -0.25, 0.0),
-    (12.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # back
-    (14.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # put down
-    (15.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # let go
-    (17.4, *LEFT_HOME),
-)
+
+
+def _meeting(middle: float) -> dict[str, tuple[WayPoint, ...]]:
+    """Ways of both hands that lead their blocks to ``middle`` [m] from the cell's middle, and put them back."""
+    left: tuple[WayPoint, ...] = (
+        (1.4, 0.55, 0.25, 0.35, 0.0, 0.0),  # over the block
+        (3.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # down around it
+        (4.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # grasp
+        (5.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # lift
+        (9.0, 0.55, middle, 0.40, -0.25, 0.0),  # to the middle, wrists outwards
+        (10.0, 0.55, middle, 0.40, -0.25, 0.0),
+        (12.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # back
+        (14.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # put down
+        (15.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # let go
+        (17.4, *LEFT_HOME),
+    )
+    return {"left": left, "right": tuple((t, x, -y, z, -tilt, -turn) for t, x, y, z, tilt, turn in left)}
+
+
 MEET = HandWork(
     duration=17.4,
-    tools={"left": _MEET, "right": tuple((t, x, -y, z, -tilt, -turn) for t, x, y, z, tilt, turn in _MEET)},
+    tools=_meeting(0.065),  # where the grippers nearly touch
     steps=(
         (0.0, "each hand reaches for its block"),
         (3.2, "both grasp"),
@@ -38,6 +46,8 @@ MEET = HandWork(
     ),
     presses={"left": (3.5, 14.9), "right": (3.7, 15.1)},
 )
+# Each target gets to 85 mm from its tool, which the leash allows, so that the blocks are put back where they were.
+CLASH = replace(MEET, tools=_meeting(-0.02))
 
 _LOW = 0.216  # tips 3 mm above the table
 GRASP = HandWork(
@@ -157,6 +167,7 @@ HANDOVER = HandWork(
 # In the order in which they can follow each other.
 WORKS: Mapping[str, HandWork] = {
     "meet": MEET,
+    "clash": CLASH,
     "grasp": GRASP,
     "carry": CARRY,
     "handover": HANDOVER,

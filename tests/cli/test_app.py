@@ -43,7 +43,7 @@ def test_the_help_lists_every_command_whose_own_has_an_example(command: str) -> 
         (("run", CELL, "--viewer", "--headless"), "--viewer"),
         (("run", CELL, "--task", "something"), "--task needs --record"),
         (("run", CELL, "--operator", "Ada"), "--operator needs --record"),
-        (("demo", "juggle"), "task 'juggle': allowed: meet, grasp, carry"),
+        (("demo", "juggle"), "task 'juggle': allowed: meet, clash, grasp, carry"),
         (("demo", "--fast", "--rt"), "exclude each other"),
         (("replay", "pyproject.toml"), "pyproject.toml"),
         (("replay", "missing.mcap"), "missing.mcap"),

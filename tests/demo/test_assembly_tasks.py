@@ -106,6 +106,17 @@ def test_arms_that_yield_press_with_what_is_asked_and_find_the_hole(name: str) -
         assert result.measured["tilt_deg"] < 1.0
 
 
+@pytest.mark.parametrize("mode", list(SHOWN))
+def test_arms_that_hands_lead_into_each_other_refuse_without_a_touch(mode: CommandMode) -> None:
+    played = Played("clash", mode)
+    assert played.results["clash"].reason == ""
+    led = [[tick.targets[arm].pose for arm in ("left", "right")] for tick in played.ticks]
+    ways = [left.translation[1] - right.translation[1] for left, right in led if left is not None and right is not None]
+    assert min(ways) < -0.03  # past each other
+    assert played.summary.at_rest
+    assert played.summary.uncertified_ticks == 0
+
+
 def test_hands_that_never_grip_lift_nothing_and_the_measure_says_so() -> None:
     held_up_at = 7.0
     result = Played("grasp", CommandMode.POSITION, Gripless, held_up_at).results["grasp"]
@@ -141,7 +152,7 @@ def test_tasks_come_in_the_order_in_which_they_can_follow_each_other() -> None:
     assert [task.name for task in tasks_named(["stack", "meet", "stack"])] == ["meet", "stack"]
     assert tasks_named(["all"]) == tuple(TASKS.values())
     with pytest.raises(
-        ConfigError, match="task 'juggle': allowed: meet, grasp, carry, handover, stack, wipe, peg, all"
+        ConfigError, match="task 'juggle': allowed: meet, clash, grasp, carry, handover, stack, wipe, peg, all"
     ):
         tasks_named(["juggle"])
 

@@ -105,7 +105,7 @@ def test_nothing_comes_before_start_nor_after_close_and_it_waits_while_nobody_po
         *(
             (
                 {"trajectory": name},
-                r"allowed are circle, .*peg, and meet, grasp, carry, handover, stack, wipe, peg joined by \+$",
+                r"allowed are circle, .*peg, and meet, clash, grasp, carry, handover, stack, wipe, peg joined by \+$",
             )
             for name in ("spiral", "handover+", "circle+stack", "")
         ),
