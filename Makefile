@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot test-lerobot test-learning test-web chromium lint bench docs picture page-picture soak wheel release-check arena clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot test-lerobot test-learning test-web web-setup chromium lint bench docs picture page-picture soak wheel release-check arena clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -52,8 +52,10 @@ test-soak: setup
 # Meta's emulator of headsets comes from npm, under a licence of its own; it is no part of this project.
 IWER := $(VENV)/iwer
 
-test-web: chromium $(VENV)/.installed-web $(IWER)/package
+test-web: web-setup
 	$(BIN)/python -m pytest tests/web
+
+web-setup: chromium $(VENV)/.installed-web $(IWER)/package
 
 $(IWER)/package:
 	@command -v npm > /dev/null || { echo 'the emulated headset is fetched with npm: apt-get install npm'; exit 1; }
