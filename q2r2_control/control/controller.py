@@ -164,9 +164,7 @@ class CartesianController:
         check_kind("targets", targets, Mapping, "a pin.SE3 or None by arm, such as {'left': pose}", RobotError)
         usable = _passes(dt)
         time = min(float(dt), LONGEST_DT) if usable else 0.0
-        state = self._state
-        for kept, array in zip(self._before, (state.q, state.v, self._stop), strict=True):
-            kept[:] = array
+        self._remember()
         self._targets.aim_posture(posture)
         summary = StepSummary()
         if usable and dt > time:
@@ -181,9 +179,12 @@ class CartesianController:
             pointers = self._model_pointer, self._targets.pointer, self._data_pointer
             summary.targets_usable, _, _ = self._assemble(*pointers, longest, 0.0)
         rejected = () if known and summary.targets_usable else self._targets.rejected(targets)
+        return self._reference(summary, usable and dt <= LONGEST_DT, rejected)
+
+    def _reference(self, summary: StepSummary, dt_usable: bool, rejected: tuple[str, ...] = ()) -> Reference:
         closest, distance, tightest, margin = self._observed
         report = StepReport(
-            status=summary.status(self._apart, usable and dt <= LONGEST_DT, rejected),
+            status=summary.status(self._apart, dt_usable, rejected),
             rejected=rejected,
             binding=self._names.of(self._active),
             closest_pair=self._names.pair(closest),
@@ -196,18 +197,28 @@ class CartesianController:
             margin=margin,
             unsolved=summary.unsolved,
         )
+        state = self._state
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
 
-    def brake(self, dt: float) -> None:
+    def brake(self, dt: float) -> Reference:
         """Move the reference by ``dt`` [s] along its certified stop, of which the rest stays certified.
 
-        A dt that :meth:`step` does not use moves nothing.
+        Nothing else moves it: it is at rest when the stop ends. A dt that :meth:`step` does not use moves nothing.
         """
-        if not _passes(dt):
-            return
-        self._obstacles.pass_time(dt)
-        self._observed, _, _ = self._move(self._model_pointer, self._data_pointer, self._solution, False, dt, 0.0)
-        self._apart = self._observed[-1] >= -ROUNDING
+        self._remember()
+        self._state.a[:] = 0.0
+        usable = _passes(dt)
+        if usable:
+            self._obstacles.pass_time(dt)
+            self._observed, _, _ = self._move(self._model_pointer, self._data_pointer, self._solution, False, dt, 1.0)
+            self._apart = self._observed[-1] >= -ROUNDING
+        self._active.used[0] = 0  # no limit holds it back from anything
+        return self._reference(StepSummary(), usable)
+
+    def _remember(self) -> None:
+        """The state to which :meth:`withdraw` returns."""
+        for kept, array in zip(self._before, (self._state.q, self._state.v, self._stop), strict=True):
+            kept[:] = array
 
     def withdraw(self, reference: Reference) -> None:
         """Undo the last step, whose ``reference`` came too late for the plant: be where the arms went on braking from.

@@ -141,7 +141,7 @@ class ControlLoop:
         if was_inactive and supervisor.phase is Phase.ACTIVE and state is not None:
             self._begin(state, openings, now)
         if reference is None and self._owns_plant:
-            reference = self.controller.step({}, dt)  # the rest of the arms' motion
+            reference = self.controller.brake(dt)  # the rest of the arms' motion
         if self.controller.kept_distances is not self._kept:  # the step may have taken up others
             self._kept = self.controller.kept_distances
             self.drive.set_kept_distances(self._kept)

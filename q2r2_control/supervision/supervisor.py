@@ -5,7 +5,7 @@
 
 Inactive and stopped command nothing more, so that whatever else holds the arms is not disturbed. Activation starts the
 reference at the measured posture and forgets all targets: nothing moves until a stream of targets begins anew at the
-tool, see :mod:`target_stream`. At a fault the arms brake, within all promises of the controller, and hold where they
+tool, see :mod:`target_stream`. At a fault the arms brake along the controller's certified stop, and hold where they
 come to rest. Knows no ROS and no clock: times are passed in.
 """
 
@@ -170,7 +170,9 @@ class Supervisor:
 
     def _step(self, targets: dict[str, pin.SE3 | None], dt: float, posture: Array | None) -> Reference:
         state = self._watch.state
-        if state is None or self.phase is not Phase.ACTIVE:
+        if self.phase is not Phase.ACTIVE:
+            return self._controller.brake(dt)
+        if state is None:
             return self._controller.step(targets, dt)
         if self._displace is not None:
             targets = self._displace(targets, state, dt)

@@ -58,3 +58,19 @@ def test_arms_that_are_sent_into_each_other_keep_every_promise_with_late_steps(r
         nearest = min(nearest, (robot.distance_values(reference.q) - controller.kept_distances).min())
         before = reference
     assert -1e-9 <= nearest < 0.01
+
+
+def test_a_reference_that_brakes_says_how_and_can_be_undone_too(robot: Robot) -> None:
+    controller = CartesianController(robot)
+    targets = crossing(controller)
+    for _ in range(100):
+        before = controller.step(targets, DT)
+    deceleration = controller.stop_deceleration
+    braked = controller.brake(DT)
+    np.testing.assert_allclose(braked.a, -np.sign(before.v) * deceleration, atol=1e-6)
+    assert braked.report.certified
+    controller.withdraw(braked)
+    np.testing.assert_array_equal(braked.q, before.q)
+    while np.abs(braked.v).max() > 0.0:
+        braked = controller.brake(DT)
+    np.testing.assert_array_equal(controller.brake(DT).q, braked.q)

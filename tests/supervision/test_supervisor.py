@@ -281,3 +281,17 @@ def test_arms_that_lag_behind_the_commands_are_not_off_their_reference(world: Wo
         assert not world.supervisor.off_reference
     assert deviation > 0.03
     assert world.supervisor.follows("left")
+
+
+def test_arms_that_brake_near_each_other_rest_when_their_stop_ends_and_make_no_room_by_themselves(
+    world: World, controller: CartesianController
+) -> None:
+    world.q = np.array([-0.8, 0.42, -0.69, -1.49, 0.43, 1.12, -0.28, 0.52, 0.47, 0.18, -1.31, -0.02, 1.32, 0.36])
+    world.run(0.2)
+    begun = world.q.copy()
+    velocity = np.array([*np.zeros(7), 0.49, 0.22, -0.14, 0.16, 0.42, 0.34, -0.01])
+    controller.reset(begun, velocity)
+    world.supervisor.stop(Reason(ReasonKind.OTHER))
+    world.run(float(np.abs(velocity).max()) / controller.settings.acceleration_limit + 0.05)
+    assert np.abs(world.v).max() < 1e-9
+    np.testing.assert_array_equal(world.q[:7], begun[:7])
