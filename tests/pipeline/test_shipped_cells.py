@@ -10,12 +10,11 @@ import pytest
 from q2r2_control.config.cell import load_config
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
-from q2r2_control.verification.contract import Contract
 from tests.config.cell_files import SHIPPED
 from tests.control.scenarios import into_the_table, overhead
 from tests.support.driven import Driven
+from tests.support.processes import Watch
 
 
 @pytest.mark.parametrize("file", sorted(SHIPPED.glob("*.yaml")), ids=lambda file: file.stem)
@@ -24,14 +23,9 @@ def test_its_tools_follow_the_hands_around_a_circle_and_keep_the_contract_where_
     config = load_config(file).model_copy(update={"loop_rate_hz": 500.0})
     pipeline = Pipeline.from_config(config, input=ScriptedInput.from_config(config, "circle"), plant="mujoco")
     assert preflight_faults(pipeline.robot, pipeline.controller.settings, pipeline.controller) == ()
-    contract, heights = Contract(pipeline.controller), []
-
-    def look(tick: Tick) -> None:
-        contract.check(tick.reference, tick.step)
-        heights.append([tool.translation[2] for tool in tick.tools.values()])
-
-    pipeline.listeners.append(look)
+    watch = Watch(pipeline)  # of the contract
     summary = pipeline.run(2.8, realtime=False)
+    heights = [[tool.translation[2] for tool in tick.tools.values()] for tick in watch.ticks]
     assert (np.ptp(heights, axis=0) > 0.02).all()
     assert summary.at_rest
     assert summary.uncertified_ticks == summary.rejected_targets == 0

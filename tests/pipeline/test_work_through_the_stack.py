@@ -32,7 +32,8 @@ SLIDE = replace(WORK_MOTIONS["slide"], rest=1.5)
 def config() -> Config:
     cell = load_config("config/dual_iiwa7.yaml")
     empty = cell.mujoco.model_copy(update={"objects": {}})
-    return cell.model_copy(update={"loop_rate_hz": RATE, "mujoco": empty})
+    control = cell.control.model_copy(update={"solve_time_limit": None})
+    return cell.model_copy(update={"loop_rate_hz": RATE, "mujoco": empty, "control": control})
 
 
 @cache

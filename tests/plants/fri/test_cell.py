@@ -235,7 +235,7 @@ def test_an_arm_that_stands_beyond_its_margin_is_led_back(config: Config, robot:
     start[joint] = robot.position_upper[joint] - 0.3 * margin
     pipeline = make_loop(config, start=start)
     plant = started(pipeline)
-    pipeline.run(0.6, realtime=False)
+    pipeline.run(0.8, realtime=False)
     assert trips(plant) == []
     assert plant.heard["left"][0][6] == pytest.approx(start[joint], abs=1e-4)
     assert plant.heard["left"][-1][6] <= robot.position_upper[joint] - margin + 1e-4
