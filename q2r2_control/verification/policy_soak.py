@@ -110,7 +110,7 @@ class HostilePolicy:
         if space is ActionSpace.JOINTS:
             return np.asarray(q)
         if space is ActionSpace.TOOL_DELTA:
-            return random.choice([-1.0, 1.0], 6 * len(robot.arms)) * step
+            return np.asarray(random.choice([-1.0, 1.0], 6 * len(robot.arms)), dtype=float) * step
         poses = [pin.SE3ToXYZQUAT(robot.tool_pose(q, arm)) for arm in robot.arms]
         if stream == "limits":
             for pose in poses:

@@ -88,7 +88,7 @@ def test_the_margin_that_a_report_tells_is_to_what_the_pairs_keep_at_that_tick(
         spare = distances - controller.object_distances
         if distances[spare.argmin()] > 0.0:  # Coal's depth is another quantity
             assert reference.report.margin == pytest.approx(spare.min(), abs=2e-6)
-            grown += counting(controller).min() > kept
+            grown += int(counting(controller).min() > kept)
         kept = counting(controller).min()
     assert grown > 0, "what the pair with the table keeps grows as the object is lifted"
 

@@ -226,7 +226,8 @@ class JointRecorder:
     def speeds(self, duration: float) -> Array:
         """Greatest speed of each joint in the last ``duration`` [s]."""
         recent = self.since(time.monotonic() - duration)
-        return np.max([np.abs(state.v) for state in recent], axis=0) if recent else np.zeros(self._robot.model.nv)
+        speeds = np.abs([state.v for state in recent] or [np.zeros(self._robot.model.nv)])
+        return np.asarray(speeds.max(axis=0), dtype=float)
 
     def fastest(self, since: float) -> float:
         """Greatest speed of any joint since [s], as a mean over a window [rad/s]."""

@@ -327,13 +327,13 @@ def test_every_shape_keeps_position_limits_at_every_moment_of_the_stop(shape: in
     """Every joint, near a limit or not, starts as fast as property P allows; the slow ones would drift on for long."""
     random, limits, h = np.random.default_rng(seed), MODEL.limits, 0.001
     room = 10.0 ** random.uniform(-6, 0, 14)
-    ahead = random.choice([-1.0, 1.0], 14)
+    ahead = np.asarray(random.choice([-1.0, 1.0], 14), dtype=float)
     limit = np.where(ahead > 0, limits.upper, limits.lower)
     q = limit - ahead * room
     # The largest speed that P allows: v^2 / 2a + H v = room.
     a, longest = limits.acceleration, limits.longest_step
     fastest = np.minimum(a * (-longest + np.sqrt(longest**2 + 2 * room / a)), limits.velocity)
-    v = ahead * fastest * random.choice([1.0 - 1e-9, 0.5, 0.01], 14)
+    v = ahead * fastest * np.asarray(random.choice([1.0 - 1e-9, 0.5, 0.01], 14), dtype=float)
     deceleration = _decelerations(q, v, shape)
     assert (deceleration > 0.0).all()
     assert (deceleration <= a * (1 + 1e-12)).all()
