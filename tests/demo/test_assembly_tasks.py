@@ -112,7 +112,7 @@ def test_arms_that_hands_lead_into_each_other_refuse_without_a_touch(mode: Comma
     assert played.results["clash"].reason == ""
     led = [[tick.targets[arm].pose for arm in ("left", "right")] for tick in played.ticks]
     ways = [left.translation[1] - right.translation[1] for left, right in led if left is not None and right is not None]
-    assert min(ways) < -0.03  # past each other
+    assert min(ways) < 1e-3  # to one place
     assert played.summary.at_rest
     assert played.summary.uncertified_ticks == 0
 
