@@ -25,13 +25,17 @@ def crossing(controller: CartesianController) -> dict[str, pin.SE3 | None]:
     return {"left": pin.SE3(left.rotation, right.translation), "right": pin.SE3(right.rotation, left.translation)}
 
 
-def test_an_undone_step_leaves_state_and_stop_as_they_were(robot: Robot) -> None:
+def moving(robot: Robot) -> tuple[CartesianController, Reference]:
+    """A controller whose arms are on their way into each other, and its last reference."""
     controller = CartesianController(robot)
     targets = crossing(controller)
-    for _ in range(100):
-        before = controller.step(targets, DT)
+    return controller, [controller.step(targets, DT) for _ in range(100)][-1]
+
+
+def test_an_undone_step_leaves_state_and_stop_as_they_were(robot: Robot) -> None:
+    controller, before = moving(robot)
     stop = controller.stop_deceleration
-    late = controller.step(targets, DT)
+    late = controller.step(crossing(controller), DT)
     assert np.abs(late.q - before.q).max() > 1e-4
     controller.withdraw(late)
     np.testing.assert_array_equal(late.q, before.q)
@@ -61,10 +65,7 @@ def test_arms_that_are_sent_into_each_other_keep_every_promise_with_late_steps(r
 
 
 def test_a_reference_that_brakes_says_how_and_can_be_undone_too(robot: Robot) -> None:
-    controller = CartesianController(robot)
-    targets = crossing(controller)
-    for _ in range(100):
-        before = controller.step(targets, DT)
+    controller, before = moving(robot)
     deceleration = controller.stop_deceleration
     braked = controller.brake(DT)
     np.testing.assert_allclose(braked.a, -np.sign(before.v) * deceleration, atol=1e-6)

@@ -25,7 +25,7 @@ from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 ACCELERATION = 4.0  # of the reference [rad/s^2]
 _ALLOWANCE, _STILL = 0.05, 1e-3  # after the braking time the reference rests [s], [rad/s]
-_MAKES_ROOM = 0.02  # a new reference, begun at arms that their springs left nearer than they rest by themselves [rad/s]
+_MAKES_ROOM = 0.02  # of a new reference, which begins where springs left the arms, nearer than it would rest [rad/s]
 
 
 class Rest(NamedTuple):
