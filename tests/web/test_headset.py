@@ -19,6 +19,8 @@ EMULATOR = Path(os.environ.get("Q2R2_IWER", ".venv/iwer/package")) / "build" / "
 RUN = ("tests.web.headset_run", "0.004")
 LOWER = {"left": "x-button", "right": "a-button"}
 UPPER = {"left": "y-button", "right": "b-button"}
+# One browser opens both pages, and a page of the driver's browser would be its own, loaded anew.
+ANOTHER_BROWSER = "Storage.prototype.getItem = () => null"
 ORANGE = (255.0, 107.0, 13.0)  # of the arms' rings
 
 
@@ -161,7 +163,7 @@ def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: A
 def test_the_first_headset_drives_and_another_is_told_so(enter: Any, start: Start, open_page: Open) -> None:
     run = start(*RUN)
     page = enter(run.url, "ar")
-    other = open_page(run.url, "")
+    other = open_page(run.url, ANOTHER_BROWSER)
     wait_until(lambda: "drives" in other.inner_text("#link"))
     press(page, LOWER)
     wait_for(page, "engaged")
