@@ -35,7 +35,14 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, AssemblyTask, held_to_promises, tasks_named, with_carry
+from q2r2_control.demo.assembly_tasks import (
+    ALL_TASKS,
+    TASKS,
+    AssemblyTask,
+    held_to_promises,
+    tasks_named,
+    with_controls,
+)
 from q2r2_control.demo.trials import try_tasks
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import adapted, make_input, options_of
@@ -223,10 +230,10 @@ def demo(
         say("--viewer shows the arms in MuJoCo's window, --web in a browser")
     if plant == "fri":
         with rehearsal(_FRI_CONFIG, mode, chosen, period, rt) as results:
-            done = run_cell(with_carry(load_config(_FRI_CONFIG)), options)
+            done = run_cell(with_controls(load_config(_FRI_CONFIG)), options)
         done = replace(done, tasks=held_to_promises(results, done.summary))
     else:
-        done = run_cell(with_carry(load_config(DEMO_CONFIG)), options)
+        done = run_cell(with_controls(load_config(DEMO_CONFIG)), options)
     print_summary(done, json)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)

@@ -15,6 +15,7 @@ from q2r2_control.config.strict import STREAM_TIMEOUT, StrictModel
 from q2r2_control.types import Array, Interval
 
 _Scale = Annotated[float, Field(ge=0, le=10)]
+PRECISION_SCALE = 0.25
 _SIGNS = (("+", 1.0), ("-", -1.0))
 _ALLOWED = "three of +x -x +y -y +z -z that use x, y and z once each, e.g. [+z, -x, +y]"
 
@@ -130,7 +131,7 @@ class TeleopSettings(StrictModel):
         0.6, ge=0.2, le=3, description="after which a control counts as held, where that is bound [s]"
     )
     linked: bool = Field(True, description="a fault of one hand disengages both arms")
-    precision_scale: float = Field(0.25, gt=0, le=1, description="of all motion while precision is held")
+    precision_scale: float = Field(PRECISION_SCALE, gt=0, le=1, description="of all motion while precision is held")
     gripper_speed: float = Field(
         4.0, gt=0, le=50, description="of a gripper that is gripper_analog, in full openings a second [1/s]"
     )

@@ -90,6 +90,7 @@ _ALL = (
 )
 TASKS: dict[str, AssemblyTask] = {task.name: task for task in _ALL}
 ALL_TASKS = "all"
+_TASK_CONTROLS = {"grip": Action.CARRY, "stick_up": Action.PRECISION}
 
 
 def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
@@ -103,12 +104,11 @@ def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
     return tuple(task for name, task in TASKS.items() if name in wanted or ALL_TASKS in wanted)
 
 
-def with_carry(config: Config) -> Config:
-    """The cell with the grips bound to ``carry``, as the task of this name has it, where no control is."""
+def with_controls(config: Config) -> Config:
+    """The cell with ``carry`` and ``precision`` bound as tasks have them, where no control is bound to them."""
     bindings = config.teleop.bindings
-    if bindings.words_of(Action.CARRY) is not None:
-        return config
-    teleop = config.teleop.model_copy(update={"bindings": bindings.model_copy(update={"grip": Action.CARRY})})
+    given = {control: action for control, action in _TASK_CONTROLS.items() if bindings.words_of(action) is None}
+    teleop = config.teleop.model_copy(update={"bindings": bindings.model_copy(update=given)})
     return config.model_copy(update={"teleop": teleop})
 
 

@@ -11,7 +11,7 @@ from functools import partial
 from multiprocessing import get_context
 
 from q2r2_control.config.cell import Config
-from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, held_to_promises, tasks_named, with_carry
+from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, held_to_promises, tasks_named, with_controls
 from q2r2_control.errors import PlantError
 from q2r2_control.inputs.scripted import ScriptedInput, hurried, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -67,7 +67,7 @@ def try_tasks(
 def try_task(config: Config, mode: CommandMode, shaky: bool, job: tuple[str, int]) -> str:
     """Try a task of a name with a seed; returns what fell short, empty where it succeeded."""
     name, seed = job
-    config, work = with_carry(config), trajectory_named(name)
+    config, work = with_controls(config), trajectory_named(name)
     work = hurried(work, seed) if shaky else work
     robot = Robot.from_config(config)
     plant = MujocoPlant(robot, config)

@@ -89,21 +89,21 @@ WIPE = HandWork(
 _PEG, _HOLE = (0.60, -0.40), (0.66, -0.24)
 _PEG_HELD = 0.265  # 30 mm over the middle of a peg of 70 mm
 _ON_TOP = _PEG_HELD + 0.04  # with the peg on the socket
-_SEARCH = 8  # way points of the search, a spiral of two turns
+_TURNS, _WIDEST, _PRESSED = 4, 0.004, 0.005  # of the search: a spiral, and how far below the socket's top it presses
 
 
-def _searching(begins: float) -> tuple[WayPoint, ...]:
-    """A spiral, pressed on lightly, until the peg falls in; then the way down."""
-    points = []
-    for i in range(2 * _SEARCH + 1):
-        angle, radius = 2.0 * math.pi * i / _SEARCH, 0.0015 * i / (2 * _SEARCH)
+def _searching(begins: float, duration: float) -> tuple[WayPoint, ...]:
+    """A spiral, pressed on lightly, until the peg falls in."""
+    points, steps = [], 8 * _TURNS
+    for i in range(steps + 1):
+        angle, radius = 2.0 * math.pi * _TURNS * i / steps, _WIDEST * i / steps
         x, y = _HOLE[0] + radius * math.cos(angle), _HOLE[1] + radius * math.sin(angle)
-        points.append((begins + 0.25 * i, x, y, _ON_TOP - 0.003, 0.0, 0.0))
+        points.append((begins + duration * i / steps, x, y, _ON_TOP - _PRESSED, 0.0, 0.0))
     return tuple(points)
 
 
 PEG = HandWork(
-    duration=19.0,
+    duration=24.0,
     tools={
         "right": (
             (1.6, *_PEG, 0.35, 0.0, 0.0),
@@ -111,21 +111,22 @@ PEG = HandWork(
             (3.8, *_PEG, _PEG_HELD, 0.0, 0.0),  # grasp
             (5.0, *_PEG, _ON_TOP + 0.03, 0.0, 0.0),
             (6.8, *_HOLE, _ON_TOP + 0.03, 0.0, 0.0),
-            (8.2, *_HOLE, _ON_TOP + 0.004, 0.0, 0.0),
-            *_searching(9.4),
-            (14.6, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # in
-            (15.6, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # let go
-            (16.8, *_HOLE, 0.36, 0.0, 0.0),
-            (19.0, *RIGHT_HOME),
+            (8.2, *_HOLE, _ON_TOP + 0.008, 0.0, 0.0),
+            *_searching(9.4, 8.0),
+            (19.2, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # in
+            (20.6, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # let go
+            (21.8, *_HOLE, 0.36, 0.0, 0.0),
+            (24.0, *RIGHT_HOME),
         )
     },
     steps=(
         (0.0, "the right hand reaches for the peg"),
         (3.0, "it grasps"),
         (5.0, "it carries the peg over the hole"),
-        (8.2, "it looks for the hole"),
-        (13.4, "it pushes the peg in"),
-        (15.0, "it lets go"),
+        (8.2, "it looks for the hole, with precision"),
+        (17.4, "it pushes the peg in"),
+        (20.0, "it lets go"),
     ),
-    presses={"right": (3.1, 15.0)},
+    presses={"right": (3.1, 20.0)},
+    precise=((8.2, 19.6),),
 )

@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.teleop import PRECISION_SCALE
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.assembly import WORKS
 from q2r2_control.inputs.played import EvenSampling, HeadsetSampling, PlayedInput, SampleTiming
@@ -42,6 +43,7 @@ class HandTrajectory:
     duration: float | None = None  # None: without end [s]
     steps: tuple[tuple[float, str], ...] = ()  # from when on [s], in words
     grips: tuple[float, ...] = ()  # taps of the left grip [s]
+    precise: tuple[tuple[float, float], ...] = ()  # from when to when both sticks are pushed up [s]
     lost: tuple[float, float] = (math.inf, math.inf)  # from when to when the headset does not see the hands [s]
 
     def displacement(self, hand: str, t: float, frequency: float) -> tuple[Array, Array]:
@@ -67,6 +69,7 @@ class HandTrajectory:
             button_lower=pressed[1],
             press_index=float(closed),
             press_middle=float(pressed[2]),
+            thumb_stick_vertical=float(any(begins <= t < ends for begins, ends in self.precise)),
         )
 
 
@@ -105,7 +108,7 @@ def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
     points = {hand: [home] for hand, home in homes.items()}
     presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
     begins, steps = START, [(0.0, "the hands rest")]
-    grips, engages = list[float](), list[float]()
+    grips, engages, precise = list[float](), list[float](), list[tuple[float, float]]()
     for name, work in works:
         steps += [(begins + t, f"{name}: {words}") for t, words in work.steps]
         for hand, home in homes.items():
@@ -114,24 +117,28 @@ def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
             presses[hand] += [begins + t for t in work.presses.get(hand, ())]
         grips += [begins + t for t in work.grips]
         engages += [begins + t for t in work.engages]
+        precise += [(begins + first, begins + last) for first, last in work.precise]
         begins += work.duration
     return HandTrajectory(
-        left=_from_home(points["left"], "left"),
-        right=_from_home(points["right"], "right"),
+        left=_from_home(points["left"], "left", precise),
+        right=_from_home(points["right"], "right", precise),
         upper_presses={hand: tuple(times) for hand, times in presses.items()},
         lower_presses=(FIRST_PRESS, *engages, begins + _LAST_PRESS),
         duration=begins + _LAST_PRESS + _REST,
         steps=tuple(steps),
         grips=tuple(grips),
+        precise=tuple(precise),
     )
 
 
-def _from_home(points: Sequence[WayPoint], hand: str) -> Path:
+def _from_home(points: Sequence[WayPoint], hand: str, precise: Sequence[tuple[float, float]]) -> Path:
     way, home = WayPoints(points), np.array(HOME[hand])
 
     def displacement(t: float, frequency: float) -> tuple[Array, Array]:
         place, turn = way.at(t)
-        return place - home, turn
+        # While the tool goes a share of the hand's way only, the hand goes farther, and it does not go back afterwards.
+        fine = sum((way.at(min(max(t, begins), ends))[0] - way.at(begins)[0] for begins, ends in precise), np.zeros(3))
+        return place - home + (1.0 / PRECISION_SCALE - 1.0) * fine, turn
 
     return displacement
 
@@ -203,6 +210,7 @@ def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
         duration=t,
         steps=tuple(zip(then([at for at, _ in work.steps]), [words for _, words in work.steps], strict=True)),
         grips=(*then(work.grips), *[seen + _CARRIES] * carries),
+        precise=tuple((then([begins])[0], then([ends])[0]) for begins, ends in work.precise),
         lost=(seen, seen + _LOST),
     )
 

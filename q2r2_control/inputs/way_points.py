@@ -56,6 +56,7 @@ class HandWork:
     presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # of the upper buttons, by hand [s]
     grips: tuple[float, ...] = ()  # taps of the left grip, which begin to carry and end it [s]
     engages: tuple[float, ...] = ()  # presses of both lower buttons [s]
+    precise: tuple[tuple[float, float], ...] = ()  # from when to when both sticks are pushed up, for precision [s]
 
     def moved(self, x: float, y: float) -> HandWork:
         """The same work on parts that lie ``x`` and ``y`` [m] farther along the axes of the world."""

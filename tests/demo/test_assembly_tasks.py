@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.cell import Config, load_config
-from q2r2_control.demo.assembly_tasks import TASKS, TaskWatch, tasks_named, with_carry
+from q2r2_control.demo.assembly_tasks import TASKS, TaskWatch, tasks_named, with_controls
 from q2r2_control.demo.part_judges import TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
@@ -29,7 +29,7 @@ PERIODS = {CommandMode.POSITION: 0.01, CommandMode.TORQUE: 0.005}  # [s]
 @cache
 def coarse(mode: CommandMode = CommandMode.POSITION) -> Config:
     """The demo's cell, with the control loop slowed down."""
-    config, period = with_carry(load_config("config/dual_iiwa7.yaml")), PERIODS[mode]
+    config, period = with_controls(load_config("config/dual_iiwa7.yaml")), PERIODS[mode]
     control = config.control.model_copy(update={"max_substep": period})
     return config.model_copy(update={"loop_rate_hz": 1.0 / period, "control": control})
 

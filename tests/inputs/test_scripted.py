@@ -13,7 +13,7 @@ from q2r2_control import Robot, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.assembly import WORKS
 from q2r2_control.inputs.played import HeadsetSampling
-from q2r2_control.inputs.scripted import TRAJECTORIES, ScriptedInput, hurried, trajectory_named
+from q2r2_control.inputs.scripted import START, TRAJECTORIES, ScriptedInput, hurried, trajectory_named
 from q2r2_control.inputs.way_points import HOME, HandWork, WayPoints, minimum_jerk
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
@@ -52,7 +52,8 @@ def test_hands_move_smoothly_calmly_and_within_reach(trajectory: str, hand: str)
     script, dt = ScriptedInput(trajectory), 0.01
     poses = [script.hand_pose(hand, tick * dt) for tick in range(2100)]
     way = np.array([pose.translation - poses[0].translation for pose in poses])
-    assert way[:, 2].min() > (-0.164 if trajectory in WORKS else 0.0) - 1e-9
+    lowest = -0.211 if trajectory == "peg" else -0.164 if trajectory in WORKS else 0.0  # farther than a precise tool
+    assert way[:, 2].min() > lowest - 1e-9
     assert np.abs(way).max() <= (0.355 if trajectory == "carry" else 0.25) + 1e-9
     velocity = np.diff(way, axis=0) / dt
     assert np.linalg.norm(velocity, axis=1).max() < 0.5
@@ -181,6 +182,18 @@ def test_works_in_sequence_do_what_each_of_them_does_one_after_the_other() -> No
             np.testing.assert_allclose(both.displacement(hand, t + shift, 1.0), expected, atol=1e-9)
         presses = first.upper_presses[hand] + tuple(t + shift for t in second.upper_presses[hand])
         assert both.upper_presses[hand] == pytest.approx(presses)
+
+
+def test_a_hand_with_precision_goes_four_times_as_far_as_the_tool_and_pushes_its_stick() -> None:
+    trajectory, tool = trajectory_named("peg"), WayPoints(WORKS["peg"].tools["right"])
+    ((begins, ends),) = trajectory.precise
+    for first, last, farther in ((3.0, begins, 1.0), (begins, ends, 4.0), (ends, 24.0, 1.0)):
+        for t, until in itertools.pairwise(np.linspace(first, last - 1e-6, 50).tolist()):
+            assert trajectory.inputs("right", t).thumb_stick_vertical == float(farther > 1.0)
+            way = trajectory.displacement("right", until, 1.0)[0] - trajectory.displacement("right", t, 1.0)[0]
+            of_tool = tool.at(until - START)[0] - tool.at(t - START)[0]
+            np.testing.assert_allclose(way, farther * of_tool, atol=1e-9)
+    assert not trajectory_named("meet").precise
 
 
 def test_the_hand_is_where_its_way_points_say_and_rests_at_each() -> None:
