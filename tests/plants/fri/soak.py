@@ -38,7 +38,7 @@ class Rest(NamedTuple):
 
 
 # Torques settle arms on their springs. The slowest has a time constant of 0.4 s; a held joint may creep.
-_RESTS = {CommandMode.POSITION: Rest(0.0, _STILL, 0.0, _STILL), CommandMode.TORQUE: Rest(0.35, 0.15, 1.95, 0.02)}
+_RESTS = {CommandMode.POSITION: Rest(0.0, _STILL, 0.0, _STILL), CommandMode.TORQUE: Rest(0.35, 0.2, 1.95, 0.02)}
 _ENDS = ("pendant", "back at once", "safety stop", "loop freezes", "computer freezes", "garbage")
 _ASKED = {Trip.STOPPED, Trip.SAFETY}
 _MUTATED = 250  # datagrams with wrong bytes before a session ends so
