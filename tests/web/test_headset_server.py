@@ -17,6 +17,7 @@ from q2r2_control.inputs.webxr.page_messages import LONGEST
 from q2r2_control.inputs.webxr.webxr import WebXrInput
 from q2r2_control.types import HandFault, HapticFeedback
 from tests.support.processes import cell, wait_until
+from tests.web.browser import PATIENCE
 from tests.web.headset_page import Listen, Page, hand, samples
 
 NOISE = np.random.default_rng(3)
@@ -123,13 +124,14 @@ def test_a_flood_ends_its_page(listen: Listen) -> None:
 
 
 def test_the_first_page_drives_and_one_that_comes_back_takes_its_place(listen: Listen) -> None:
-    source = listen()
+    source = listen(silence=PATIENCE)
     with closing(Page(source, "1")) as first:
         first.send(left=hand(1.0))
         samples(source, len)
         peer = source.statistics.peer
         with closing(Page(source, "2")) as second:
-            assert second.ended() == f"4001 {peer} drives"
+            # The second words are those of a machine so busy that the first page has been silent for a while.
+            assert second.ended() in (f"4001 {peer} drives", f"4001 {peer} is connected")
         # Only after a silence of the first connection, which has been lost without a word. The page tries again.
         with ExitStack() as tries:
 
@@ -155,7 +157,7 @@ def test_a_page_that_falls_silent_is_dropped(listen: Listen) -> None:
 
 
 def test_vibrations_reach_the_page_that_drives(listen: Listen) -> None:
-    source = listen()
+    source = listen(silence=PATIENCE)
     with closing(Page(source)) as page:
         page.send()
         wait_until(lambda: source.connected)
@@ -166,7 +168,7 @@ def test_vibrations_reach_the_page_that_drives(listen: Listen) -> None:
 
 
 def test_the_newest_picture_reaches_the_page_that_drives(listen: Listen) -> None:
-    source = listen()
+    source = listen(silence=PATIENCE)
     with closing(Page(source)) as page:
         page.send()
         wait_until(lambda: source.connected)
@@ -184,7 +186,7 @@ def test_the_newest_picture_reaches_the_page_that_drives(listen: Listen) -> None
 
 
 def test_headset_check_shows_what_the_page_sends_and_where_to_open_it(listen: Listen) -> None:
-    source, config = listen(), WebXrInput.cell(cell())
+    source, config = listen(silence=PATIENCE), WebXrInput.cell(cell())
     alone = watch_headset(source, config, 0.0, lambda check: None, lambda: False)
     assert f"open {source.url} in the headset's browser" in alone.advice
     assert len(alone.missing) == 4
