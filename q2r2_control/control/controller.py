@@ -309,8 +309,8 @@ class CartesianController:
 
     @property
     def moving_obstacles(self) -> dict[str, MovingObstacle]:
-        """The moving obstacles that are there, by name, as :meth:`move_obstacle` was told last."""
-        return dict(self._obstacles.there)
+        """The moving obstacles that are there, by name, as reported last, with the age of that now."""
+        return self._obstacles.there
 
     def _observe_again(self, grown: IntArray) -> int:
         """Observe what has changed; returns the pair in the way of bodies that have ``grown``, or -1."""

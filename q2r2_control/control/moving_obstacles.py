@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import coal
 import numpy as np
 import pinocchio as pin
 
@@ -16,10 +15,8 @@ from q2r2_control.control.jit import KernelPointer, bound, pointer_to
 from q2r2_control.control.kernel_model import KernelModel, stop_buffer
 from q2r2_control.control.safety.protective_distance import ObstacleData, keep_clear, keep_while_stopping
 from q2r2_control.robot.kept_distances import kept_by_obstacles
-from q2r2_control.robot.obstacle_bodies import HULL
+from q2r2_control.robot.obstacle_bodies import HULL, body_of
 from q2r2_control.robot.robot import Robot
-
-_SHAPES = {"sphere": coal.Sphere, "capsule": coal.Capsule, "box": coal.Box}
 
 
 class MovingObstacles:
@@ -53,13 +50,19 @@ class MovingObstacles:
             velocity=limits.velocity.copy(),
             stop_time=np.zeros(1),
         )
-        self.there: dict[str, MovingObstacle] = {}
+        self._there: dict[str, MovingObstacle] = {}
         self._holding: frozenset[str] = frozenset()
         if count:
             pointers = *pointers, pointer_to(self._data)
             self._keep_while_stopping = partial(bound(keep_while_stopping, *pointers), *pointers)
             self._keep_clear = partial(bound(keep_clear, *pointers, 0.0), *pointers)
         self.change(settings)
+
+    @property
+    def there(self) -> dict[str, MovingObstacle]:
+        """As they were reported last, with the age that the reports have now."""
+        ages = zip(self._number, self._data.age.tolist(), strict=True)
+        return {name: self._there[name].model_copy(update={"age": age}) for name, age in ages if name in self._there}
 
     def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
         """Take it that an obstacle is there as described, or is not there; returns a 1 for its body (g,).
@@ -71,13 +74,12 @@ class MovingObstacles:
         number, index = self._number[name], list(self._number).index(name)
         changed: IntArray = np.zeros(len(self._bodies.joint), dtype=np.int64)
         if obstacle is None:
-            self.there.pop(name, None)
+            self._there.pop(name, None)
         else:
-            self.there[name] = obstacle
+            self._there[name] = obstacle
             changed[number] = 1
-            placement = pin.SE3(pin.rpy.rpyToMatrix(*obstacle.rpy), np.array(obstacle.position))
             body = pin.GeometryModel()
-            body.addGeometryObject(pin.GeometryObject(name, 0, placement, _SHAPES[obstacle.shape](*obstacle.size)))
+            body.addGeometryObject(body_of(name, obstacle))
             for array, value in zip(self._bodies, bodies_of(body), strict=True):
                 array[number] = value[0]
             data = self._data
@@ -99,7 +101,7 @@ class MovingObstacles:
 
     def keep_clear(self, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference: say what pairs have to keep, and joint speeds."""
-        if self.there:
+        if self._there:
             self._keep_clear(h)
 
     def pass_time(self, time: float) -> None:
@@ -110,10 +112,10 @@ class MovingObstacles:
         """Let pairs count whose obstacle is there and whose object is held."""
         if not self._number:
             return
-        there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))
+        there = np.repeat([name in self._there for name in self._number], len(self._goal) // len(self._number))
         held = np.array([arm is None or arm in self._holding for arm in self._holders])
         self._data.kept[:] = np.where(there & held, self._goal, -np.inf)
         self._keep_while_stopping()
-        if not self.there:
+        if not self._there:
             self._limits.velocity[:] = self._data.velocity
             self._data.stop_time[:] = (self._data.velocity / self._limits.acceleration).max()

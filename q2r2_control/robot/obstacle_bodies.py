@@ -12,6 +12,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
 from q2r2_control.robot.held_objects import HeldObject
@@ -19,6 +20,13 @@ from q2r2_control.robot.pairs import LinkClass, Role
 from q2r2_control.robot.robot import Robot
 
 HULL = "_hull"  # ending of the capsule around a held object
+_SHAPES = {"sphere": coal.Sphere, "capsule": coal.Capsule, "box": coal.Box}
+
+
+def body_of(name: str, obstacle: MovingObstacle) -> pin.GeometryObject:
+    """The body of an obstacle where it was reported, in the world."""
+    placement = pin.SE3(pin.rpy.rpyToMatrix(*obstacle.rpy), np.array(obstacle.position))
+    return pin.GeometryObject(name, 0, placement, _SHAPES[obstacle.shape](*obstacle.size))
 
 
 def with_obstacle_bodies(robot: Robot, names: Iterable[str]) -> pin.GeometryModel:
