@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,13 @@ from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.control.tasks.external import add_costs, load_tasks
 from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
-from q2r2_control.robot.obstacle_bodies import roles_with_obstacles, with_obstacle_bodies
+from q2r2_control.robot.obstacle_bodies import distances_with, roles_with_obstacles, with_obstacle_bodies
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, pose_of
+
+# Measures pairs at a posture (nv,), and what each of them has to keep there (p,) [m].
+PairsAhead = tuple[Callable[[Array], Array], Array]
 
 _NUMBER = (float, int, np.floating)
 
@@ -306,6 +309,14 @@ class CartesianController:
         self._obstacles.keep_clear(0.0)
         self._observe_again(self._unchanged)
         return None if blocked < 0 else self._names.pair(blocked)
+
+    def pairs_ahead(self, stop: float) -> PairsAhead:
+        """All pairs, for a look at a way before it is gone by arms that stop in ``stop`` [s].
+
+        Held objects count, and moving obstacles where they were reported last.
+        """
+        kept = self.kept_distances, self._objects.kept, self._obstacles.kept_from(stop)
+        return distances_with(self.robot, self.moving_obstacles), np.concatenate(kept)
 
     @property
     def moving_obstacles(self) -> dict[str, MovingObstacle]:

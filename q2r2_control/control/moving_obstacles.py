@@ -13,10 +13,11 @@ from q2r2_control.control.geometry.collision import bodies_of
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import KernelPointer, bound, pointer_to
 from q2r2_control.control.kernel_model import KernelModel, stop_buffer
-from q2r2_control.control.safety.protective_distance import ObstacleData, keep_clear, keep_while_stopping
+from q2r2_control.control.safety.protective_distance import REPORT_AGE, ObstacleData, keep_clear, keep_while_stopping
 from q2r2_control.robot.kept_distances import kept_by_obstacles
 from q2r2_control.robot.obstacle_bodies import HULL, body_of
 from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
 
 
 class MovingObstacles:
@@ -98,6 +99,12 @@ class MovingObstacles:
         self._goal = kept_by_obstacles(self._robot, settings).values
         self._data.buffer[:] = stop_buffer(self._goal, settings)
         self._count()
+
+    def kept_from(self, stop: float) -> Array:
+        """Distances that pairs keep from where these were reported, if arms stop in ``stop`` [s]."""
+        kept = self._data.kept.reshape(len(self._number), -1) if self._number else np.zeros((0, 0))
+        way = self._data.speed * (np.maximum(self._data.age, REPORT_AGE) + stop)
+        return np.ravel((kept + way[:, None])[[name in self._there for name in self._number]])
 
     def keep_clear(self, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference: say what pairs have to keep, and joint speeds."""

@@ -5,7 +5,7 @@ They end the collision geometries that a controller is made with. Shape and pose
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from itertools import product
 
 import coal
@@ -18,6 +18,7 @@ from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
 from q2r2_control.robot.held_objects import HeldObject
 from q2r2_control.robot.pairs import LinkClass, Role
 from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
 
 HULL = "_hull"  # ending of the capsule around a held object
 _SHAPES = {"sphere": coal.Sphere, "capsule": coal.Capsule, "box": coal.Box}
@@ -44,6 +45,20 @@ def with_obstacle_bodies(robot: Robot, names: Iterable[str]) -> pin.GeometryMode
         for number in moving:
             geometry.addCollisionPair(pin.CollisionPair(number, body))
     return geometry
+
+
+def distances_with(robot: Robot, obstacles: Mapping[str, MovingObstacle]) -> Callable[[Array], Array]:
+    """A function that measures all pairs of :func:`with_obstacle_bodies` at ``q`` (nv,) by Coal, (p,) [m]."""
+    geometry = with_obstacle_bodies(robot, obstacles)
+    for number, (name, obstacle) in enumerate(obstacles.items(), geometry.ngeoms - len(obstacles)):
+        geometry.geometryObjects[number] = body_of(name, obstacle)
+    data, placed = robot.model.createData(), geometry.createData()
+
+    def distances(q: Array) -> Array:
+        pin.computeDistances(robot.model, data, geometry, placed, q)
+        return np.array([result.min_distance for result in placed.distanceResults], dtype=np.float64)
+
+    return distances
 
 
 def roles_with_obstacles(robot: Robot, names: Iterable[str]) -> dict[str, Role]:
