@@ -11,7 +11,8 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.controller import CartesianController, PairsAhead
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.watched_pairs import PairsAhead
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.robot import Robot
