@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.config.moving_obstacle import MovingObstacle, check_obstacle
-from q2r2_control.control.geometry.collision import bodies_of
+from q2r2_control.control.geometry.collision import CollisionBodies, bodies_of
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import KernelPointer, bound, pointer_to
 from q2r2_control.control.kernel_model import KernelModel, stop_buffer
@@ -52,6 +52,7 @@ class MovingObstacles:
             stop_time=np.zeros(1),
         )
         self._there: dict[str, MovingObstacle] = {}
+        self.still: dict[str, MovingObstacle] = {}  # those among them that stay; another mapping at each report
         self._holding: frozenset[str] = frozenset()
         if count:
             pointers = *pointers, pointer_to(self._data)
@@ -79,13 +80,11 @@ class MovingObstacles:
         else:
             self._there[name] = obstacle
             changed[number] = 1
-            body = pin.GeometryModel()
-            body.addGeometryObject(body_of(name, obstacle))
-            for array, value in zip(self._bodies, bodies_of(body), strict=True):
-                array[number] = value[0]
+            write_body(self._bodies, number, obstacle)
             data = self._data
             data.speed[index], data.slower[index], data.rise[index] = obstacle.speed, obstacle.slower, obstacle.rise
             data.age[index] = obstacle.age
+        self.still = {name: one for name, one in self._there.items() if one.speed == 0.0}
         self._count()
         return changed
 
@@ -126,3 +125,11 @@ class MovingObstacles:
         if not self._there:
             self._limits.velocity[:] = self._data.velocity
             self._data.stop_time[:] = (self._data.velocity / self._limits.acceleration).max()
+
+
+def write_body(bodies: CollisionBodies, number: int, obstacle: MovingObstacle) -> None:
+    """Let the body ``number`` of a collision model be an obstacle's."""
+    body = pin.GeometryModel()
+    body.addGeometryObject(body_of("", obstacle))
+    for array, value in zip(bodies, bodies_of(body), strict=True):
+        array[number] = value[0]

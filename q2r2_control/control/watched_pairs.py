@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -145,6 +145,11 @@ class WatchedPairs:
         Raises as :meth:`tool_pose` does.
         """
         return float(self._spare(self._model_pointer, self._data_pointer, self._with_others[self.robot.arm(arm).name]))
+
+    @property
+    def still_obstacles(self) -> Mapping[str, MovingObstacle]:
+        """Those of :attr:`moving_obstacles` that stay; another mapping, not a changed one, when that changes."""
+        return self._obstacles.still
 
     def _observe_again(self, grown: IntArray) -> int:
         """Observe what has changed; returns the pair in the way of bodies that have ``grown``, or -1."""

@@ -30,16 +30,18 @@ def body_of(name: str, obstacle: MovingObstacle) -> pin.GeometryObject:
     return pin.GeometryObject(name, 0, placement, _SHAPES[obstacle.shape](*obstacle.size))
 
 
-def with_obstacle_bodies(robot: Robot, names: Iterable[str]) -> pin.GeometryModel:
+def with_obstacle_bodies(robot: Robot, names: Iterable[str], held: bool = True) -> pin.GeometryModel:
     """``Robot.objects.geometry``, and after it a sphere and its pairs for each of ``names``.
 
-    A held object counts as the capsule around it: two boxes would need pairs of all their edges.
+    Without what is ``held`` it is the collision model that these come after. A held object counts as the capsule
+    around it: two boxes would need pairs of all their edges.
     """
+    known = robot.objects.geometry if held else robot.collision_model
     if not names:
-        return robot.objects.geometry
-    geometry = robot.objects.geometry.copy()
+        return known
+    geometry = known.copy()
     moving = [i for i, item in enumerate(robot.collision_model.geometryObjects) if item.parentJoint != 0]
-    moving += [int(geometry.addGeometryObject(_hull(held))) for held in robot.objects.by_arm.values()]
+    moving += [int(geometry.addGeometryObject(_hull(one))) for one in robot.objects.by_arm.values() if held]
     for name in names:
         body = geometry.addGeometryObject(pin.GeometryObject(f"{name}_0", 0, pin.SE3.Identity(), coal.Sphere(1.0)))
         for number in moving:
