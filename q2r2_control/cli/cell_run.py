@@ -79,7 +79,7 @@ def show_window(pipeline: Pipeline, *, paced: bool = False) -> None:
             now = time.monotonic()
             began = now - tick.t if began == -math.inf else began
             time.sleep(max(began + tick.t - now, 0.0))
-        if not plant.viewer_sync([(one, obstacle_colour(one)) for one in tick.obstacles.values()]):
+        if not plant.viewer_sync([(one.obstacle, obstacle_colour(one)) for one in tick.obstacles.values()]):
             pipeline.stop()
 
     pipeline.listeners.append(show)

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.config.moving_obstacle import MovingObstacle, check_obstacle
+from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport, check_obstacle
 from q2r2_control.control.geometry.collision import CollisionBodies, bodies_of
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import KernelPointer, bound, pointer_to
@@ -51,7 +51,7 @@ class MovingObstacles:
             velocity=limits.velocity.copy(),
             stop_time=np.zeros(1),
         )
-        self._there: dict[str, MovingObstacle] = {}
+        self.there: dict[str, MovingObstacle] = {}
         self.still: dict[str, MovingObstacle] = {}  # those among them that stay; another mapping at each report
         self._holding: frozenset[str] = frozenset()
         if count:
@@ -61,10 +61,10 @@ class MovingObstacles:
         self.change(settings)
 
     @property
-    def there(self) -> dict[str, MovingObstacle]:
-        """As they were reported last, with the age that the reports have now."""
+    def reports(self) -> dict[str, ObstacleReport]:
+        """Those that are there, as reported last."""
         ages = zip(self._number, self._data.age.tolist(), strict=True)
-        return {name: self._there[name].model_copy(update={"age": age}) for name, age in ages if name in self._there}
+        return {name: ObstacleReport(self.there[name], age) for name, age in ages if name in self.there}
 
     def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
         """Take it that an obstacle is there as described, or is not there; returns a 1 for its body (g,).
@@ -76,15 +76,15 @@ class MovingObstacles:
         number, index = self._number[name], list(self._number).index(name)
         changed: IntArray = np.zeros(len(self._bodies.joint), dtype=np.int64)
         if obstacle is None:
-            self._there.pop(name, None)
+            self.there.pop(name, None)
         else:
-            self._there[name] = obstacle
+            self.there[name] = obstacle
             changed[number] = 1
             write_body(self._bodies, number, obstacle)
             data = self._data
             data.speed[index], data.slower[index], data.rise[index] = obstacle.speed, obstacle.slower, obstacle.rise
             data.age[index] = obstacle.age
-        self.still = {name: one for name, one in self._there.items() if one.speed == 0.0}
+        self.still = {name: one for name, one in self.there.items() if one.speed == 0.0}
         self._count()
         return changed
 
@@ -103,11 +103,11 @@ class MovingObstacles:
         """Distances that pairs keep from where these were reported, if arms stop in ``stop`` [s]."""
         kept = self._data.kept.reshape(len(self._number), -1) if self._number else np.zeros((0, 0))
         way = self._data.speed * (np.maximum(self._data.age, REPORT_AGE) + stop)
-        return np.ravel((kept + way[:, None])[[name in self._there for name in self._number]])
+        return np.ravel((kept + way[:, None])[[name in self.there for name in self._number]])
 
     def keep_clear(self, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference: say what pairs have to keep, and joint speeds."""
-        if self._there:
+        if self.there:
             self._keep_clear(h)
 
     def pass_time(self, time: float) -> None:
@@ -118,11 +118,11 @@ class MovingObstacles:
         """Let pairs count whose obstacle is there and whose object is held."""
         if not self._number:
             return
-        there = np.repeat([name in self._there for name in self._number], len(self._goal) // len(self._number))
+        there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))
         held = np.array([arm is None or arm in self._holding for arm in self._holders])
         self._data.kept[:] = np.where(there & held, self._goal, -np.inf)
         self._keep_while_stopping()
-        if not self._there:
+        if not self.there:
             self._limits.velocity[:] = self._data.velocity
             self._data.stop_time[:] = (self._data.velocity / self._limits.acceleration).max()
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.config.moving_obstacle import MovingObstacle
+from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import bound, pointer_to
@@ -136,8 +136,13 @@ class WatchedPairs:
 
     @property
     def moving_obstacles(self) -> dict[str, MovingObstacle]:
-        """The moving obstacles that are there, by name, as reported last, with the age of that now."""
-        return self._obstacles.there
+        """The moving obstacles that are there, by name, as :meth:`move_obstacle` was told last."""
+        return dict(self._obstacles.there)
+
+    @property
+    def obstacle_reports(self) -> dict[str, ObstacleReport]:
+        """The same, and how old these reports are now."""
+        return self._obstacles.reports
 
     def spare_distance(self, arm: str) -> float:
         """How much nearer ``arm`` may come to what is no part of it at the reference [m]; inf if there is no pair.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from q2r2_control.config.moving_obstacle import MovingObstacle
+from q2r2_control.config.moving_obstacle import ObstacleReport
 from q2r2_control.control.safety.protective_distance import REPORT_AGE
 from q2r2_control.teleop.arm_states import ArmState
 
@@ -24,6 +24,6 @@ def state_colour(state: str) -> Colour:
     return _COLOURS.get(state, GREY)
 
 
-def obstacle_colour(obstacle: MovingObstacle) -> Colour:
+def obstacle_colour(report: ObstacleReport) -> Colour:
     """RED for one that moves and whose report is so old that arms keep farther away from it."""
-    return RED if obstacle.speed > 0.0 and obstacle.age > REPORT_AGE else AMBER
+    return RED if report.obstacle.speed > 0.0 and report.age > REPORT_AGE else AMBER

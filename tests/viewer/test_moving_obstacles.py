@@ -11,7 +11,7 @@ pytest.importorskip("viser")
 
 import viser
 
-from q2r2_control.config.moving_obstacle import MovingObstacle
+from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport
 from q2r2_control.summary.tick import Tick
 from q2r2_control.viewer.state_colours import AMBER, RED, obstacle_colour
 from q2r2_control.viewer.web.figure import ObstacleFigure
@@ -50,7 +50,7 @@ def test_each_tick_of_a_run_has_the_obstacles_as_reported_and_their_age() -> Non
             for name, begun in (("hand", 0.1), ("box", 0.2)):
                 if name in tick.obstacles:
                     shown = tick.obstacles[name]
-                    assert shown.position == AT
+                    assert shown.obstacle.position == AT
                     assert shown.age == pytest.approx(0.05 + tick.t - begun, abs=0.005)
                     old = name == "hand" and tick.t > 0.15
                     if abs(tick.t - 0.15) > 0.01:
@@ -62,8 +62,8 @@ def test_the_page_draws_an_obstacle_anew_where_it_is_looks_otherwise_and_until_i
 ) -> None:
     figure = ObstacleFigure(server.scene, "/obstacles")
 
-    def drawn(obstacle: MovingObstacle | None) -> viser.MeshHandle | None:
-        figure.show({} if obstacle is None else {"hand": obstacle})
+    def drawn(obstacle: MovingObstacle | None, age: float = 0.0) -> viser.MeshHandle | None:
+        figure.show({} if obstacle is None else {"hand": ObstacleReport(obstacle, age)})
         found = server.scene.get_handle_by_name("/obstacles/hand")
         assert found is None or isinstance(found, viser.MeshHandle)
         return found
@@ -77,7 +77,7 @@ def test_the_page_draws_an_obstacle_anew_where_it_is_looks_otherwise_and_until_i
     moved = drawn(box.model_copy(update={"position": (0.0, 1.0, 0.0)}))
     assert moved is first
     np.testing.assert_allclose(moved.position, (0.0, 1.0, 0.0))
-    ball = drawn(MovingObstacle(shape="sphere", size=(0.3,), position=AT, speed=0.1, age=1.0))
+    ball = drawn(MovingObstacle(shape="sphere", size=(0.3,), position=AT, speed=0.1), age=1.0)
     assert ball is not None
     np.testing.assert_allclose(np.ptp(ball.vertices, axis=0), 0.6, rtol=1e-2)
     assert tuple(ball.color) == RED

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker
 
 from q2r2_control.config.cell import load_config
-from q2r2_control.config.moving_obstacle import MovingObstacle, check_obstacle
+from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport, check_obstacle
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.events import Event
 from q2r2_control.recording.messages import (
@@ -251,7 +251,7 @@ class WebPage(BaseNode):
             state=state,
             openings=openings,
             obstacles={
-                name: obstacle.model_copy(update={"age": obstacle.age + self.now - then})
+                name: ObstacleReport(obstacle, obstacle.age + self.now - then)
                 for name, (obstacle, then) in self._obstacles.items()
             },
             tools={arm: pin.XYZQUATToSE3(pose) for arm, pose in zip(arms, tools, strict=True)},

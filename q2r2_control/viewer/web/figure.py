@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import viser
 
-from q2r2_control.config.moving_obstacle import MovingObstacle
+from q2r2_control.config.moving_obstacle import ObstacleReport
 from q2r2_control.robot.obstacle_bodies import body_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.joint_tree import Colour, JointTree, mesh_of
@@ -74,13 +74,13 @@ class ObstacleFigure:
         self._scene, self._name = scene, name
         self._drawn: dict[str, tuple[object, viser.SceneNodeHandle]] = {}  # looks and node of each
 
-    def show(self, obstacles: Mapping[str, MovingObstacle]) -> None:
+    def show(self, reports: Mapping[str, ObstacleReport]) -> None:
         """Draw these and no others."""
-        for gone in self._drawn.keys() - obstacles.keys():
+        for gone in self._drawn.keys() - reports.keys():
             self._drawn.pop(gone)[1].remove()
-        for name, obstacle in obstacles.items():
-            body, colour = body_of(name, obstacle), obstacle_colour(obstacle)
-            looks = obstacle.shape, obstacle.size, colour
+        for name, report in reports.items():
+            body, colour = body_of(name, report.obstacle), obstacle_colour(report)
+            looks = report.obstacle.shape, report.obstacle.size, colour
             if name not in self._drawn or self._drawn[name][0] != looks:
                 mesh = mesh_of(body.geometry)
                 assert mesh is not None
