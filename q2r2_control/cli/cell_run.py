@@ -44,6 +44,7 @@ from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.headset_display import DisplayInput, HeadsetView
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.live_pictures import LivePictures
+from q2r2_control.viewer.state_colours import obstacle_colour
 from q2r2_control.viewer.tables import print_table
 from q2r2_control.viewer.web.view import PageView
 
@@ -78,7 +79,7 @@ def show_window(pipeline: Pipeline, *, paced: bool = False) -> None:
             now = time.monotonic()
             began = now - tick.t if began == -math.inf else began
             time.sleep(max(began + tick.t - now, 0.0))
-        if not plant.viewer_sync():
+        if not plant.viewer_sync([(one.obstacle, obstacle_colour(one)) for one in tick.obstacles.values()]):
             pipeline.stop()
 
     pipeline.listeners.append(show)

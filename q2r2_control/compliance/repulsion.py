@@ -32,6 +32,9 @@ than that are slowed down, but touch. Fingers that may come within a millimetre 
 **Fingers** are the same bodies as in the controller, at the openings that it has accepted. A wall around all of their
 way would push the arms out of postures that the reference may take. A body that has grown meets no pair at the
 reference; elsewhere its push comes at the rate of torques that the impedance allows.
+
+**Moving obstacles** count that stay where they are. A report of one that moves would put energy into the wall,
+k x^2 / 2 for each jump of x, and push an arm that rests.
 """
 
 from __future__ import annotations
@@ -45,6 +48,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings, WallSettings
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.cholesky import factorise
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, collision_model_of, update_placements
@@ -52,7 +56,9 @@ from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_smooth
 from q2r2_control.control.jit import KernelPointer, bound, kernel, pointee, pointer_to
-from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.control.moving_obstacles import write_body
+from q2r2_control.robot.kept_distances import kept_by_obstacles, kept_distances
+from q2r2_control.robot.obstacle_bodies import with_obstacle_bodies
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval
 
@@ -67,6 +73,7 @@ _SMOOTHING = 0.07
 _DEEP = 0.25
 # Of the radii: how deep two bodies that may touch have to be in each other before the wall pushes.
 _SOFT = 0.5
+_OUT_OF_REACH = MovingObstacle(shape="sphere", size=(0.1,), position=(0.0, 0.0, -20.0), speed=0.0)
 
 
 class RepulsionModel(NamedTuple):
@@ -212,19 +219,25 @@ class MeasuredSeparation:
         Raises :class:`RobotError` for a shape that no kernel measures, :class:`ConfigError` as the controller does.
         """
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
-        collision = collision_model_of(robot)
-        pairs, radius = collision.pairs, collision.bodies.radius
+        geometry = with_obstacle_bodies(robot, settings.moving_obstacles, held=False)
+        names = [item.name for item in geometry.geometryObjects]
+        self._obstacles = {name: names.index(f"{name}_0") for name in settings.moving_obstacles}
+        collision = collision_model_of(robot, geometry)
+        pairs = collision.pairs
         self._bodies, self._pairs = collision.bodies, pairs
-        self._radii = radius[pairs.first] + radius[pairs.second]
-        self._shell, self._smoothing, self._deep = (np.zeros_like(self._radii) for _ in range(3))
-        self.set_kept_distances(kept_distances(robot, settings).values)
+        self._shell, self._smoothing, self._deep = np.zeros((3, len(pairs.first)))
+        # Of each obstacle the pairs of arms, without the last ones, which are those of held objects.
+        by_obstacle = kept_by_obstacles(robot, settings).values.reshape(max(len(self._obstacles), 1), -1)
+        count = by_obstacle.shape[1] - len(robot.objects.by_arm) if self._obstacles else 0
+        self._kept_by_obstacles = by_obstacle[:, :count].ravel()
+        self._kept = kept_distances(robot, settings).values
+        self.set_obstacles({})
         by_pair = self._smoothing, self._deep, self._shell
         model = RepulsionModel(collision, *by_pair, law.stiffness, law.damping_ratio, law.maximum_force)
         self._fingers = FingerOpenings(robot, collision.bodies)
         self._kernel_data = RepulsionData.empty(model)
         self._measured = self._kernel_data.measured.reshape(-1)  # a view
         self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(self._kernel_data)
-        names = [geometry.name for geometry in robot.collision_model.geometryObjects]
         self._pair_names = [(names[one], names[other]) for one, other in zip(pairs.first, pairs.second, strict=True)]
         # Every kernel runs once here, so that none is compiled in mid-motion.
         self._find_near = bound(find_near, self._model_pointer, self._data_pointer)
@@ -236,17 +249,22 @@ class MeasuredSeparation:
         """Between which openings each arm's gripper is; of an arm that is not named, all of the way."""
         self._fingers.set_all(openings)
         if self._fingers.turn:
-            radius = self._bodies.radius
-            self._radii = radius[self._pairs.first] + radius[self._pairs.second]
             self.set_kept_distances(self._kept)
+
+    def set_obstacles(self, obstacles: Mapping[str, MovingObstacle]) -> None:
+        """The moving obstacles that stay where they are, by name; the others are out of reach."""
+        for name, number in self._obstacles.items():
+            write_body(self._bodies, number, obstacles.get(name, _OUT_OF_REACH))
+        self.set_kept_distances(self._kept)
 
     def set_kept_distances(self, kept: Array) -> None:
         """How far apart every pair stays, (p,) [m], which is where its wall begins."""
-        self._kept = kept
-        self._deep[:] = (_DEEP - 1.0) * self._radii
+        self._kept, radius = kept, self._bodies.radius
+        radii = radius[self._pairs.first] + radius[self._pairs.second]
+        self._deep[:] = (_DEEP - 1.0) * radii
         # Pairs that may touch meet the wall only where they are deeper in each other than bodies get that touch.
-        self._shell[:] = np.maximum(kept, -_SOFT * self._radii)
-        self._smoothing[:] = (_SMOOTHING * (self._radii + self._shell)) ** 2
+        self._shell[:] = np.maximum(np.append(kept, self._kept_by_obstacles), -_SOFT * radii)
+        self._smoothing[:] = (_SMOOTHING * (radii + self._shell)) ** 2
 
     def update(self, q: Array, v: Array) -> WallReport:
         """Wall torque at the measured ``q`` [rad] and ``v`` [rad/s], (nv,) each.

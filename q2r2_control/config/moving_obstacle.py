@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
@@ -40,6 +40,13 @@ class MovingObstacle(ObstacleConfig):
         if self.speed_now is not None and self.speed_now > self.speed:
             raise ValueError(f"speed_now {self.speed_now:g}: allowed: up to speed, {self.speed:g} m/s")
         return self
+
+
+class ObstacleReport(NamedTuple):
+    """An obstacle as it was reported last."""
+
+    obstacle: MovingObstacle
+    age: float  # that its pose has now [s]
 
 
 def check_obstacle(name: str, obstacle: MovingObstacle | None, names: Collection[str]) -> None:

@@ -10,30 +10,23 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.config.moving_obstacle import MovingObstacle
-from q2r2_control.control.geometry.finger_openings import FingerOpenings
-from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.jit import bound, pointer_to
-from q2r2_control.control.kernel_model import KernelData, kernel_model_of
-from q2r2_control.control.live_settings import LiveSettings, ObjectPairs
-from q2r2_control.control.moving_obstacles import MovingObstacles
+from q2r2_control.control.jit import bound
 from q2r2_control.control.qp import DaqpSolver, QpProblem, Solver, assemble, find_minimum
-from q2r2_control.control.reference import move_reference, observe_bodies, spare_distance, start_reference
+from q2r2_control.control.reference import move_reference, start_reference
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
-from q2r2_control.control.step_report import LimitNames, StepSummary
+from q2r2_control.control.step_report import StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.control.tasks.external import add_costs, load_tasks
+from q2r2_control.control.watched_pairs import WatchedPairs
 from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
-from q2r2_control.robot.obstacle_bodies import roles_with_obstacles, with_obstacle_bodies
-from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, pose_of
+from q2r2_control.types import LONGEST_DT, Array, Reference, StepReport, pose_of
 
 _NUMBER = (float, int, np.floating)
 
 
-class CartesianController:
+class CartesianController(WatchedPairs):
     """QP differential inverse kinematics for all arms of a cell at once, with a certified stop at every tick.
 
     The contract, for every sequence of targets and every dt in (0, 0.1] s, is this. Numbers are finite, and no
@@ -53,21 +46,13 @@ class CartesianController:
         check_kind("robot", robot, Robot, "a Robot, as Robot.from_config and Robot.from_urdf return")
         settings = ControllerSettings() if settings is None else settings
         check_kind("settings", settings, ControllerSettings, "ControllerSettings, which a Config has as config.control")
-        self.robot = robot
-        self._nv = robot.model.nv
-        self._arms = tuple(robot.arms)
         if solver is not None and not callable(getattr(solver, "solve", None)):
             raise ConfigError(f"solver = {shown(solver)}: allowed: a Solver, or None for DAQP")
+        super().__init__(robot, settings)
+        self._nv = robot.model.nv
         self._solver = DaqpSolver(self._nv, settings.solve_time_limit) if solver is None else solver
-        model = kernel_model_of(robot, settings)
-        data = KernelData.empty(model)
-        self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(data)
-        self._objects = ObjectPairs(robot, settings, model, data)
-        self._live = LiveSettings(robot, settings, model, data, self._objects)
-        geometry = with_obstacle_bodies(robot, settings.moving_obstacles)
-        self._obstacles = MovingObstacles(robot, settings, (self._model_pointer, self._data_pointer), geometry)
-        self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
-        self._stop, self._tasks = data.safety.certified, data.tasks
+        model, data = self._model_pointer.value, self._data_pointer.value
+        self._rows, self._tasks = data.safety.rows, data.tasks
         self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step
         self._solution = np.zeros(self._nv)  # of the QP, whatever array has it
         self._problem = QpProblem(
@@ -78,13 +63,8 @@ class CartesianController:
             rows=self._rows.matrix[:0],
             rows_lower=self._rows.lower[:0],
         )
-        self._fingers = FingerOpenings(robot, model.safety.collision.bodies)
-        self._unchanged: IntArray = np.zeros(len(model.safety.collision.bodies.joint), dtype=np.int64)
         self._targets = TargetTracker(model.tasks, self._arms, settings)
         self._external_tasks = load_tasks(robot, settings.tasks)
-        self._names = LimitNames(robot, geometry)
-        roles = roles_with_obstacles(robot, settings.moving_obstacles)
-        self._with_others = {arm: pairs_with_others(self._names.pairs, roles, arm) for arm in self._arms}
         self._compile()
         self.reset(robot.home)
 
@@ -107,23 +87,11 @@ class CartesianController:
         self._observe_again(self._unchanged)
         return refused
 
-    @property
-    def kept_distances(self) -> Array:
-        """Kept distance of every monitored pair now (p,) [m]; another array, not a changed one, when that changes."""
-        return self._live.kept
-
-    @property
-    def narrow_pair(self) -> tuple[str, str] | None:
-        """The pair that is farthest from keeping what was asked for, since it was too near yet; None: all keep it."""
-        return None if self._live.narrow < 0 else self._names.pair(self._live.narrow)
-
     def _compile(self) -> None:
         """Run every kernel and the solver once, so that none is compiled or set up in mid-motion."""
         model, data, targets = self._model_pointer, self._data_pointer, self._targets.pointer
-        self._observe_bodies = bound(observe_bodies, model, data, self._unchanged)
         self.reset(self.robot.home)
         self._assemble = bound(assemble, model, targets, data, self.settings.max_substep, -1.0)
-        self._spare = bound(spare_distance, model, data, self._with_others[self._arms[0]])
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         if self._external_tasks:
             self._find_minimum = bound(find_minimum, data)
@@ -240,95 +208,10 @@ class CartesianController:
         """
         self._targets.hold_at(None if q is None else self.robot.checked("q", q))
 
-    def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
-        """Say that the gripper of ``arm`` is, and stays, between two openings, 0 closed .. 1 fully open.
-
-        Its fingers count as what they sweep between these, from the next step on; at first, and after :meth:`reset`,
-        they are all of their way. Bodies within what they were are always accepted. Others are if every pair keeps its
-        distance with them, at the reference and on a certified stop from there. Else nothing changes, and the pair in
-        the way is returned. A gripper may be commanded to what was accepted only.
-
-        Raises :class:`RobotError` for a name that is no arm's and for numbers that are no interval.
-        """
-        self.robot.arm(arm)
-        interval, before = self._fingers.checked(arm, least, greatest), self._fingers.intervals[arm]
-        if interval == before:
-            return None
-        blocked = self._observe_again(self._fingers.set(arm, interval))
-        if blocked < 0:
-            return None
-        self._fingers.set(arm, before)
-        self._observe_again(self._unchanged)
-        return self._names.pair(blocked)
-
-    @property
-    def openings(self) -> dict[str, Interval]:
-        """Between which openings each arm's gripper counts as being, as :meth:`set_opening` accepted it."""
-        return dict(self._fingers.intervals)
-
-    def set_holding(self, arm: str, holds: bool) -> None:
-        """Say that the gripper of ``arm`` holds its object from the next step on, or, as after :meth:`reset`, does not.
-
-        The object then is part of the tool. Each of its pairs begins with the distance that there is and keeps more as
-        it gets more, until it keeps its own (:attr:`object_distances`). The object is therefore always accepted, and
-        nothing moves for it. Raises :class:`RobotError` for an arm that has no object.
-        """
-        if not self._objects.set_holding(arm, holds):
-            return
-        self._active.used[0] = 0  # what it names may not count any more
-        self._obstacles.hold(self._objects.holding)
-        self._observe_again(self._unchanged)
-        self._objects.begin()
-        self._observe_again(self._unchanged)
-
-    @property
-    def holding(self) -> dict[str, bool]:
-        """Of each arm that has an object, whether its gripper holds it, as :meth:`set_holding` was told."""
-        return {arm: arm in self._objects.holding for arm in self.robot.objects.by_arm}
-
-    @property
-    def object_distances(self) -> Array:
-        """Kept distance of every pair of ``Robot.objects`` now (pairs,) [m]; minus infinity while it does not count."""
-        return self._objects.kept.copy()
-
-    def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> tuple[str, str] | None:
-        """Say where a moving obstacle is from the next step on, and how fast it may move; None: it is gone.
-
-        ``name`` is one of ``ControllerSettings.moving_obstacles``. The arms keep away from all that it can get to
-        until they rest, and slow down as it comes nearer. From then on nothing moves closer to it. It counts in any
-        case. The pair is returned for which the stop at hand is not proven to end before the obstacle could be there,
-        as when it appears in front of a moving arm. Raises :class:`ConfigError` for another name.
-        """
-        changed = self._obstacles.put(name, obstacle)
-        self._active.used[0] = 0  # what it names may not count any more
-        blocked = self._observe_again(changed) if self._state.v.any() else -1
-        self._certified &= blocked < 0
-        self._obstacles.keep_clear(0.0)
-        self._observe_again(self._unchanged)
-        return None if blocked < 0 else self._names.pair(blocked)
-
-    @property
-    def moving_obstacles(self) -> dict[str, MovingObstacle]:
-        """The moving obstacles that are there, by name, as :meth:`move_obstacle` was told last."""
-        return dict(self._obstacles.there)
-
-    def _observe_again(self, grown: IntArray) -> int:
-        """Observe what has changed; returns the pair in the way of bodies that have ``grown``, or -1."""
-        self._observed, blocked = self._observe_bodies(self._model_pointer, self._data_pointer, grown)
-        self._apart = self._observed[-1] >= -ROUNDING
-        return int(blocked)
-
     def tool_pose(self, arm: str) -> pin.SE3:
         """World pose of an arm's tool at the reference. Raises :class:`RobotError` for an arm that does not exist."""
         i = self._arms.index(self.robot.arm(arm).name)
         return pose_of(self._tasks.rotation[i], self._tasks.translation[i])
-
-    def spare_distance(self, arm: str) -> float:
-        """How much nearer ``arm`` may come to what is no part of it at the reference [m]; inf if there is no pair.
-
-        Raises as :meth:`tool_pose` does.
-        """
-        return float(self._spare(self._model_pointer, self._data_pointer, self._with_others[self.robot.arm(arm).name]))
 
     @property
     def stop_deceleration(self) -> Array:

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from functools import partial
 
-import coal
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.config.moving_obstacle import MovingObstacle, check_obstacle
-from q2r2_control.control.geometry.collision import bodies_of
+from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport, check_obstacle
+from q2r2_control.control.geometry.collision import CollisionBodies, bodies_of
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import KernelPointer, bound, pointer_to
 from q2r2_control.control.kernel_model import KernelModel, stop_buffer
-from q2r2_control.control.safety.protective_distance import ObstacleData, keep_clear, keep_while_stopping
+from q2r2_control.control.safety.protective_distance import REPORT_AGE, ObstacleData, keep_clear, keep_while_stopping
 from q2r2_control.robot.kept_distances import kept_by_obstacles
-from q2r2_control.robot.obstacle_bodies import HULL
+from q2r2_control.robot.obstacle_bodies import HULL, body_of
 from q2r2_control.robot.robot import Robot
-
-_SHAPES = {"sphere": coal.Sphere, "capsule": coal.Capsule, "box": coal.Box}
+from q2r2_control.types import Array
 
 
 class MovingObstacles:
@@ -54,12 +52,19 @@ class MovingObstacles:
             stop_time=np.zeros(1),
         )
         self.there: dict[str, MovingObstacle] = {}
+        self.still: dict[str, MovingObstacle] = {}  # those among them that stay; another mapping at each report
         self._holding: frozenset[str] = frozenset()
         if count:
             pointers = *pointers, pointer_to(self._data)
             self._keep_while_stopping = partial(bound(keep_while_stopping, *pointers), *pointers)
             self._keep_clear = partial(bound(keep_clear, *pointers, 0.0), *pointers)
         self.change(settings)
+
+    @property
+    def reports(self) -> dict[str, ObstacleReport]:
+        """Those that are there, as reported last."""
+        ages = zip(self._number, self._data.age.tolist(), strict=True)
+        return {name: ObstacleReport(self.there[name], age) for name, age in ages if name in self.there}
 
     def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
         """Take it that an obstacle is there as described, or is not there; returns a 1 for its body (g,).
@@ -75,14 +80,11 @@ class MovingObstacles:
         else:
             self.there[name] = obstacle
             changed[number] = 1
-            placement = pin.SE3(pin.rpy.rpyToMatrix(*obstacle.rpy), np.array(obstacle.position))
-            body = pin.GeometryModel()
-            body.addGeometryObject(pin.GeometryObject(name, 0, placement, _SHAPES[obstacle.shape](*obstacle.size)))
-            for array, value in zip(self._bodies, bodies_of(body), strict=True):
-                array[number] = value[0]
+            write_body(self._bodies, number, obstacle)
             data = self._data
             data.speed[index], data.slower[index], data.rise[index] = obstacle.speed, obstacle.slower, obstacle.rise
             data.age[index] = obstacle.age
+        self.still = {name: one for name, one in self.there.items() if one.speed == 0.0}
         self._count()
         return changed
 
@@ -96,6 +98,12 @@ class MovingObstacles:
         self._goal = kept_by_obstacles(self._robot, settings).values
         self._data.buffer[:] = stop_buffer(self._goal, settings)
         self._count()
+
+    def kept_from(self, stop: float) -> Array:
+        """Distances that pairs keep from where these were reported, if arms stop in ``stop`` [s]."""
+        kept = self._data.kept.reshape(len(self._number), -1) if self._number else np.zeros((0, 0))
+        way = self._data.speed * (np.maximum(self._data.age, REPORT_AGE) + stop)
+        return np.ravel((kept + way[:, None])[[name in self.there for name in self._number]])
 
     def keep_clear(self, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference: say what pairs have to keep, and joint speeds."""
@@ -117,3 +125,11 @@ class MovingObstacles:
         if not self.there:
             self._limits.velocity[:] = self._data.velocity
             self._data.stop_time[:] = (self._data.velocity / self._limits.acceleration).max()
+
+
+def write_body(bodies: CollisionBodies, number: int, obstacle: MovingObstacle) -> None:
+    """Let the body ``number`` of a collision model be an obstacle's."""
+    body = pin.GeometryModel()
+    body.addGeometryObject(body_of("", obstacle))
+    for array, value in zip(bodies, bodies_of(body), strict=True):
+        array[number] = value[0]

@@ -15,6 +15,7 @@ from q2r2_control.compliance.impedance import ImpedanceController, ImpedanceRepo
 from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, Interval, Reference, RobotState
@@ -62,6 +63,9 @@ class Drive(ABC):
 
     def set_kept_distances(self, kept: Array) -> None:  # noqa: B027
         """How far apart every pair stays from now on, (p,) [m], as the controller's settings were changed."""
+
+    def set_obstacles(self, obstacles: Mapping[str, MovingObstacle]) -> None:  # noqa: B027
+        """The moving obstacles that stay where they are, by name."""
 
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """The tool targets that the controller is to follow in a tick of ``dt`` [s]."""
@@ -195,6 +199,9 @@ class TorqueDrive(Drive):
 
     def set_kept_distances(self, kept: Array) -> None:
         self.wall.set_kept_distances(kept)
+
+    def set_obstacles(self, obstacles: Mapping[str, MovingObstacle]) -> None:
+        self.wall.set_obstacles(obstacles)
 
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.compliance.admittance import estimate_wrench
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import Drive, DriveReport
 from q2r2_control.events import Reason
@@ -70,6 +71,7 @@ class ControlLoop:
         self._grasps = GraspWatch(controller, STALL + gripper_delay)
         self._limiter: GripperLimiter | None = None  # while the controller's reference is where the arms are
         self._kept: Array = controller.kept_distances  # that the drive was told of [m]
+        self._still: Mapping[str, MovingObstacle] = {}  # obstacles that the drive was told of
         self.holding: dict[str, bool] = {}  # of each arm that has an object, whether its gripper holds it
         self.granted_openings: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and granted
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
@@ -145,6 +147,9 @@ class ControlLoop:
         if self.controller.kept_distances is not self._kept:  # the step may have taken up others
             self._kept = self.controller.kept_distances
             self.drive.set_kept_distances(self._kept)
+        if self.controller.still_obstacles is not self._still:
+            self._still = self.controller.still_obstacles
+            self.drive.set_obstacles(self._still)
         trusted = supervisor.measured if self._owns_plant else supervisor.trusted
         command = None
         if reference is not None and state is not None:

@@ -292,6 +292,7 @@ class Pipeline(RequestedRun):
             grippers=self.plant.gripper_openings(),
             held_grippers=dict(self.loop.held_grippers),
             holding=self.loop.holding,
+            obstacles=self.controller.obstacle_reports,
             compute_time=compute_time,
             impedance=step.report.impedance,
             wall=step.report.wall,

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason
 from q2r2_control.plugins import PLANTS, load_class
@@ -64,8 +66,8 @@ class WindowedPlant(Protocol):
     def launch_viewer(self) -> None:
         """Open the window. Raises :class:`PlantError` where there is no display."""
 
-    def viewer_sync(self) -> bool:
-        """Show the plant as it is now; False once the window has been closed."""
+    def viewer_sync(self, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]] = ()) -> bool:
+        """Show the plant as it is now, and ``obstacles`` in colours r g b; False once the window has been closed."""
 
 
 @runtime_checkable

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
-from q2r2_control.plants.mujoco_cameras import open_window
+from q2r2_control.plants.mujoco_cameras import draw_obstacles, open_window
 from q2r2_control.plants.mujoco_model import build_model, settle_mimics
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
@@ -181,10 +183,11 @@ class MujocoPlant:
         if self._window is None:
             self._window = open_window(self.model, self.data)
 
-    def viewer_sync(self) -> bool:
-        """Show the state of now in the window, if there is one; False when there is none or the user has closed it."""
+    def viewer_sync(self, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]] = ()) -> bool:
+        """See :meth:`WindowedPlant.viewer_sync`; False as well when there is no window."""
         if self._window is None or not self._window.is_running():
             return False
+        draw_obstacles(self._window.user_scn, obstacles)
         self._window.sync()
         return True
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.types import Array
@@ -18,6 +19,7 @@ from q2r2_control.types import Array
 # MuJoCo's camera looks along -z, with y up in the picture; ours looks along x, with z up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _STRAIGHT = 1e-9  # of the sine between the line of sight and the vertical
+_OPACITY = 0.6  # of moving obstacles
 # Without a graphics card, a window's 8 samples a pixel and shadow map of 8192 take five times as long, and its round
 # shapes of 28 x 16 parts twice as long.
 _SHADOW_MAP, _SAMPLES, _ROUND = 1024, 0, (16, 8)
@@ -103,3 +105,23 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.viewer.Han
         return viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
     except (RuntimeError, mujoco.FatalError, glfw.GLFWError) as error:
         raise PlantError(f"MuJoCo's window cannot be opened: {error}") from error
+
+
+# Kind of each shape, and its sizes there in those of ours.
+_DRAWN = {
+    "sphere": (mujoco.mjtGeom.mjGEOM_SPHERE, (1.0,)),
+    "capsule": (mujoco.mjtGeom.mjGEOM_CAPSULE, (1.0, 0.5)),
+    "box": (mujoco.mjtGeom.mjGEOM_BOX, (0.5, 0.5, 0.5)),
+}
+
+
+def draw_obstacles(scene: mujoco.MjvScene, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]]) -> None:
+    """Let ``scene`` hold these obstacles alone, each in its colour r g b."""
+    scene.ngeom = 0
+    for obstacle, colour in obstacles:
+        kind, factors = _DRAWN[obstacle.shape]
+        size, rgba = np.zeros(3), np.append(np.divide(colour, 255.0), _OPACITY)
+        size[: len(factors)] = np.multiply(obstacle.size, factors)
+        turned = pin.rpy.rpyToMatrix(*obstacle.rpy).ravel()
+        mujoco.mjv_initGeom(scene.geoms[scene.ngeom], kind, size, np.array(obstacle.position), turned, rgba)
+        scene.ngeom += 1

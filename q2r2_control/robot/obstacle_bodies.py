@@ -5,37 +5,62 @@ They end the collision geometries that a controller is made with. Shape and pose
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from itertools import product
 
 import coal
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
 from q2r2_control.robot.held_objects import HeldObject
 from q2r2_control.robot.pairs import LinkClass, Role
 from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
 
 HULL = "_hull"  # ending of the capsule around a held object
+_SHAPES = {"sphere": coal.Sphere, "capsule": coal.Capsule, "box": coal.Box}
 
 
-def with_obstacle_bodies(robot: Robot, names: Iterable[str]) -> pin.GeometryModel:
+def body_of(name: str, obstacle: MovingObstacle) -> pin.GeometryObject:
+    """The body of an obstacle where it was reported, in the world."""
+    placement = pin.SE3(pin.rpy.rpyToMatrix(*obstacle.rpy), np.array(obstacle.position))
+    return pin.GeometryObject(name, 0, placement, _SHAPES[obstacle.shape](*obstacle.size))
+
+
+def with_obstacle_bodies(robot: Robot, names: Iterable[str], held: bool = True) -> pin.GeometryModel:
     """``Robot.objects.geometry``, and after it a sphere and its pairs for each of ``names``.
 
-    A held object counts as the capsule around it: two boxes would need pairs of all their edges.
+    Without what is ``held`` it is the collision model that these come after. A held object counts as the capsule
+    around it: two boxes would need pairs of all their edges.
     """
+    known = robot.objects.geometry if held else robot.collision_model
     if not names:
-        return robot.objects.geometry
-    geometry = robot.objects.geometry.copy()
+        return known
+    geometry = known.copy()
     moving = [i for i, item in enumerate(robot.collision_model.geometryObjects) if item.parentJoint != 0]
-    moving += [int(geometry.addGeometryObject(_hull(held))) for held in robot.objects.by_arm.values()]
+    moving += [int(geometry.addGeometryObject(_hull(one))) for one in robot.objects.by_arm.values() if held]
     for name in names:
         body = geometry.addGeometryObject(pin.GeometryObject(f"{name}_0", 0, pin.SE3.Identity(), coal.Sphere(1.0)))
         for number in moving:
             geometry.addCollisionPair(pin.CollisionPair(number, body))
     return geometry
+
+
+def distances_with(robot: Robot, obstacles: Mapping[str, MovingObstacle]) -> Callable[[Array], Array]:
+    """A function that measures all pairs of :func:`with_obstacle_bodies` at ``q`` (nv,) by Coal, (p,) [m]."""
+    geometry = with_obstacle_bodies(robot, obstacles)
+    for number, (name, obstacle) in enumerate(obstacles.items(), geometry.ngeoms - len(obstacles)):
+        geometry.geometryObjects[number] = body_of(name, obstacle)
+    data, placed = robot.model.createData(), geometry.createData()
+
+    def distances(q: Array) -> Array:
+        pin.computeDistances(robot.model, data, geometry, placed, q)
+        return np.array([result.min_distance for result in placed.distanceResults], dtype=np.float64)
+
+    return distances
 
 
 def roles_with_obstacles(robot: Robot, names: Iterable[str]) -> dict[str, Role]:

@@ -10,6 +10,7 @@ import pinocchio as pin
 from q2r2_control.compliance.admittance import AdmittanceReport
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
+from q2r2_control.config.moving_obstacle import ObstacleReport
 from q2r2_control.events import Event
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.types import ActionChunk, ArmTarget, Command, HandSample, Reference, RobotState
@@ -51,6 +52,7 @@ class Tick:
     admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
     held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)  # see :attr:`ControlLoop.held_grippers`
     holding: dict[str, bool] = field(default_factory=dict)  # arm whose gripper has an object -> whether it holds it
+    obstacles: dict[str, ObstacleReport] = field(default_factory=dict)  # that move by themselves, as reported last
     chunks: list[ActionChunk] = field(default_factory=list)  # of a policy, as they came
     interventions: dict[str, bool] = field(default_factory=dict)  # arm -> whether a hand moves it instead of a policy
     sessions: dict[str, str] = field(default_factory=dict)  # of arms that follow during sessions only, in words

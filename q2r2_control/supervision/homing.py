@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from itertools import islice, pairwise
 from typing import NamedTuple, Protocol
 
@@ -11,6 +12,7 @@ import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.watched_pairs import PairsAhead
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.robot import Robot
@@ -24,6 +26,7 @@ _POINT_REACHED, _GOAL_REACHED = 0.1, 0.003  # how near the arms come to a way po
 _LONGEST_WAIT, _PROGRESS = 3.0, 1e-3  # without progress of so much [s], [rad]
 _AT_REST = 0.02  # [rad/s]
 _ROOM = 0.003  # more than what a pair keeps [m]
+_STOP = 0.05  # in which joints of that speed stop, if their limit is 6 rad/s^2 or more [s]
 _SAMPLE = 0.05  # between two samples of a way [rad]
 _SAMPLES_A_TICK = 2
 _RANDOM_WAYS = 300
@@ -52,13 +55,12 @@ class WayHome(Protocol):
 class JointHoming:
     """Leads all joints to a goal, from where they come to rest."""
 
-    def __init__(self, robot: Robot, kept: Array, goal: Array, straight: bool = False) -> None:
-        """``kept`` (pairs,) [m]: what each monitored pair keeps; ``goal`` (nv,) [rad].
+    def __init__(self, robot: Robot, look: Callable[[], PairsAhead], goal: Array, straight: bool = False) -> None:
+        """``look``: see :meth:`CartesianController.pairs_ahead`; ``goal`` (nv,) [rad].
 
         ``straight``: no way but the straight one is gone.
         """
-        self._robot, self._kept, self._goal, self._straight = robot, kept, goal, straight
-        self._needed = kept
+        self._robot, self._look, self._goal, self._straight = robot, look, goal, straight
         self._search: Iterator[list[Array] | None] | None = None
         self._points: list[Array] | None = None  # still to be reached, the goal last
         self._at = self._leg = self._goal  # where the joints shall be, and where the leg to the next point began
@@ -72,8 +74,9 @@ class JointHoming:
         if self._search is None:
             if float(np.abs(v).max()) > _AT_REST:
                 return HomingStep(None, {})
+            self._distances, kept = self._look()
             # A pair that has less room where the way begins needs no more than that.
-            self._needed = np.minimum(self._kept + _ROOM, self._robot.distance_values(q) - 1e-4)
+            self._needed = np.minimum(kept + _ROOM, self._distances(q) - 1e-4)
             self._at = self._leg = q.copy()
             self._search = self._ways(self._at)
         if self._points is None:
@@ -111,7 +114,7 @@ class JointHoming:
             points = [start, *between, self._goal]
             for posture in _samples(points):
                 yield None
-                if (self._robot.distance_values(posture) < self._needed).any():
+                if (self._distances(posture) < self._needed).any():
                     break
             else:
                 yield points[1:]
@@ -197,13 +200,11 @@ class Homing:
     def begin(self, goal: Array | None = None) -> None:
         """Begin the way home, or the straight way of all joints to another ``goal`` (nv,) [rad]."""
         self.outcome = None
-        kept = self._controller.kept_distances
-        if goal is not None:
-            self._way = JointHoming(self._robot, kept, goal, straight=True)
-        elif self._tools_only:
+        if goal is None and self._tools_only:
             self._way = ToolHoming(self._home, self._controller.tool_pose)
         else:
-            self._way = JointHoming(self._robot, kept, self._robot.home)
+            to, straight = (self._robot.home, False) if goal is None else (goal, True)
+            self._way = JointHoming(self._robot, partial(self._controller.pairs_ahead, _STOP), to, straight)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
         """The target of each tool in ``dt`` [s], from the ``last`` reference: none where joints are led."""

@@ -129,13 +129,13 @@ class MeasuredDistances:
     def compare(self, q: Array, report: StepReport) -> tuple[Array, list[float]]:
         """The margins (p,) [m], and by how much the least distance and margin of a report are wrong [m].
 
-        Not compared are penetrations, whose depth Coal measures otherwise, pairs of objects, and boxes that may be
-        touched, which are rounded for the controller.
+        Not compared are penetrations, whose depth Coal measures otherwise, pairs of objects and of moving obstacles,
+        and boxes that may be touched, which are rounded for the controller.
         """
         values, margins = self._values(q), self.margins(q)
         closest, tightest = frozenset(report.closest_pair), frozenset(report.tightest_pair)
         wrong: list[float] = []
-        if len(values) and values.min() > 0.0 and not {closest, tightest} & self._objects:
+        if len(values) and values.min() > 0.0 and {closest, tightest} <= self._pairs.keys():
             for found, told, pair in ((values, report.closest_distance, closest), (margins, report.margin, tightest)):
                 if self.kept[int(found.argmin())] >= 0.0 <= self.kept[self._pairs[pair]]:
                     wrong.append(abs(float(found.min()) - told))

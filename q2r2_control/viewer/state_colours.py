@@ -1,7 +1,9 @@
-"""The colour of each state of an arm, the same on every display: r g b."""
+"""The colour of each state of an arm, and of obstacles that move, the same on every display: r g b."""
 
 from __future__ import annotations
 
+from q2r2_control.config.moving_obstacle import ObstacleReport
+from q2r2_control.control.safety.protective_distance import REPORT_AGE
 from q2r2_control.teleop.arm_states import ArmState
 
 Colour = tuple[int, int, int]
@@ -20,3 +22,8 @@ _COLOURS: dict[str, Colour] = {
 
 def state_colour(state: str) -> Colour:
     return _COLOURS.get(state, GREY)
+
+
+def obstacle_colour(report: ObstacleReport) -> Colour:
+    """RED for one that moves and whose report is so old that arms keep farther away from it."""
+    return RED if report.obstacle.speed > 0.0 and report.age > REPORT_AGE else AMBER

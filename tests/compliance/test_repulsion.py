@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import cache
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -12,6 +13,8 @@ import pytest
 from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings, WallSettings
+from q2r2_control.config.moving_obstacle import MovingObstacle
+from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.finger_bodies import collision_model_at
@@ -19,7 +22,10 @@ from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
 from tests.control.cells import cell, random_posture
+from tests.control.test_moving_obstacles import Coal
 from tests.support.coal_distances import coal_distances
+from tests.support.object_cell import BLOCK
+from tests.support.object_cell import cell as object_cell
 
 ROBOT = cell("dual_iiwa7").robot
 SHELL = ControllerSettings().min_distance
@@ -270,3 +276,44 @@ def test_a_wall_begins_where_pairs_are_told_to_stay_later_as_if_it_had_been_made
     assert not np.array_equal(told.update(q, REST).tau, made.update(q, REST).tau)
     told.set_kept_distances(kept_distances(ROBOT, wider).values)
     np.testing.assert_array_equal(told.update(q, REST).tau, made.update(q, REST).tau)
+
+
+def test_an_arm_pushed_at_a_box_that_was_put_down_never_touches_it_and_is_free_of_it_when_it_is_gone() -> None:
+    controller = CartesianController(ROBOT, ControllerSettings(moving_obstacles=("hand", "box")))
+    separation, size = MeasuredSeparation(ROBOT, controller.settings), (0.2, 0.05, 0.3)
+    at = ROBOT.tool_pose(ROBOT.home, "left").translation + np.array([0.0, 0.14, 0.0])
+    box = MovingObstacle(shape="box", size=size, position=tuple(at.tolist()), speed=0.0)
+    measured, data = Coal(controller, coal.Box(*size)), ROBOT.model.createData()
+    assert 0.03 < measured.distances(ROBOT.home, at).min() < 0.1
+    least = {}
+    for known in (True, False):
+        controller.move_obstacle("box", box if known else None)
+        separation.set_obstacles(controller.still_obstacles)
+        plant, distances, pressing = MujocoPlant(ROBOT, load_config("config/dual_iiwa7.yaml")), [], set()
+        plant.push("left", np.array([0.0, 40.0, 0.0, 0.0, 0.0, 0.0]), 1.5)
+        for _ in range(1500):
+            state = plant.state()
+            report = separation.update(state.q, state.v)
+            pressing |= {name for pair in report.pressing for name in pair}
+            distances.append(float(measured.distances(state.q, at).min()))
+            assert report.closest_distance <= distances[-1] + 1e-6 or not known
+            tau = pin.computeGeneralizedGravity(ROBOT.model, data, state.q) + report.tau - 5.0 * state.v
+            plant.apply(Command(CommandMode.TORQUE, state.q, state.v, tau, {}))
+            plant.advance(0.001)
+        least[known] = min(distances)
+        assert ("box_0" in pressing) == known
+    assert least[True] > 0.002
+    assert least[False] < 0.0
+
+
+@pytest.mark.parametrize("with_object", [False, True], ids=["empty hands", "an object in one hand's reach"])
+def test_a_hand_that_moves_is_no_wall_since_its_reports_would_push_the_arms(with_object: bool) -> None:
+    robot = Robot.from_config(object_cell(BLOCK)) if with_object else ROBOT
+    controller = CartesianController(robot, ControllerSettings(moving_obstacles=("hand", "box")))
+    separation = MeasuredSeparation(robot, controller.settings)
+    at = robot.tool_pose(robot.home, "left").translation
+    for speed in (0.0, 0.25):
+        hand = MovingObstacle(shape="sphere", size=(0.1,), position=tuple(at.tolist()), speed=speed)
+        controller.move_obstacle("hand", hand)
+        separation.set_obstacles(controller.still_obstacles)
+        assert separation.update(robot.home, np.zeros(robot.model.nv)).tau.any() == (speed == 0.0)

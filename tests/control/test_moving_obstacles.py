@@ -318,6 +318,25 @@ def test_arms_beside_a_hand_that_comes_too_near_may_leave_it_and_the_other_arm_m
     assert np.linalg.norm(controller.tool_pose("left").translation - away["left"].translation) < 5e-3
 
 
+def least_ahead(controller: CartesianController) -> float:
+    distances, kept = controller.pairs_ahead(0.05)
+    return float((distances(controller.step({}, 0.0).q) - kept).min())
+
+
+def test_a_look_ahead_finds_what_arms_beside_a_hand_keep_while_they_are_slow(controller: CartesianController) -> None:
+    side = controller.tool_pose("left").translation + np.array([0.0, RADIUS + 0.12, 0.0])
+    controller.move_obstacle("hand", hand(side))
+    for _ in range(250):
+        controller.move_obstacle("hand", hand(side))
+        reference = controller.step({}, 0.002)
+    assert "hand_0" in reference.report.tightest_pair
+    assert least_ahead(controller) == pytest.approx(reference.report.margin, abs=1e-6)
+    controller.move_obstacle("hand", None)
+    distances, kept = controller.pairs_ahead(0.05)
+    np.testing.assert_array_equal(kept, controller.kept_distances)
+    np.testing.assert_allclose(distances(reference.q), controller.robot.distance_values(reference.q), atol=2e-6)
+
+
 def test_a_held_box_keeps_away_too_once_it_is_held() -> None:
     config = cell(BLOCK)
     robot = Robot.from_config(config)
@@ -333,8 +352,11 @@ def test_a_held_box_keeps_away_too_once_it_is_held() -> None:
     below = controller.tool_pose("left").act(np.array([0.0, 0.0, 0.05 + RADIUS]))
     controller.move_obstacle("hand", hand(below, speed=0.0))
     before = controller.step({}, 0.002).report
+    least = [least_ahead(controller)]
     controller.set_holding("left", True)
     after = controller.step({}, 0.002).report
+    least.append(least_ahead(controller))
+    assert least == pytest.approx([before.margin, after.margin], abs=1e-6)
     assert after.margin < before.margin
     assert "left_object_hull" in after.tightest_pair
 

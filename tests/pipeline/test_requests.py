@@ -11,6 +11,7 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.drives.base import TorqueDrive
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import ReasonKind
+from q2r2_control.robot.obstacle_bodies import distances_with
 from q2r2_control.summary.tick import Tick
 from tests.pipeline.loops import pipeline, when_moving
 from tests.support.processes import cell, changes
@@ -91,6 +92,31 @@ def test_a_hand_that_a_program_reports_in_front_of_an_arm_is_named_once_and_brak
     assert min(tick.reference.report.margin for tick in ticks) < 0.0
     with pytest.raises(ConfigError, match="foot"):
         loop.move_obstacle("foot", None)
+
+
+def test_in_torque_mode_the_wall_knows_a_box_that_was_put_down_until_it_is_gone() -> None:
+    loop = pipeline(
+        plant="mujoco", mode="torque", control=cell().control.model_copy(update={"moving_obstacles": ("box",)})
+    )
+    robot, box, offset = loop.robot, MovingObstacle(shape="box", size=(0.1, 0.1, 0.1), speed=0.0), 0.3
+    while distances_with(robot, {"box": box})(robot.home).min() > 0.003:
+        offset -= 0.001
+        place = tuple(
+            robot.tool_pose(robot.home, "left").act(np.array([offset, 0.0, -0.12])).tolist()
+        )  # beside the hand
+        box = box.model_copy(update={"position": place})
+    moments: dict[float, MovingObstacle | None] = {0.1: box, 0.2: None}
+    pressed: dict[float, bool] = {}
+
+    def report(tick: Tick) -> None:
+        assert tick.wall is not None
+        pressed[tick.t] = any("box_0" in pair for pair in tick.wall.pressing)
+        for moment in [moment for moment in moments if tick.t >= moment]:
+            loop.move_obstacle("box", moments.pop(moment))
+
+    loop.listeners.append(report)
+    loop.run(0.3, realtime=False)
+    assert {t for t, pressing in pressed.items() if pressing} == {t for t in pressed if 0.101 < t < 0.201}
 
 
 def test_a_mark_without_a_recording_is_refused() -> None:

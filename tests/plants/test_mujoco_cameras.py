@@ -6,9 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.mujoco_cameras import draw_obstacles
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.support.processes import cell
@@ -51,3 +53,21 @@ def test_a_window_without_a_display_is_refused(plant: MujocoPlant, monkeypatch: 
     with pytest.raises(PlantError, match="needs a display"):
         plant.launch_viewer()
     assert plant.viewer_sync() is False
+
+
+def test_the_window_draws_moving_obstacles_where_they_are_and_no_longer_than_they_are_there(plant: MujocoPlant) -> None:
+    scene = mujoco.MjvScene(plant.model, maxgeom=8)
+    shapes = [("sphere", (0.1,)), ("capsule", (0.1, 0.4)), ("box", (0.1, 0.2, 0.4))]
+    turned = {"position": (0.6, 0.4, 0.3), "rpy": (0.0, np.pi / 2, 0.0), "speed": 0.2}
+    many = [MovingObstacle.model_validate({"shape": shape, "size": size, **turned}) for shape, size in shapes]
+    draw_obstacles(scene, [(one, (0, 51, 255)) for one in many])
+    drawn = scene.geoms[: scene.ngeom]
+    kinds = [mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]
+    assert [one.type for one in drawn] == kinds
+    np.testing.assert_allclose([one.size for one in drawn], [(0.1, 0.1, 0.1), (0.1, 0.1, 0.2), (0.05, 0.1, 0.2)])
+    for one in drawn:
+        np.testing.assert_allclose(one.pos, (0.6, 0.4, 0.3), rtol=1e-6)
+        np.testing.assert_allclose(one.mat @ (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), atol=1e-6)
+        np.testing.assert_allclose(one.rgba[:3], (0.0, 0.2, 1.0), atol=1e-6)
+    draw_obstacles(scene, [])
+    assert scene.ngeom == 0

@@ -107,6 +107,8 @@ def test_every_display_shows_what_the_set_publishes(node: Any, robot: Robot, pro
     start_controller(processes, *PATIENT)
     processes.start_node("arm_controllers", "rate:=50.0")
     wanted = rviz_topics() | foxglove_topics()
+    by_others = node.create_publisher(Marker, "/cartesian_controller/obstacles", 1)
+    assert by_others.topic_name in wanted
 
     def missing() -> dict[str, str]:
         types = dict(node.get_topic_names_and_types())

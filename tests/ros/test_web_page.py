@@ -20,8 +20,10 @@ from tests.ros.test_processes import external_cell
 
 need_ros()
 
+from geometry_msgs.msg import Point, Pose, Vector3
 from sensor_msgs.msg import CompressedImage
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
+from visualization_msgs.msg import Marker
 
 from q2r2_control.recording.messages import arm_events
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
@@ -41,7 +43,7 @@ def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
     node: Any, processes: Processes, tmp_path: Path
 ) -> None:
     cell = changed_cell(
-        tmp_path, cameras=CAMERA, teleop={"gate": {"timeout": 2.0}}
+        tmp_path, cameras=CAMERA, teleop={"gate": {"timeout": 2.0}}, control={"moving_obstacles": ["hand"]}
     )  # no node is lost beside other load
     command = ("ros", "up", cell, "--web", "--web-port", "0", "--record", str(tmp_path))
     up = processes.start(sys.executable, "-u", "-m", "q2r2_control", *command, name="up")
@@ -54,6 +56,12 @@ def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
         picture = CompressedImage(data=b"a JPEG")
         page.wait_until(lambda: camera.publish(picture) or b"a JPEG" in page.pictures)
 
+        hands = node.create_publisher(Marker, "/cartesian_controller/obstacles", 10)
+        far = Pose(position=Point(x=0.6, y=2.5, z=0.4))
+        hand = {"header": Header(frame_id="world"), "type": Marker.SPHERE, "scale": Vector3(x=0.2, y=0.2, z=0.2)}
+        marker = Marker(ns="hand", text="speed: 0.1", pose=far, **hand)
+        page.wait_until(lambda: hands.publish(marker) or "/obstacles/hand" in page.drawn)
+        hands.publish(Marker(ns="hand", action=Marker.DELETE))
         page.press("Pause both")
         page.wait_until(lambda: all("the pause service" in why for why in page.row("why")))
         page.press("Bring both")

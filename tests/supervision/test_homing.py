@@ -7,11 +7,13 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.supervision.homing import JointHoming, preflight_faults
@@ -19,7 +21,8 @@ from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
 from q2r2_control.verification.contract import Contract
-from tests.supervision.conftest import CONFIG, STRICT
+from tests.control.test_moving_obstacles import Coal
+from tests.supervision.conftest import CONFIG, STRICT, unhurried
 from tests.support.reasons import kinds
 
 DT = 0.004  # [s]
@@ -131,8 +134,8 @@ def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
 def test_while_no_way_is_known_the_arms_stand_still_and_a_tick_looks_at_two_samples_at_most(robot: Robot) -> None:
     distances = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))  # only the start is free
     bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
-    searched: Any = SimpleNamespace(arms=robot.arms, distance_values=distances, **bounds)
-    homing, q, ticks = JointHoming(searched, np.full(3, 0.02), robot.home), robot.home + 0.5, 0
+    searched: Any = SimpleNamespace(arms=robot.arms, **bounds)
+    homing, q, ticks = JointHoming(searched, lambda: (distances, np.full(3, 0.02)), robot.home), robot.home + 0.5, 0
     while homing.outcome is None:
         before = distances.call_count
         at = homing.step(q, np.zeros_like(q), DT).joints
@@ -147,8 +150,8 @@ def test_while_no_way_is_known_the_arms_stand_still_and_a_tick_looks_at_two_samp
 def test_where_only_the_straight_way_is_asked_for_no_other_one_is_gone(robot: Robot) -> None:
     free = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))
     bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
-    searched: Any = SimpleNamespace(arms=robot.arms, distance_values=free, **bounds)
-    homing = JointHoming(searched, np.full(3, 0.02), robot.home, straight=True)
+    searched: Any = SimpleNamespace(arms=robot.arms, **bounds)
+    homing = JointHoming(searched, lambda: (free, np.full(3, 0.02)), robot.home, straight=True)
     for _ in range(2):
         homing.step(robot.home + 0.5, np.zeros_like(robot.home), DT)
     assert homing.outcome is ReasonKind.HOMING_NO_WAY
@@ -156,7 +159,7 @@ def test_where_only_the_straight_way_is_asked_for_no_other_one_is_gone(robot: Ro
 
 def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) -> None:
     settings = load_config(CONFIG).control
-    homing = JointHoming(robot, kept_distances(robot, settings).values, robot.home)
+    homing = JointHoming(robot, lambda: (robot.distance_values, kept_distances(robot, settings).values), robot.home)
     q = robot.home.copy()
     q[0] += 0.8
     farthest = 0.0
@@ -168,6 +171,67 @@ def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) 
             break
     assert homing.outcome is ReasonKind.HOMING_HELD_UP
     assert 0.05 < farthest < 0.13  # or it would set off fast when it is free again
+
+
+class Beside(World):
+    """With a thing that is reported 30 times a second from ``begin`` [s] on; no body comes nearer than it has to be."""
+
+    def __init__(self, controller: CartesianController, q: Array, thing: MovingObstacle, begin: float = 0.0) -> None:
+        super().__init__(controller.robot, controller, q)
+        self.thing, self.begin, self.due = thing, begin, begin
+        shape = coal.Box(*thing.size) if thing.shape == "box" else coal.Sphere(*thing.size)
+        self.coal = Coal(controller, shape)
+
+    def tick(self) -> Reference:
+        if self.now >= self.due:
+            self.due = self.now + 0.033
+            assert self.controller.move_obstacle("thing", self.thing) is None
+        reference = super().tick()
+        if self.now > self.begin:
+            self.check(reference.q)
+        return reference
+
+    def check(self, q: Array) -> None:
+        assert (self.coal.distances(q, np.array(self.thing.position)) >= self.coal.kept - 1e-9).all()
+
+
+@pytest.fixture
+def in_the_way(robot: Robot) -> tuple[CartesianController, Array, Array]:
+    """A controller, the left arm turned outwards, and where its tool comes by on the straight way home."""
+    settings = unhurried(load_config(CONFIG)).model_copy(update={"moving_obstacles": ("thing",)})
+    turned = robot.home.copy()
+    turned[robot.arms["left"].joints[0]] += 1.0
+    middle = robot.tool_pose(0.5 * (turned + robot.home), "left").translation
+    return CartesianController(robot, settings), turned, middle
+
+
+@pytest.mark.parametrize(
+    "thing",
+    [
+        pytest.param({"shape": "box", "size": (0.1, 0.1, 0.3), "speed": 0.0}, id="a box that somebody put down"),
+        pytest.param({"shape": "sphere", "size": (0.1,), "speed": 0.25}, id="a hand that may move"),
+    ],
+)
+def test_a_way_home_leads_past_a_moving_obstacle_where_it_was_reported(
+    in_the_way: tuple[CartesianController, Array, Array], thing: dict[str, Any]
+) -> None:
+    controller, turned, middle = in_the_way
+    world = Beside(controller, turned, MovingObstacle(position=tuple(middle.tolist()), **thing))
+    with pytest.raises(AssertionError):
+        world.check(0.5 * (turned + controller.robot.home))  # the straight way is not free
+    assert world.go_home() == "homing_arrived"
+    assert np.abs(world.state.q - controller.robot.home).max() < 0.004
+
+
+def test_a_moving_obstacle_that_comes_into_the_way_home_later_holds_the_arms_up_until_that_ends(
+    in_the_way: tuple[CartesianController, Array, Array],
+) -> None:
+    controller, turned, middle = in_the_way
+    box = MovingObstacle(shape="box", size=(0.1, 0.1, 0.3), position=tuple(middle.tolist()), speed=0.0)
+    world = Beside(controller, turned, box, begin=0.5)
+    assert world.go_home() == "homing_held_up"
+    assert np.abs(world.state.v).max() < 0.02
+    assert np.abs(world.state.q - turned).max() > 0.1
 
 
 SETTINGS = ControllerSettings()

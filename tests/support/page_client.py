@@ -33,6 +33,7 @@ class PageClient:
         self._socket = connect(f"ws://{host}", origin=Origin(f"http://{host}"), subprotocols=protocol, max_size=None)
         self._contents: dict[str, str] = {}  # of the panel's pieces of HTML
         self.buttons: dict[str, str] = {}  # by label
+        self.drawn: set[str] = set()  # names of meshes
         self.pictures: list[bytes] = []  # of cameras, as they came
         self._send("ViewerCameraMessage", **_CAMERA)  # before which no press counts
 
@@ -85,6 +86,8 @@ class PageClient:
         for one in told["messages"]:
             if one["type"] == "GuiButtonMessage":
                 self.buttons[one["props"]["label"]] = one["uuid"]
+            if one["type"] == "MeshMessage":
+                self.drawn.add(one["name"])
             content = (one.get("props") or one.get("updates") or {}).get("content")
             if isinstance(content, str):
                 self._contents[one["uuid"]] = content

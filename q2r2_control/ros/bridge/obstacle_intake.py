@@ -33,9 +33,8 @@ class ObstacleIntake:
             node.create_subscription(Marker, TOPIC, self._on_marker, 10)
 
     def _on_marker(self, message: Marker) -> None:
-        gone = message.action in (Marker.DELETE, Marker.DELETEALL)
         try:
-            pair = self._controller.move_obstacle(message.ns, None if gone else obstacle_of(message, self._node.now))
+            pair = self._controller.move_obstacle(message.ns, obstacle_of(message, self._node.now))
             text = None if pair is None else f"{message.ns} is in the way: {' | '.join(pair)}; the arms brake"
         except Q2R2Error as error:
             text = f"{TOPIC}: not used: {error}"
@@ -44,8 +43,13 @@ class ObstacleIntake:
         self._said = text
 
 
-def obstacle_of(message: Marker, now: float) -> MovingObstacle:
-    """The obstacle of a marker that came at ``now`` [s]. Raises :class:`RobotError` or :class:`ConfigError`."""
+def obstacle_of(message: Marker, now: float) -> MovingObstacle | None:
+    """The obstacle of a marker that came at ``now`` [s], or None: it is gone.
+
+    Raises :class:`RobotError` or :class:`ConfigError`.
+    """
+    if message.action in (Marker.DELETE, Marker.DELETEALL):
+        return None
     pose, scale = pose_of(message.pose), message.scale
     shapes: dict[int, tuple[str, tuple[float, ...]]] = {
         Marker.CUBE: ("box", (scale.x, scale.y, scale.z)),

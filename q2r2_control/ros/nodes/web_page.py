@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from queue import SimpleQueue
@@ -18,9 +19,11 @@ import pinocchio as pin
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosbags.serde import SerdeError
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker
 
 from q2r2_control.config.cell import load_config
-from q2r2_control.errors import ConfigError
+from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport, check_obstacle
+from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.events import Event
 from q2r2_control.recording.messages import (
     NANOSECONDS,
@@ -40,6 +43,8 @@ from q2r2_control.recording.ros_recording import RosTicks
 from q2r2_control.recording.tick_rows import STATUSES
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import OK, RECORDED_QOS, STEADY, WARN, BaseNode
+from q2r2_control.ros.bridge.obstacle_intake import TOPIC as OBSTACLES
+from q2r2_control.ros.bridge.obstacle_intake import obstacle_of
 from q2r2_control.ros.monitoring import NodeStates
 from q2r2_control.ros.watching.set_listener import node_views
 from q2r2_control.ros.watching.set_view import arm_views
@@ -95,6 +100,9 @@ class WebPage(BaseNode):
         for topic in ros_topics(tuple(self._robot.arms), {}):
             if topic.name in shown:
                 self._listen(topic, partial(self._take, topic), RECORDED_QOS if topic.type == TEXT else _STREAM_QOS)
+        self._obstacles: dict[str, tuple[MovingObstacle, float]] = {}  # newest ones, and when they came [s]
+        if config.control.moving_obstacles:
+            self.create_subscription(Marker, OBSTACLES.replace("~", _CONTROLLER), self._on_obstacle, 10)
         self._pictures: dict[str, bytes] = {}  # newest messages, by camera
         for camera in [name for name, its in config.cameras.items() if its.topic and is_compressed(its.topic)]:
             topic = Topic(0, str(config.cameras[camera].topic), PICTURE)
@@ -116,6 +124,14 @@ class WebPage(BaseNode):
 
     def _take(self, topic: Topic, payload: bytes) -> None:
         self._waiting.append((topic.name, Message(topic.channel, 0, time.monotonic_ns(), 0, bytes(payload))))
+
+    def _on_obstacle(self, marker: Marker) -> None:
+        with suppress(Q2R2Error):  # the controller's log tells
+            obstacle, now = obstacle_of(marker, self.now), self.now
+            check_obstacle(marker.ns, obstacle, self._cell.control.moving_obstacles)
+            self._obstacles.pop(marker.ns, None)
+            if obstacle is not None:
+                self._obstacles[marker.ns] = obstacle, now
 
     def _look(self) -> None:
         """Find the nodes, and their services before a button needs them."""
@@ -234,6 +250,10 @@ class WebPage(BaseNode):
             reference=reference,
             state=state,
             openings=openings,
+            obstacles={
+                name: ObstacleReport(obstacle, obstacle.age + self.now - then)
+                for name, (obstacle, then) in self._obstacles.items()
+            },
             tools={arm: pin.XYZQUATToSE3(pose) for arm, pose in zip(arms, tools, strict=True)},
             command=Command(CommandMode.POSITION, reference.q, reference.v, np.zeros_like(reference.q), {}),
             events=[],

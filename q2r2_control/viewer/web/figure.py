@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pinocchio as pin
 import viser
 
+from q2r2_control.config.moving_obstacle import ObstacleReport
+from q2r2_control.robot.obstacle_bodies import body_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.joint_tree import Colour, JointTree, mesh_of
+from q2r2_control.viewer.state_colours import obstacle_colour
 
 _GHOST: Colour = (120, 160, 230)
 _CAPSULE: Colour = (200, 110, 40)
-_GHOST_OPACITY = 0.35
+_GHOST_OPACITY, _OBSTACLE_OPACITY = 0.35, 0.6
 
 
 class RobotFigure:
@@ -60,6 +65,31 @@ class CapsuleFigure:
         """Draw all shapes where ``placed`` has them."""
         for index, node in self._shapes:
             place(node, placed.oMg[index])
+
+
+class ObstacleFigure:
+    """The moving obstacles that are there, where they were reported last."""
+
+    def __init__(self, scene: viser.SceneApi, name: str) -> None:
+        self._scene, self._name = scene, name
+        self._drawn: dict[str, tuple[object, viser.SceneNodeHandle]] = {}  # looks and node of each
+
+    def show(self, reports: Mapping[str, ObstacleReport]) -> None:
+        """Draw these and no others."""
+        for gone in self._drawn.keys() - reports.keys():
+            self._drawn.pop(gone)[1].remove()
+        for name, report in reports.items():
+            body, colour = body_of(name, report.obstacle), obstacle_colour(report)
+            looks = report.obstacle.shape, report.obstacle.size, colour
+            if name not in self._drawn or self._drawn[name][0] != looks:
+                mesh = mesh_of(body.geometry)
+                assert mesh is not None
+                parts = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+                node = self._scene.add_mesh_simple(
+                    f"{self._name}/{name}", *parts, color=colour, opacity=_OBSTACLE_OPACITY
+                )
+                self._drawn[name] = looks, node
+            place(self._drawn[name][1], body.placement)
 
 
 def place(node: viser.SceneNodeHandle, pose: pin.SE3) -> None:

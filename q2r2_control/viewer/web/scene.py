@@ -13,7 +13,7 @@ from q2r2_control.types import Array, RobotState
 from q2r2_control.viewer.joint_tree import Colour, JointTree, colour_of
 from q2r2_control.viewer.state_colours import AMBER, GREEN, GREY, RED, state_colour
 from q2r2_control.viewer.web.exchange import Frame, PageSetup
-from q2r2_control.viewer.web.figure import CapsuleFigure, RobotFigure, place
+from q2r2_control.viewer.web.figure import CapsuleFigure, ObstacleFigure, RobotFigure, place
 
 _TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (150, 80, 190))
 _TRAIL = 90  # points
@@ -68,6 +68,7 @@ class CellScene:
             RobotFigure(scene, "/ghost", self._tree, True),
         )
         self._capsules = CapsuleFigure(scene, "/capsules", self._pairs)
+        self._obstacles = ObstacleFigure(scene, "/obstacles")
         self._ghost_always = self._add_choices(server)
         arms = list(setup.joints)
         look = {"axes_length": 0.08, "axes_radius": 0.003, "origin_radius": 0.012, "visible": False}
@@ -141,6 +142,7 @@ class CellScene:
                 place(node, target)
             self._show_line(self._leashes[arm], tool, None if target is None else target.translation - tool.translation)
             self._show_line(self._forces[arm], tool, self._force(arm, tick.state))
+        self._obstacles.show(tick.obstacles)
         self._show_trails(frame)
         self._show_pair(frame)
         for name, box in self._parts.items():
