@@ -39,7 +39,7 @@ CARRY = HandWork(
             (7.8, _CARRIED[0], _Y, _CARRIED[1], 0.0, -_TURN),
             (9.2, _CARRIED[0], _Y, _CARRIED[1], 0.0, -_TURN),
             (10.8, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # back
-            (12.6, _X, _Y, _HELD, 0.0, -_TURN),  # put down
+            (12.6, _X, _Y, _HELD - 0.003, 0.0, -_TURN),  # put down, until it rests on the table
             *_from_handle(1.0, LEFT_HOME),
         ),
         "right": (*_at_handle(-1.0), *_from_handle(-1.0, RIGHT_HOME)),
