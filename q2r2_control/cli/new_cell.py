@@ -26,7 +26,7 @@ from q2r2_control.robot.home_search import find_home, mirrored_home
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, lacks_of, tip_of, tips_by_side
 from q2r2_control.robot.near_pairs import spreads_of
-from q2r2_control.robot.pairs import CLEARANCE, link_of, pair_names
+from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_names
 from q2r2_control.robot.reachability import nearest_approaches, srdf_text
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
@@ -104,7 +104,10 @@ def new_cell(
         cell = Robot.from_config(found)
         _limit_acceleration(draft, cell, found)
         approaches = nearest_approaches(cell, samples, 0, CLEARANCE, progress)
-    always = dict.fromkeys([*draft.always, *((link_of(a), link_of(b)) for a, b in cell.ignored_pairs)])
+    # Links of several shapes are left out only where no two of these are watched.
+    watched = {frozenset(map(link_of, pair)) for pair in pair_names(cell.collision_model)}
+    overlapping = ((link_of(a), link_of(b)) for a, b in cell.ignored_pairs)
+    always = dict.fromkeys([*draft.always, *(links for links in overlapping if frozenset(links) not in watched)])
     never = [(pair.link_a, pair.link_b) for pair in approaches if pair.nearest > CLEARANCE]
     if always or never:
         comment = (
@@ -172,7 +175,22 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         arms[side] |= {"tip": found[side], "home": [float(np.mean(joint_limits(joint))) for joint in joints]}
         if gripper := gripper_of(described[side], tree, found[side]):
             arms[side]["gripper"] = gripper
-    draft.fits = {model: capsule_fits(described[side]) for side, model in models.items()}
+    # Fingers are all that they sweep, which finer shapes would hardly make smaller.
+    moved = {
+        side: links_moved_by(tree, [joint.get("name", "") for joint in chains[side]])
+        - links_moved_by(tree, arms[side].get("gripper", {}).get("joints", ()))
+        for side, tree in trees.items()
+    }
+    capsules: dict[str, int] = {}
+    for side, model in models.items():
+        if model not in draft.fits:
+            draft.fits[model] = capsule_fits(described[side], set[str]().union(*moved.values()))
+        for fit in draft.fits[model]:
+            if fit.capsules > 1 and fit.link in moved[side]:
+                name = fit.link if shared else f"{side}_{fit.link}"
+                capsules[name] = max(fit.capsules, capsules.get(name, 0))
+    if capsules:
+        draft.data["capsules"] = capsules
 
 
 def _mount(draft: _Draft, distance: float | None, height: float | None, yes: bool) -> None:
@@ -292,6 +310,8 @@ def _text(draft: _Draft, robot: Robot) -> str:
     lines += ["", f"obstacles: {{}}   # what stands around [m], such as {cabinet}"]
     if "srdf" in data:
         lines.append(f"srdf: {_flow(data['srdf'])}   # pairs of links that cannot meet")
+    if capsules := data.get("capsules"):
+        lines.append(f"capsules: {_flow(capsules)}   # for each mesh of these links, where one would be much larger")
     if control := data.get("control"):
         lines += ["", "control:"]
         if "acceleration_limit" in control:
@@ -312,9 +332,14 @@ def _print(draft: _Draft, notes: list[str], faults: list[str]) -> None:
     console = Console(highlight=False, soft_wrap=True)
     for model, fits in draft.fits.items():
         rows = (
-            (fit.link, 1e3 * fit.radius, 1e3 * fit.length, 1e3 * fit.beyond, 100 * fit.wasted) for fit in fits[:_FITS]
+            (
+                *(fit.link, 1e3 * fit.radius, 1e3 * fit.length, 1e3 * fit.beyond, 100 * fit.wasted),
+                *((fit.capsules, 100 * fit.then_wasted) if fit.capsules > 1 else ("", "")),
+            )
+            for fit in fits[:_FITS]
         )
-        columns = ("link", "radius [mm]", "length [mm]", "beyond the mesh [mm]", "empty [%]")
+        sizes = ("radius [mm]", "length [mm]", "beyond the mesh [mm]")
+        columns = ("link", *sizes, "empty [%]", "better", "then empty [%]")
         if fits:
             title = f"{model}: capsules around {len(fits)} meshes, which none sticks out of; the worst first"
             print_table(figure_table(title, columns, rows), console)

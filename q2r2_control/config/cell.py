@@ -9,7 +9,7 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import Field, field_validator, model_validator
@@ -140,6 +140,9 @@ class Config(StrictModel):
     floor: Coordinate | None = Field(0.0, description="height of the floor, which arms keep off [m]; none: no floor")
     srdf: LocalPath | None = Field(
         None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it"
+    )
+    capsules: dict[str, Annotated[int, Field(ge=2, le=4)]] = Field(
+        default_factory=dict, description="links of whose meshes each becomes so many capsules at most; others: one"
     )
     supervision: SupervisionSettings = SupervisionSettings()
     loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")

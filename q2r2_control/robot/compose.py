@@ -113,6 +113,7 @@ def compose(config: Config) -> ComposedCell:
             },
             tool_links={side: arm.tool_links() for side, arm in arms.items()},
             obstacles=(*config.obstacles, *([] if config.floor is None else [FLOOR])),
+            capsules=config.capsules,
         ),
     )
 

@@ -5,32 +5,52 @@ too: a pair of two boxes has no short closed form.
 
 A mesh or convex becomes a capsule around its vertices, hence around its triangles, since a capsule is convex. Safety
 rests on its enclosing every vertex only, which its construction gives for any axis and any centre.
+
+Several capsules hold a mesh together: parallel planes cut it into slabs. The corners of a triangle's part in a slab are
+its vertices there and where its edges cross the slab's planes, and the slab's capsule is put around all of these.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
-from itertools import product
+from itertools import combinations, pairwise, product
 
 import coal
 import numpy as np
+import numpy.typing as npt
 import pinocchio as pin
 from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial import ConvexHull, QhullError
 
-from q2r2_control.errors import RobotError
+from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.robot.pairs import link_of
 from q2r2_control.types import Array
+
+Capsule = tuple[float, Array, Array]  # radius and both ends of the segment (3,) [m]
 
 # Rounding may take something away, which is given back: 1 micrometre on every enclosing radius.
 _ROUNDING = 1e-6
+_SLABS = 12  # of equal height, which the capsules of a mesh share
 
 
-def enclose_shapes(geometry: pin.GeometryModel) -> None:
+def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | None = None) -> None:
     """Replace in place every shape that is not a capsule, a sphere or a box fixed in the world; names and pairs stay.
 
-    Raises :class:`RobotError` for a shape without extent or without bounds.
+    ``capsules`` has links of whose meshes each becomes that many capsules at most. The first one has the mesh's name,
+    the others follow all shapes, as further ones of their link. Raises :class:`RobotError` for a shape without extent
+    or without bounds, and :class:`ConfigError` for a link in ``capsules`` that has no mesh.
     """
+    capsules = capsules or {}
+    numbers = Counter(link_of(item.name) for item in geometry.geometryObjects)
+    meshes = {link_of(one.name) for one in geometry.geometryObjects if isinstance(one.geometry, coal.BVHModelBase)}
+    for link in capsules:
+        if link not in meshes:
+            allowed = ", ".join(sorted(meshes)) or "none in this cell"
+            raise ConfigError(f"capsules.{link!s:.60}: no link with a mesh; allowed: {allowed}")
+    more = []
     for item in geometry.geometryObjects:
         fixed_box = isinstance(item.geometry, coal.Box) and item.parentJoint == 0
         if fixed_box or isinstance(item.geometry, coal.Capsule | coal.Sphere):
@@ -39,40 +59,117 @@ def enclose_shapes(geometry: pin.GeometryModel) -> None:
             radius, half_length = float(shape.radius), float(shape.halfLength)
             item.geometry = _around_cylinder(radius, half_length, box_allowed=item.parentJoint == 0)
         else:
-            item.geometry, placement = capsule_between(*_cached_capsule(_vertices(shape, item.name).tobytes()))
-            item.placement = item.placement * placement
+            link, drawn = link_of(item.name), item.placement.copy()
+            first, *others = capsules_around(shape, item.name, capsules.get(link, 1))
+            item.geometry, placement = capsule_between(*first)
+            item.placement = drawn * placement
+            for other in others:
+                part, placement = capsule_between(*other)
+                name = f"{link}_{numbers[link]}"
+                more.append(pin.GeometryObject(name, item.parentJoint, item.parentFrame, drawn * placement, part))
+                numbers[link] += 1
         item.meshPath = ""
         item.meshScale = np.ones(3)
+    for item in more:
+        geometry.addGeometryObject(item)
 
 
-def enclosing_capsule(points: Array) -> tuple[float, Array, Array]:
+def capsules_around(shape: coal.CollisionGeometry, name: str, count: int) -> list[Capsule]:
+    """Capsules that hold a shape together, in its frame: ``count`` at most for a mesh, one for others.
+
+    Raises :class:`RobotError` for a shape called ``name`` that has no bounds.
+    """
+    vertices = _vertices(shape, name)
+    if count == 1 or not isinstance(shape, coal.BVHModelBase):
+        return [_cached_capsule(vertices.tobytes())]
+    triangles = np.array(
+        [[one[0], one[1], one[2]] for one in map(shape.tri_indices, range(shape.num_tris))], dtype=np.int64
+    )
+    return list(_cached_capsules(vertices.tobytes(), triangles.tobytes(), count))
+
+
+def enclosing_capsule(points: Array) -> Capsule:
     """A small capsule around ``points`` (n, 3): radius and the segment's two ends (3,), same unit and frame.
 
     Starts from the principal axes and minimises the volume over the axis (two angles), its place (two offsets) and the
     radius beyond the least one. For an axis with radius r, a point at height t and distance rho from it is inside when
     the segment covers a height within sqrt(r^2 - rho^2) of t.
     """
-    points = np.asarray(points, dtype=float)
-    with suppress(QhullError, ValueError):  # of points in a plane, or too few
-        points = points[ConvexHull(points).vertices]
+    points = _corners(np.asarray(points, dtype=float))
     centre = points.mean(axis=0)
     scale = max(float(np.abs(points - centre).max()), 1e-9)
-    axes = np.linalg.svd(points - centre, full_matrices=True)[2]
-    frames = [axes[[index - 2, index - 1, index]] for index in range(3)]  # rows: two across, one along
-    views = [(points - centre) @ frame.T / scale for frame in frames]
-    best = int(np.argmin([_volume(*_fit(view, _start(view))) for view in views]))
+    frame, view = _best_view(points - centre, np.linalg.svd(points - centre, full_matrices=True)[2], scale)
     options = {"maxiter": 600, "xatol": 1e-4, "fatol": 1e-5}
-    start = _start(views[best])
-    result = minimize(lambda x: _volume(*_fit(views[best], x)), start, method="Nelder-Mead", options=options)
-    radius, ends = _fit(views[best], result.x)
-    start, end = ends * scale @ frames[best] + centre
+    start = _start(view)
+    result = minimize(lambda x: _volume(*_fit(view, x)), start, method="Nelder-Mead", options=options)
+    radius, ends = _fit(view, result.x)
+    start, end = ends * scale @ frame + centre
     return radius * scale + _ROUNDING, start, end
 
 
 @lru_cache(maxsize=64)
-def _cached_capsule(points: bytes) -> tuple[float, Array, Array]:
+def _cached_capsule(points: bytes) -> Capsule:
     """Both arms of a cell usually share their meshes."""
     return enclosing_capsule(np.frombuffer(points).reshape(-1, 3))
+
+
+@lru_cache(maxsize=64)
+def _cached_capsules(points: bytes, corners: bytes, count: int) -> tuple[Capsule, ...]:
+    """``count`` capsules at most, of neighbouring slabs each, along the principal axis that needs the least volume."""
+    vertices = np.frombuffer(points).reshape(-1, 3)
+    triangles = np.frombuffer(corners, dtype=np.int64).reshape(-1, 3)
+    edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    best: tuple[float, list[Array]] = (np.inf, [])
+    for axis in np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]:
+        slabs = _slabs(vertices, edges, axis)
+        parts = {cut: _corners(np.concatenate(slabs[slice(*cut)])) for cut in combinations(range(_SLABS + 1), 2)}
+        volumes = {cut: _first_volume(part) for cut, part in parts.items()}
+        for inner in combinations(range(1, _SLABS), count - 1):
+            cuts = list(pairwise((0, *inner, _SLABS)))
+            if (volume := sum(map(volumes.__getitem__, cuts))) < best[0]:
+                best = volume, [parts[cut] for cut in cuts if len(parts[cut])]
+    return tuple(map(enclosing_capsule, best[1]))
+
+
+def _slabs(vertices: Array, edges: npt.NDArray[np.int64], axis: Array) -> list[Array]:
+    """Points (n, 3) around what triangles with these ``edges`` (m, 2) have in each slab across ``axis`` (3,)."""
+    height = vertices @ axis
+    planes = np.linspace(height.min(), height.max(), _SLABS + 1)
+    below, above = height[edges].T
+    crossings = []
+    for plane in planes:
+        crossing = (below - plane) * (above - plane) < 0
+        start, end = vertices[edges[crossing]].transpose(1, 0, 2)
+        share = (plane - below[crossing]) / (above - below)[crossing]
+        crossings.append(start + share[:, None] * (end - start))
+    return [
+        _corners(np.concatenate([vertices[(height >= low) & (height <= high)], *on_planes]))
+        for (low, high), on_planes in zip(pairwise(planes), pairwise(crossings), strict=True)
+    ]
+
+
+def _corners(points: Array) -> Array:
+    """Those of the convex hull of ``points`` (n, 3)."""
+    with suppress(QhullError, ValueError):  # of points in a plane, or too few
+        points = points[ConvexHull(points).vertices]
+    return points
+
+
+def _best_view(points: Array, axes: Array, scale: float = 1.0) -> tuple[Array, Array]:
+    """The order of ``axes`` (3, 3), the last one along, in which a first capsule is the smallest, and points in it."""
+    frames = [axes[[index - 2, index - 1, index]] for index in range(3)]
+    views = [points @ frame.T / scale for frame in frames]
+    best = int(np.argmin([_volume(*_fit(view, _start(view))) for view in views]))
+    return frames[best], views[best]
+
+
+def _first_volume(points: Array) -> float:
+    """Of the capsule around ``points`` (n, 3) from which a smaller one would be sought; 0 without any."""
+    if not len(points):
+        return 0.0
+    offsets = points - points.mean(axis=0)
+    view = _best_view(offsets, np.linalg.eigh(offsets.T @ offsets)[1].T)[1]
+    return _volume(*_fit(view, _start(view)))
 
 
 def _vertices(shape: coal.CollisionGeometry, name: str) -> Array:

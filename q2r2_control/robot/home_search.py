@@ -1,7 +1,8 @@
 """A home that nobody has named: a posture to work from, found by sampling and then improved.
 
 Wanted are joints near their middles, a tool before and below the shoulder that points forwards and down, motion in all
-directions, torques to spare, and room between bodies. The last two are needed: where they are missing the cost jumps.
+directions, torques to spare, and room between bodies, most of all below the tool, since work goes down from home. Of
+torques and room a part is needed: where that is missing the cost jumps.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from itertools import product
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Arm, Robot
 from q2r2_control.types import Array
@@ -24,6 +26,7 @@ _AHEAD = np.array([0.8, 0.0, -0.6])  # where it points
 _LEAST_GAIN = 0.15  # of the weakest direction of motion, in reaches
 _BORNE = 0.7  # of the torque limits, by gravity
 _ROOM = 0.04  # more than a pair keeps; what is needed is a part of it [m]
+_BELOW = 0.16  # the same between the tool and the floor, as far as scripted hands go down and more [m]
 _NEEDED = 0.005  # [m]
 _MIRROR = np.array([1.0, -1.0, 1.0])
 _ALONG_X, _ALONG_Z = np.diag([0.01, 0.0, 0.01])[[0, 2]]  # in the tool's frame [m]
@@ -84,7 +87,14 @@ class _HomeSearch:
         self._box = self._middle - _INSIDE * self._half, self._middle + _INSIDE * self._half
         self._data = robot.model.createData()
         arms_of = [[robot.roles[link_of(name)].arms for name in names] for names in pair_names(robot.collision_model)]
-        self._counts = np.array([all(not arms or arms & {arm, *placed} for arms in both) for both in arms_of], bool)
+        counts = np.array([all(not arms or arms & {arm, *placed} for arms in both) for both in arms_of], bool)
+        last = {
+            item.name
+            for item in robot.collision_model.geometryObjects
+            if item.parentJoint == robot.model.frames[self._arm.frame_id].parentJoint
+        }
+        below = [FLOOR in map(link_of, pair) and bool(last & {*pair}) for pair in pair_names(robot.collision_model)]
+        self._rooms = (counts, _ROOM), (np.array(below, bool), _BELOW)
         self._reach = 1.0  # [m]
         # The first two joints turn and lift most arms: the shoulder is where the second is.
         self._shoulder = int(self._joints[min(1, len(self._joints) - 1)]) + 1
@@ -134,9 +144,10 @@ class _HomeSearch:
 
     def cost(self, x: Array) -> float:
         """With what bodies lack of their room."""
-        missing = self._kept + _ROOM - self._robot.distance_values(self._at(x))
-        most = float(missing[self._counts].max(initial=0.0))
-        return self._cost_of_posture(x) + _beyond(most, _ROOM - _NEEDED)
+        cost, kept = self._cost_of_posture(x), self._robot.distance_values(self._at(x)) - self._kept
+        for pairs, room in self._rooms:
+            cost += _beyond(room - float(kept[pairs].min(initial=room)), room - _NEEDED)
+        return cost
 
 
 def _beyond(excess: float, most: float) -> float:

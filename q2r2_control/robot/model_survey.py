@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.arm_chain import arm_ends, default_tip, end_of
 from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits
-from q2r2_control.robot.enclose import enclose_shapes
+from q2r2_control.robot.enclose import Capsule, capsules_around, enclose_shapes
 from q2r2_control.robot.pairs import link_of, links_moved_by
 from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
@@ -24,6 +24,10 @@ from q2r2_control.types import Array
 _ARM_NAME = re.compile(r"arm|hand|grip|wrist|elbow|shoulder", re.IGNORECASE)
 _SIDE_NAMES = {side: re.compile(rf"{side}|(^|[_-]){side[0]}([_-]|$)", re.IGNORECASE) for side in ("left", "right")}
 _ON_SPHERE = 400  # points of a capsule's ends that are compared with its mesh
+_IN_BOX = 20_000  # points that volumes of several capsules are measured by
+_SEVERAL = (2, 3)  # capsules that are tried
+# Of one capsule's volume, what several may have, and what each more has to save beyond the pairs that it costs.
+_CLEARLY_LESS, _EACH_SAVES = 0.8, 0.1
 _WIDEST, _STRONGEST, _FASTEST = 3.15, 500.0, 5.0  # that a cell's gripper may have
 
 
@@ -145,11 +149,16 @@ class CapsuleFit:
     radius: float  # [m]
     length: float  # of its segment [m]
     beyond: float  # how far it reaches beyond the mesh's convex hull, at least [m]
-    wasted: float  # share of its volume that the hull leaves empty
+    wasted: float  # share of its volume that is more than the hull's
+    capsules: int  # that hold the mesh together in clearly less volume; 1: one does
+    then_wasted: float  # the share that is left with these
 
 
-def capsule_fits(description: Description) -> list[CapsuleFit]:
-    """How well capsules fit the collision meshes of a model, the worst first."""
+def capsule_fits(description: Description, several: Collection[str]) -> list[CapsuleFit]:
+    """How well capsules fit the collision meshes of a model, the worst first.
+
+    Several capsules are tried for the meshes of links in ``several``.
+    """
     text = ET.tostring(description.urdf, encoding="unicode")
     model = pin.buildModelFromXML(text)
     meshes = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
@@ -166,8 +175,28 @@ def capsule_fits(description: Description) -> list[CapsuleFit]:
         on = [surface.act(point) for point in _on_capsule(radius, half)]
         beyond = float((hull.equations[:, :3] @ np.array(on).T + hull.equations[:, 3:]).max())
         volume = np.pi * radius**2 * (2.0 * half + 4.0 / 3.0 * radius)
-        fits.append(CapsuleFit(link_of(mesh.name), radius, 2.0 * half, beyond, 1.0 - float(hull.volume) / volume))
+        link, volumes = link_of(mesh.name), {1: volume}
+        if link in several:
+            volumes |= {count: _volume_of(capsules_around(mesh.geometry, mesh.name, count)) for count in _SEVERAL}
+        count = min(volumes, key=lambda count: volumes[count] / volume + _EACH_SAVES * count)
+        count = count if volumes[count] <= _CLEARLY_LESS * volume else 1
+        wasted, then_wasted = (max(1.0 - float(hull.volume) / volumes[number], 0.0) for number in (1, count))
+        fits.append(CapsuleFit(link, radius, 2.0 * half, beyond, wasted, count, then_wasted))
     return sorted(fits, key=lambda fit: -fit.wasted)
+
+
+def _volume_of(capsules: Sequence[Capsule]) -> float:
+    """Of capsules together [m^3], by random points that are always the same."""
+    ends = np.array([[start, end] for _, start, end in capsules])
+    radii = np.array([radius for radius, _, _ in capsules])[:, None, None]
+    low, high = (ends - radii).min(axis=(0, 1)), (ends + radii).max(axis=(0, 1))
+    points = np.random.default_rng(0).uniform(low, high, (_IN_BOX, 3))
+    held = np.zeros(_IN_BOX, dtype=bool)
+    for radius, start, end in capsules:
+        along = end - start
+        share = np.clip((points - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+        held |= np.linalg.norm(points - start - share[:, None] * along, axis=1) <= radius
+    return float(np.prod(high - low) * held.mean())
 
 
 def _on_capsule(radius: float, half: float) -> Array:

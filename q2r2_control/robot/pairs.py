@@ -35,6 +35,7 @@ class KnownParts:
     tool_links: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     obstacles: tuple[str, ...] = ()  # links
     strokes: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # finger joints closed and open [m or rad]
+    capsules: Mapping[str, int] = field(default_factory=dict)  # of each mesh, at most, by link; else one
 
     @classmethod
     def carried_by(cls, tree: LinkTree, chains: Mapping[str, Sequence[str]]) -> KnownParts:

@@ -120,7 +120,7 @@ class Robot:
             for name, arm in self.arms.items()
         }
         self.roles: dict[str, Role] = roles_of(tree, own_links, parts)
-        enclose_shapes(self.collision_model)
+        enclose_shapes(self.collision_model, parts.capsules)
         self.finger_bodies = sweep_fingers(self.model, self.collision_model, tree, parts, home)
         for name, arm in self.arms.items():
             ways = [body.way for body in self.finger_bodies if isinstance(body, TurningBody) and body.arm == name]

@@ -9,6 +9,7 @@ import pytest
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
+from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from tests.cli.command import one_object, q2r2
 
@@ -113,3 +114,32 @@ def test_both_arms_of_one_model_are_found_with_their_fingers(tmp_path: Path) -> 
     assert right == pytest.approx(left * [1.0, -1.0, 1.0], abs=0.005), "their homes mirror each other"
     for arm in cell.arms.values():
         assert arm.gripper.open_position > arm.gripper.closed_position == 0.0
+
+
+def test_links_of_several_shapes_are_left_out_only_where_all_of_these_overlap(tmp_path: Path) -> None:
+    ball = '<collision><origin xyz="0 0 0.2"/><geometry><sphere radius="0.17"/></geometry></collision></link>'
+    head, tail = re.split(r"</link>\s*(?=<joint name=\"A2\")", IIWA)
+    Path("arm.urdf").write_text(f"{head}{ball}{tail}")
+    q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
+    robot = Robot.from_config(load_config(tmp_path / "cell.yaml"))
+    assert ("left_link_1_1", "left_link_3_0") in robot.ignored_pairs
+    assert ("left_link_1_0", "left_link_3_0") in pair_names(robot.collision_model)
+
+
+def test_meshes_that_one_capsule_holds_badly_get_several_and_the_tools_follow(tmp_path: Path) -> None:
+    model = "example-robot-data:ur5"
+    made = one_object(
+        q2r2("new-cell", "cell", "--left", model, "--right", model, "--yes", "--samples", "100", "--json").stdout
+    )
+    assert made["faults"] == []
+    better = {fit["link"]: fit for fit in made["capsules"][model] if fit["capsules"] > 1}
+    assert {link: fit["capsules"] for link, fit in better.items()} == {"forearm_link": 3, "upper_arm_link": 3}
+    assert all(fit["then_wasted"] < 0.5 * fit["wasted"] for fit in better.values())
+    cell = load_config(tmp_path / "cell.yaml")
+    assert cell.capsules == {f"{side}_{link}": 3 for side in ("left", "right") for link in better}
+    pairs, before = map(int, re.findall(r"(\d+) pairs instead of (\d+)", made["notes"][0])[0])
+    assert before < pairs == len(Robot.from_config(cell).collision_model.collisionPairs)
+    run = q2r2("run", "cell.yaml", *["--plant", "mujoco", "--fast", "--headless", "--duration", "2", "--json"])
+    assert run.exit_code == 0, run.output
+    arms = one_object(run.stdout)["arms"].values()
+    assert max(arm["position_error_mm_rms"] for arm in arms) < 1.0

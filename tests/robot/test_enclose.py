@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -7,11 +8,13 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
+import yaml
 
-from q2r2_control.config.cell import Config
-from q2r2_control.errors import RobotError
+from q2r2_control.config.cell import Config, parse_config
+from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.description import load_description
 from q2r2_control.robot.enclose import enclose_shapes, enclosing_capsule
+from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -135,3 +138,89 @@ def test_a_mesh_without_triangles_is_refused(tmp_path: Path) -> None:
     arms = {"left": {"model": str(tmp_path / "arm.urdf"), "home": [0.0]}}
     with pytest.raises(RobotError):
         Robot.from_config(Config.model_validate({"name": "a", "arms": arms}))
+
+
+def _slender_brick() -> coal.BVHModelOBBRSS:
+    """1 m long, with vertices at both ends only."""
+    mesh = coal.BVHModelOBBRSS()
+    mesh.beginModel(12, 8)
+    corners = _clouds()["a brick"] * [1.0, 0.5, 2.5]
+    for quad in ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)):
+        for triangle in (quad[:3], (quad[0], *quad[2:])):
+            mesh.addTriangle(*corners[list(triangle)])
+    mesh.endModel()
+    return mesh
+
+
+def _on_triangles(mesh: coal.BVHModelBase) -> Array:
+    random = np.random.default_rng(5)
+    numbers = random.integers(mesh.num_tris, size=20_000)
+    corners = np.array([[mesh.tri_indices(int(i))[k] for k in range(3)] for i in numbers])
+    weights = random.dirichlet([0.5, 0.5, 0.5], len(numbers))
+    return np.asarray(np.einsum("nk,nkd->nd", weights, mesh.vertices()[corners]))
+
+
+def _volume(capsules: list[pin.GeometryObject]) -> float:
+    shapes = [item.geometry for item in capsules]
+    return float(sum(np.pi * one.radius**2 * (2 * one.halfLength + 4 / 3 * one.radius) for one in shapes))
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("link", ["forearm_link", "upper_arm_link", "thing"])
+def test_capsules_of_a_link_hold_all_of_its_mesh_together(link: str, count: int) -> None:
+    before = _one(_slender_brick(), 1) if link == "thing" else _geometry("example-robot-data:ur5")
+    enclosed = before.copy()
+    mesh = next(item for item in before.geometryObjects if item.name == f"{link}_0")
+    enclose_shapes(enclosed, {link: count})
+    capsules = [item for item in enclosed.geometryObjects if link_of(item.name) == link]
+    assert [item.name for item in capsules] == [f"{link}_{number}" for number in range(count)]
+    points = np.array([mesh.placement.act(point) for point in _on_triangles(mesh.geometry)])
+    beyond = np.full(len(points), np.inf)
+    for item in capsules:
+        assert (item.parentJoint, item.parentFrame) == (mesh.parentJoint, mesh.parentFrame)
+        half = np.array([0.0, 0.0, item.geometry.halfLength])
+        ends = item.placement.act(-half), item.placement.act(half)
+        beyond = np.minimum(beyond, _reach(points, *ends) - item.geometry.radius)
+    assert beyond.max() <= 0.0
+
+
+def test_three_capsules_are_clearly_less_than_one_around_a_forearm() -> None:
+    volumes = []
+    for counts in ({}, {"forearm_link": 3}):
+        geometry = _geometry("example-robot-data:ur5")
+        enclose_shapes(geometry, counts)
+        volumes.append(_volume([item for item in geometry.geometryObjects if link_of(item.name) == "forearm_link"]))
+    assert volumes[1] < 0.75 * volumes[0]
+
+
+_FOREARM = [f"left_forearm_link_{number}" for number in range(3)]
+
+
+def _ur5(**keys: object) -> Config:
+    arms = {"left": {"model": "example-robot-data:ur5", "tip": "tool0", "home": [0.0, -1.0, 1.3, 0.4, 1.2, 0.0]}}
+    return Config.model_validate({"name": "a", "arms": arms, **keys})
+
+
+def test_a_cell_watches_each_capsule_of_a_link() -> None:
+    plain, fine = (Robot.from_config(_ur5(capsules=counts)) for counts in ({}, {"left_forearm_link": 3}))
+    names = [item.name for item in fine.collision_model.geometryObjects]
+    assert names == [*(item.name for item in plain.collision_model.geometryObjects), *_FOREARM[1:]]
+    pairs = set(pair_names(fine.collision_model))
+    assert pairs > set(pair_names(plain.collision_model))
+    assert {("floor_0", name) in pairs or (name, "floor_0") in pairs for name in _FOREARM} == {True}
+
+
+@pytest.mark.parametrize(
+    ("capsules", "says"),
+    [
+        ({"forearm_link": 2}, "capsules.forearm_link: no link with a mesh; allowed: left_base_link, left_forearm_link"),
+        ({"left_ee_link": 2}, "capsules.left_ee_link: no link with a mesh"),
+        ({"left_forearm_link": 5}, "capsules.left_forearm_link = 5"),
+        ({"left_forearm_link": 1}, "capsules.left_forearm_link = 1"),
+    ],
+    ids=["no link of the cell", "a box", "too many", "one, which is usual"],
+)
+def test_capsules_that_cannot_be_are_refused(capsules: dict[str, int], says: str) -> None:
+    text = yaml.safe_dump(_ur5().model_dump(mode="json", exclude_unset=True) | {"capsules": capsules})
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        Robot.from_config(parse_config(text, "cell.yaml"))
