@@ -58,7 +58,8 @@ def test_what_a_kernel_uses_is_covered_by_the_name_of_the_cache(source: Path) ->
     harmless = {
         f"q2r2_control.{name}"
         for name in (
-            *("types", "errors", "config.control", "control.geometry.finger_openings"),
+            *("types", "errors", "config.control", "config.moving_obstacle"),
+            *("control.geometry.finger_openings", "control.moving_obstacles"),
             *("robot.robot", "robot.pairs", "robot.kept_distances", "robot.obstacle_bodies", "robot.turning_fingers"),
         )
     }
