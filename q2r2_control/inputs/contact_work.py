@@ -50,11 +50,11 @@ CARRY = HandWork(
         (4.2, "the left hand moves both arms: they lift the tray"),
         (6.2, "they carry it nearer"),
         (9.2, "they put it back"),
-        (12.9, "each hand lets go"),
+        (12.9, "both let go"),
     ),
-    presses={"left": (3.5, 14.4), "right": (3.5, 14.4)},
-    grips=(4.4, 12.9),
-    engages=(13.6,),
+    presses={"left": (3.5, 13.0), "right": (3.5, 13.0)},
+    grips=(4.4, 13.7),
+    engages=(14.4,),
 )
 
 _SPONGE_X, _SPONGE_Y, _SPONGE_HELD = 0.60, 0.42, 0.248
