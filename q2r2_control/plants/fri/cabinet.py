@@ -28,8 +28,8 @@ from q2r2_control.plants.fri.wire import (
 )
 
 _WINDOW = 50  # answers that the quality is judged by
-# Share of them that came in time. KUKA publishes no such numbers. With 0.9 a loss of 1 % each way ends a session every
-# minute or so, by six in 50 that chance brings together.
+# Share of them that came in time. KUKA publishes no such numbers. With 0.9 a loss of 1 % each way ends a session within
+# minutes, by six misses in 50 that chance brings together.
 _FAIR, _GOOD, _EXCELLENT = 0.5, 0.8, 0.98
 _MISSES = 10  # answers in a row that may be late while the client commands
 _NEAR = 1e-3  # how far the first command may be from the cabinet's own position [rad]
