@@ -32,7 +32,7 @@ from q2r2_control.recording.messages import RECORDER_EVENTS, arm_events
 from q2r2_control.recording.reader import Recording, read_spans
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
-from q2r2_control.teleop.haptics import EPISODE_BEGINS, EPISODE_DISCARDED, EPISODE_ENDS, Pulse
+from q2r2_control.teleop.haptics import EPISODE_BEGINS, EPISODE_DISCARDED, EPISODE_ENDS, EPISODE_REJECTED, Pulse
 from tests.recording.runs import read_elsewhere
 from tests.ros.arm_rig import ArmRig
 from tests.ros.processes import States, call, wait_until
@@ -135,6 +135,7 @@ def test_hand_and_services_tell_of_episodes_to_each_other(node: Any, processes: 
     felt(rig, EPISODE_ENDS)
     refused = call(node, "/recorder/stop")
     assert not refused.success
+    felt(rig, EPISODE_REJECTED)  # the verdict on it, which is stronger than a discard that comes meanwhile
     squeeze(rig)
     recorder.wait("episode_open", True)
     assert call(node, "/recorder/discard").success
@@ -150,8 +151,9 @@ def squeeze(rig: ArmRig) -> None:
 
 
 def felt(rig: ArmRig, pulse: Pulse) -> None:
+    """Wait until it has been felt, and has ended: a weaker one that begins meanwhile is not felt."""
     wanted = (round(pulse.frequency, 3), round(pulse.amplitude, 3))
-    rig.wait(lambda: wanted in rig.pulses, f"{pulse} is felt")
+    rig.wait(lambda: wanted in rig.pulses and rig.pulses[-1] == (0.0, 0.0), f"{pulse} is felt")
 
 
 @pytest.mark.alone
