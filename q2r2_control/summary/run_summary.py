@@ -144,6 +144,12 @@ class RunSummary:
     torque: TorqueSummary | None  # None: position mode
     events: list[Event]
 
+    @property
+    def followed(self) -> bool:
+        """Whether every tool was where it should be at the end, and no arm refused every press that engages it."""
+        refused = {event.arm for event in self.events if event.kind is ReasonKind.NOT_ENGAGED}
+        return all(arm.followed and (arm.engaged_s or name not in refused) for name, arm in self.arms.items())
+
     def as_json(self) -> dict[str, Any]:
         data = asdict(self)
         data["events"] = [event.as_json() | {"reason": sentence(event.reason)} for event in self.events]
