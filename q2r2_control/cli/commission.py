@@ -23,14 +23,15 @@ from q2r2_control.config.cell import load_config, parse_config
 from q2r2_control.config.mount_text import with_mount
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, PlantError, Q2R2Error
-from q2r2_control.pipeline.commissioning import LoadSurvey, measure_joint, measure_stop
-from q2r2_control.pipeline.slow_run import SlowRun
+from q2r2_control.pipeline.commissioning import LoadSurvey, StopReport, measure_joint, measure_stop
+from q2r2_control.pipeline.killed_run import measure_kill
+from q2r2_control.pipeline.slow_run import REST, STILL, SlowRun
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.process.scheduling import real_time
 from q2r2_control.recording.about import program
 from q2r2_control.robot.commissioned import fingerprint, sign_off_file
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import SIDES, CommandMode
+from q2r2_control.types import SIDES, Array, CommandMode
 from q2r2_control.viewer.tables import figure_table, print_table, record_table
 
 _MOST_LOST = 0.01  # of a cabinet's messages
@@ -53,7 +54,7 @@ class _Commissioning:
         self._repeats = 0  # of measurements
 
     def run(self, stack: ExitStack) -> None:
-        """All steps; what ``stack`` closes brings the arms to rest."""
+        """All steps; what ``stack`` closes brings the arms to rest, or lets go of the cabinets."""
         self._plant.begin(CommandMode.POSITION)
         stack.callback(self._plant.close)
         self._do("cabinets", f"listens for {self._duration:g} s, and moves nothing", self._cabinets)
@@ -65,10 +66,12 @@ class _Commissioning:
             "100 mm of room above it, start the application that lets this program command, and press Enter"
         )
         say("waits until the cabinets command", self._console)
-        run = self._tried(lambda: stack.enter_context(self._slow_run()))
-        self._do("motion", "each joint goes a degree and back, one after the other", lambda: self._motion(run))
-        self._do("load", "the arms go through eight postures", lambda: self._load(run))
-        self._do("stop", "each tool goes up for two seconds, and a hand lets go", lambda: self._stop(run))
+        with ExitStack() as moving:
+            run = self._tried(lambda: moving.enter_context(self._slow_run()))
+            self._do("motion", "each joint goes a degree and back, one after the other", lambda: self._motion(run))
+            self._do("load", "the arms go through eight postures", lambda: self._load(run))
+            self._do("stop", "each tool goes up for two seconds, and a hand lets go", lambda: self._stop(run))
+        self._do("kill", "both tools go up for two seconds, and the program that leads them is killed", self._kill)
 
     def signed(self) -> dict[str, Any]:
         """The sign-off, with the operator's name."""
@@ -88,7 +91,7 @@ class _Commissioning:
 
     def _do(self, name: str, what: str, step: Callable[[], Any]) -> None:
         self.step = name
-        say(f"step {len(self.seen) + 1} of 6, {name}: {what}", self._console, "bold")
+        say(f"step {len(self.seen) + 1} of 7, {name}: {what}", self._console, "bold")
         self.seen[name] = step()
 
     def _cabinets(self) -> list[dict[str, Any]]:
@@ -202,6 +205,26 @@ class _Commissioning:
         print_table(record_table("stops", reports), self._console)
         return [asdict(report) for report in reports]
 
+    def _kill(self) -> list[dict[str, Any]]:
+        def killed() -> list[StopReport]:
+            self._ask("start the application that lets this program command once more, and press Enter")
+            return [report.check() for report in measure_kill(self.config, self._resting)]
+
+        reports = self._tried(killed)
+        print_table(record_table("stops", reports), self._console)
+        return [asdict(report) for report in reports]
+
+    def _resting(self) -> Array:
+        """Where the arms rest, while nothing commands them (nv,) [rad]. Raises :class:`PlantError` where they move."""
+        self._plant.reset()
+        try:
+            seen = postures_over(self._plant, REST)
+        finally:
+            self._plant.close()
+        if (moved := float(np.ptp(seen, axis=0).max())) > STILL:
+            raise PlantError(f"the arms moved by {moved:.4f} rad although nothing commands them; allowed: {STILL:g}")
+        return np.asarray(seen[-1])
+
     def _tried(self, measure: Callable[[], _Measured], run: SlowRun | None = None) -> _Measured:
         """The result of ``measure``, which the operator may let try again: a cabinet may have ended its session."""
         while True:
@@ -234,8 +257,9 @@ def commission(
 ) -> None:
     """Commission the arms behind real cabinets, step by step: what each has to show is asked for, or measured.
 
-    Cabinets, joints, mounts, motion of each joint, loads, stops; then a sign-off is kept beside the cell, without which
-    q2r2 run asks for --i-know. Arms move at 5 % of their speed. Exit 1 where a step is not passed: nothing is kept.
+    Cabinets, joints, mounts, motion of each joint, loads, stops, a kill; then a sign-off is kept beside the cell,
+    without which q2r2 run asks for --i-know. Arms move at 5 % of their speed. Exit 1 where a step is not passed:
+    nothing is kept.
     """
     work = _Commissioning(find_resource(config), duration, tip)
     logger = logging.getLogger("q2r2_control")

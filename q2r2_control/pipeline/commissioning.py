@@ -19,7 +19,7 @@ _REACHED, _BEHIND = 0.2, 0.8  # how far a measured joint may be from the command
 # Of A2 .. A7 about the first posture; turning A1 changes no torque [rad].
 _SPREAD = np.array([0.0, 0.1, 0.2, 0.25, 0.4, 0.5, 0.5])
 _TRIES = 40
-_LED = 2.0  # upwards before the hand lets go [s]
+LED = 2.0  # upwards before the hand lets go [s]
 _LATENCY = 0.15  # from letting go until the measured arm brakes, as the gate grants a hand that is silent [s]
 _LEAST_SPEED = 0.01  # of the tool, to be stopped from [m/s]
 _STANDS = 1e-3  # joints that are nearer to where they come to rest [rad]
@@ -116,9 +116,10 @@ def _postures(robot: Robot, start: Array) -> Iterator[Array]:
 
 @dataclass(frozen=True, slots=True)
 class StopReport:
-    """An arm that stopped as its hand let go."""
+    """An arm that stopped as its hand let go, or as the program was killed."""
 
     arm: str
+    cause: str
     tool_speed_mm_s: float
     stopped_mm: float
     allowed_mm: float  # by the certified stop, after the latency
@@ -131,42 +132,51 @@ class StopReport:
             raise PlantError(f"the {self.arm} arm did not go up; begin where its tool has 100 mm of room above it")
         if self.stopped_mm > self.allowed_mm or self.stopped_s > self.allowed_s:
             raise PlantError(
-                f"the {self.arm} arm stopped after {self.stopped_mm:.1f} mm and {self.stopped_s:.2f} s; allowed: "
-                f"{self.allowed_mm:.1f} mm and {self.allowed_s:.2f} s; see to the network's and this computer's latency"
+                f"the {self.arm} arm, {self.cause}, stopped after {self.stopped_mm:.1f} mm and {self.stopped_s:.2f} s; "
+                f"allowed: {self.allowed_mm:.1f} mm and {self.allowed_s:.2f} s; see to the network's and this "
+                "computer's latency"
             )
         return self
 
 
 def measure_stop(run: SlowRun, arm: str) -> StopReport:
     """Let a hand lead ``arm`` upwards and let go, as an operator's does, and check."""
-    return stop_report(run.robot, arm, run.let_go(arm, _LED)).check()
+    return let_go_report(run.robot, arm, run.let_go([arm], LED)).check()
 
 
-def stop_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
+def let_go_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
     """Of ``moments`` in which ``arm`` was led by a hand, and came to rest."""
     led = [index for index, moment in enumerate(moments) if moment.engaged[arm]]
     if not led:
         raise PlantError(f"the {arm} arm did not follow the hand")
-    last, rest = moments[led[-1]], moments[-1].q
-    released = moments[min(led[-1] + 1, len(moments) - 1)]
+    rest, released = moments[-1].q, moments[led[-1] + 1]
+    joints = robot.arms[arm].joints
+    moving = [moment.now for moment in moments[led[-1] + 1 :] if np.abs(moment.q - rest)[joints].max() > _STANDS]
+    took = max(moving, default=released.now) - released.now
+    return stop_report(robot, arm, "let go", moments[led[-1]], released.q, rest, took)
+
+
+def stop_report(
+    robot: Robot, arm: str, cause: str, last: Moment, released: Array, rest: Array, took: float
+) -> StopReport:
+    """Of an ``arm`` that was led until the moment ``last``, and then ``took`` so long [s] to come to rest.
+
+    ``released`` and ``rest`` (nv,): measured joints as it began to stop, and afterwards [rad].
+    """
     v = np.where(np.isin(np.arange(len(rest)), robot.arms[arm].joints), last.v, 0.0)
     deceleration = np.full_like(v, np.inf) if last.deceleration is None else np.maximum(last.deceleration, 1e-6)
     brakes = np.abs(v) / deceleration
     way = v * (_LATENCY + 0.5 * brakes)
     here, end, furthest, ahead = (
-        robot.tool_pose(q, arm).translation for q in (released.q, rest, released.q + way, last.reference + 0.01 * v)
+        robot.tool_pose(q, arm).translation for q in (released, rest, released + way, last.reference + 0.01 * v)
     )
     at = robot.tool_pose(last.reference, arm).translation
-    moving = [
-        moment.now
-        for moment in moments[led[-1] + 1 :]
-        if np.abs(moment.q - rest)[robot.arms[arm].joints].max() > _STANDS
-    ]
     return StopReport(
         arm=arm,
+        cause=cause,
         tool_speed_mm_s=float(1e5 * np.linalg.norm(ahead - at)),
         stopped_mm=float(1e3 * np.linalg.norm(end - here)),
         allowed_mm=float(1e3 * np.linalg.norm(furthest - here)),
-        stopped_s=max(moving, default=released.now) - released.now,
+        stopped_s=took,
         allowed_s=float(brakes.max()) + _LATENCY,
     )

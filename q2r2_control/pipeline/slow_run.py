@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from threading import Thread
 from types import TracebackType
@@ -35,25 +35,25 @@ from q2r2_control.wording import sentence
 SPEED = 0.05  # of the joints' speeds
 HAND_SPEED = 0.03  # [m/s]
 _PATIENCE = 20.0  # for the cabinets to command, and for arms to come to rest [s]
-_STILL, REST = 2e-3, 0.3  # joints at rest move less than this [rad] for so long [s]
+STILL, REST = 2e-3, 0.3  # joints at rest move less than this [rad] for so long [s]
 _LOOKS = 0.05  # [s]
 _RATE = 75.0  # of the hands [Hz]
 
 
 class _Hands(PlayedInput):
-    """Both hands, at rest until one is held: then its arm is engaged, and it goes up."""
+    """Both hands, at rest until they are held: then their arms are engaged, and go up."""
 
     def __init__(self) -> None:
-        self.held: str | None = None
+        self.held: tuple[str, ...] = ()
         self._height = dict.fromkeys(SIDES, 1.0)  # [m]
         super().__init__(self._posed, self._pressed, {hand: EvenSampling(_RATE) for hand in SIDES})
 
     def _posed(self, hand: str, t: float) -> pin.SE3:
-        self._height[hand] += (hand == self.held) * HAND_SPEED / _RATE
+        self._height[hand] += (hand in self.held) * HAND_SPEED / _RATE
         return pin.SE3(np.eye(3), np.array([0.0, 0.0, self._height[hand]]))
 
     def _pressed(self, hand: str, t: float) -> HandInputs:
-        return HandInputs(press_middle=float(hand == self.held))
+        return HandInputs(press_middle=float(hand in self.held))
 
 
 class Moment(NamedTuple):
@@ -76,7 +76,14 @@ class SlowRun:
     unless the run :attr:`is_over`.
     """
 
-    def __init__(self, config: Config, plant: Callable[[Robot, Config], Plant], realtime: bool = True) -> None:
+    def __init__(
+        self,
+        config: Config,
+        plant: Callable[[Robot, Config], Plant],
+        realtime: bool = True,
+        listener: Callable[[Moment], None] | None = None,
+    ) -> None:
+        """``listener`` gets each tick's moment, in the loop's own thread."""
         control = config.control.model_copy(update={"velocity_scale": SPEED})
         teleop = TeleopSettings(bindings=BindingSettings(lower=Action.NONE, grip=Action.DEAD_MAN))
         slow = config.model_copy(update={"control": control, "teleop": teleop})
@@ -85,6 +92,7 @@ class SlowRun:
         self._pipeline = Pipeline(slow, self.robot, self._hands, plant(self.robot, slow))
         self._pipeline.listeners.append(self._look)
         self._thread = Thread(target=self._run, args=(realtime,), name="slow run")
+        self._listener = listener
         self._error: BaseException | None = None
         self._goal: Array | None = None  # for the loop to take up
         self._newest: Moment | None = None
@@ -139,15 +147,15 @@ class SlowRun:
             self._fail("the way there was ended" if outcome is None else sentence(outcome))
         return self._end()
 
-    def let_go(self, arm: str, duration: float) -> list[Moment]:
-        """Let a hand lead ``arm`` upwards for ``duration`` [s], and let go; all ticks from rest to rest."""
+    def let_go(self, arms: Sequence[str], duration: float) -> list[Moment]:
+        """Let hands lead ``arms`` upwards for ``duration`` [s], and let go; all ticks from rest to rest."""
         self._begin()
-        self._hands.held = self._pipeline.teleop.hand_of(arm)
+        self._hands.held = tuple(self._pipeline.teleop.hand_of(arm) for arm in arms)
         try:
             end = self._now + duration
             self._wait(lambda: self._now >= end)
         finally:
-            self._hands.held = None
+            self._hands.held = ()
         return self._end()
 
     def _begin(self) -> None:
@@ -196,11 +204,13 @@ class SlowRun:
                 self._lost = self._pipeline.supervisor.fault
             self._moments.append(moment)
             moved = np.abs((moment.q - self._rest.q, moment.reference - self._rest.reference)).max()
-            if moved > _STILL:
+            if moved > STILL:
                 self._rest = moment
         if self._goal is not None:
             self._pipeline.supervisor.go_home(self._goal)
             self._goal = None
+        if self._listener is not None:
+            self._listener(moment)
 
     @property
     def _now(self) -> float:

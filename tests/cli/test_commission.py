@@ -17,7 +17,7 @@ import pytest
 from q2r2_control.cli.fri_check import CabinetReport, Heard
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.pipeline.commissioning import _SPREAD, JointMotion, LoadSurvey
+from q2r2_control.pipeline.commissioning import _SPREAD, JointMotion, LoadSurvey, StopReport
 from q2r2_control.pipeline.slow_run import SlowRun
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.robot.commissioned import fingerprint
@@ -29,7 +29,7 @@ from tests.pipeline.slow_cell import PendantCabinets, StuckArm, slow_run
 
 MODULE = "q2r2_control.cli.commission"
 GUIDED = ["", "y", "", "y"]  # both arms, and the joints are right
-TO_THE_END = [*GUIDED, "keep", "", "Ada"]
+TO_THE_END = [*GUIDED, "keep", "", "", "Ada"]
 GOOD = CabinetReport(
     "left", 2, 10.0, 100, 0, 0.1, 0.1, "monitoring ready", "excellent", "normal", "t1", "off", [0.0] * 7, 0.0
 )
@@ -48,7 +48,13 @@ def cell(tmp_path: Path) -> Path:
 def virtual(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Puts cabinets in virtual time in the place of real ones, whose arms are guided by a quarter of a radian."""
 
-    def use(run: Callable[[Config], SlowRun] = slow_run, report: CabinetReport = GOOD, guided: float = 0.25) -> None:
+    def use(
+        run: Callable[[Config], SlowRun] = slow_run,
+        report: CabinetReport = GOOD,
+        guided: float = 0.25,
+        stopped_mm: float = 1.0,
+    ) -> None:
+        killed = [StopReport(arm, "program killed", 30.0, stopped_mm, 4.5, 0.1, 0.16) for arm in SIDES]
         heard = Heard([report, replace(GOOD, arm="right")], np.zeros(0), None, [])
         at = iter(np.arange(0.0, 100.0 * guided + 1.0, guided) if guided else np.zeros(100))
 
@@ -59,6 +65,7 @@ def virtual(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         monkeypatch.setattr(f"{MODULE}.listen", lambda plant, duration: heard)
         monkeypatch.setattr(f"{MODULE}.postures_over", postures)
         monkeypatch.setattr(f"{MODULE}.SlowRun", lambda config, plant: run(config))
+        monkeypatch.setattr(f"{MODULE}.measure_kill", lambda config, posture: killed)
 
     return use
 
@@ -95,8 +102,8 @@ def test_a_cell_that_shows_all_it_has_to_is_signed_off_and_may_run(
     kept = json.loads((cell.parent / "my_cell.commissioned.json").read_text(encoding="utf-8"))
     assert kept == json.loads(out)
     assert (kept["operator"], kept["fingerprint"], kept["repeats"]) == ("Ada", fingerprint(load_config(cell)), 0)
-    assert list(kept["steps"]) == ["cabinets", "joints", "mounts", "motion", "load", "stop"]
-    assert [len(kept["steps"][name]) for name in ("motion", "load", "stop")] == [14, 4, 2]
+    assert list(kept["steps"]) == ["cabinets", "joints", "mounts", "motion", "load", "stop", "kill"]
+    assert [len(kept["steps"][name]) for name in ("motion", "load", "stop", "kill")] == [14, 4, 2, 2]
     assert [load["against"] for load in kept["steps"]["load"]] == [MODEL, PENDANT] * 2
     for load in kept["steps"]["load"]:
         assert load["identified_kg"] == pytest.approx(load["expected_kg"], abs=0.01)
@@ -171,6 +178,16 @@ def test_a_tool_that_is_heavier_than_its_model_ends_the_load(
     monkeypatch.setattr(f"{MODULE}.measure_joint", lambda run, joint: JointMotion("A1", 1.0, 1.0, 0.1, 0.0))
     monkeypatch.setattr(LoadSurvey, "measure", lambda survey: [LoadReport("left", MODEL, 1.86, 1.06, at, at, 0.1)])
     assert refused(cell, TO_THE_END).startswith("q2r2: load: the left arm carries 1.86 kg")
+
+
+def test_arms_that_go_on_when_their_program_is_killed_end_it(
+    cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    virtual(stopped_mm=5.0)
+    for step in ("_motion", "_load", "_stop"):
+        monkeypatch.setattr(f"{MODULE}._Commissioning.{step}", lambda commissioning, run: [])
+    line = refused(cell, [*TO_THE_END[:-1], "n"])
+    assert line.startswith("q2r2: kill: the left arm, program killed, stopped after 5.0 mm")
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import PlantError
-from q2r2_control.pipeline.commissioning import JointMotion, measure_joint, measure_stop, stop_report
+from q2r2_control.pipeline.commissioning import JointMotion, let_go_report, measure_joint, measure_stop
 from q2r2_control.pipeline.slow_run import Moment
 from q2r2_control.robot.robot import Robot
 from tests.pipeline.slow_cell import StuckArm, slow_run
@@ -87,17 +87,17 @@ def moments(robot: Robot, on: float, engaged: bool = True) -> list[Moment]:
 
 
 def test_a_stop_that_is_later_or_longer_than_it_may_be_is_told(robot: Robot) -> None:
-    stop_report(robot, "left", moments(robot, 0.1)).check()
-    with pytest.raises(PlantError, match=r"the left arm stopped after .* mm and 0\.2. s; allowed"):
-        stop_report(robot, "left", moments(robot, 0.3)).check()
-    late = replace(stop_report(robot, "left", moments(robot, 0.1)), stopped_s=0.3)
+    let_go_report(robot, "left", moments(robot, 0.1)).check()
+    with pytest.raises(PlantError, match=r"the left arm, let go, stopped after .* mm and 0\.2. s; allowed"):
+        let_go_report(robot, "left", moments(robot, 0.3)).check()
+    late = replace(let_go_report(robot, "left", moments(robot, 0.1)), stopped_s=0.3)
     with pytest.raises(PlantError, match="stopped after"):
         late.check()
 
 
 def test_an_arm_that_did_not_follow_tells_nothing(robot: Robot) -> None:
     with pytest.raises(PlantError, match="the left arm did not follow the hand"):
-        stop_report(robot, "left", moments(robot, 0.0, engaged=False))
-    still = replace(stop_report(robot, "left", moments(robot, 0.1)), tool_speed_mm_s=1.0)
+        let_go_report(robot, "left", moments(robot, 0.0, engaged=False))
+    still = replace(let_go_report(robot, "left", moments(robot, 0.1)), tool_speed_mm_s=1.0)
     with pytest.raises(PlantError, match="did not go up"):
         still.check()

@@ -22,7 +22,7 @@ def test_no_joint_is_faster_than_a_twentieth_of_its_limit_and_at_the_end_all_res
         goal = run.reference + 0.2 * np.tile([0, 0, 0, 1, 1, 1, -1], 2)
         there = run.lead_to(goal)
         assert there is not None
-        led = run.let_go("right", 1.0)
+        led = run.let_go(["right"], 1.0)
     speeds = np.abs([moment.v for moment in there + led]) / run.robot.velocity_limit
     assert 0.8 * SPEED < speeds.max() <= SPEED * (1.0 + 1e-9)
     assert np.abs(there[-1].reference - goal).max() < 0.004

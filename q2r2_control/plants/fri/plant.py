@@ -90,6 +90,15 @@ class FriPlant:
             time.sleep(0.01)
             self.due(time.monotonic())
 
+    def is_released(self) -> bool:
+        """Whether no process answers the cabinets, on this computer, so that nothing moves the arms any more."""
+        try:
+            for line in self._lines():
+                socket.close(line.file)
+        except PlantError:
+            return False
+        return True
+
     def _lines(self) -> list[Line]:
         lines: list[Line] = []
         for arm, its in self._cabinets.items():

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -13,45 +11,14 @@ import pytest
 from q2r2_control.config.cell import Config
 from q2r2_control.config.fri import ModbusGripperConfig
 from q2r2_control.errors import ConfigError, PlantError
-from q2r2_control.plants.fri.cabinet import Cabinet, StillArm
-from q2r2_control.plants.fri.cabinet_server import settings_of
 from q2r2_control.plants.fri.plant import FriPlant
-from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
+from q2r2_control.plants.fri.wire import Session
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import SIDES
 from tests.plants.conftest import hold
 from tests.plants.fri.conftest import PATIENCE
+from tests.plants.fri.waiting_cabinets import waiting_cabinets
 from tests.support.headset_server import eventually
 from tests.support.robotiq_gripper import SimulatedGripper
-
-
-@contextmanager
-def cabinets(robot: Robot, config: Config, version: int) -> Iterator[dict[str, Cabinet]]:
-    """One for each arm, in a thread; each has started its overlay."""
-    made, done = {}, threading.Event()
-    for arm in SIDES:
-        settings = settings_of(robot, arm, CommandKind.POSITION, version, 0.005)
-        made[arm] = Cabinet(settings, StillArm(tuple(robot.home[robot.arms[arm].joints])))
-        made[arm].start_overlay()
-
-    def serve(cabinet: Cabinet, port: int) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-            opened.bind(("127.0.0.1", 0))
-            opened.settimeout(0.02)
-            while not done.is_set():
-                opened.sendto(write_monitoring(cabinet.send(0.0)), ("127.0.0.1", port))
-                with suppress(OSError):
-                    cabinet.receive(opened.recv(2000))
-
-    threads = [threading.Thread(target=serve, args=(made[arm], its.port)) for arm, its in config.fri.items()]
-    for thread in threads:
-        thread.start()
-    try:
-        yield made
-    finally:
-        done.set()
-        for thread in threads:
-            thread.join()
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -59,7 +26,7 @@ def test_the_sessions_of_both_cabinets_come_to_commanding_where_the_arms_are_hel
     robot: Robot, fri_config: Config, version: int
 ) -> None:
     plant = FriPlant.from_config(robot, fri_config)
-    with cabinets(robot, fri_config, version) as made:
+    with waiting_cabinets(robot, fri_config, version) as made:
         plant.reset()
         try:
             waited = threading.Event()
@@ -82,7 +49,7 @@ def test_a_gripper_by_modbus_gets_its_openings_and_is_measured(robot: Robot, fri
         left = fri_config.fri["left"].model_copy(update={"gripper": gripper})
         config = fri_config.model_copy(update={"fri": {**fri_config.fri, "left": left}})
         plant = FriPlant.from_config(robot, config)
-        with cabinets(robot, config, 2):
+        with waiting_cabinets(robot, config, 2):
             plant.reset()
             try:
                 assert plant.gripper_openings() == {}, "before it is active"

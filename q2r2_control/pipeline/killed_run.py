@@ -1,0 +1,66 @@
+"""A run that is killed while hands lead its arms: they have to stop by what outlives it.
+
+Where a loop dies, the process that answers the cabinets brings the arms to rest on the certified stop, and then ends
+and releases its ports. A commissioning sees to that with a loop in a process of its own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from q2r2_control.config.cell import Config
+from q2r2_control.errors import PlantError
+from q2r2_control.pipeline.commissioning import LED, StopReport, stop_report
+from q2r2_control.pipeline.slow_run import Moment, SlowRun
+from q2r2_control.plants.fri.plant import FriPlant
+from q2r2_control.process.helper_process import HelperProcess
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+_LOOKS = 0.005  # [s]
+_PATIENCE = 5.0  # for the ports to be released [s]
+
+
+def main(requests: Iterator[Config], answer: Callable[[Any], None]) -> None:
+    """In the process that is killed: lead all arms of each cell upwards, and answer every moment."""
+    for config in requests:
+        with SlowRun(config, FriPlant, listener=answer) as run:
+            run.let_go(list(run.robot.arms), 2.0 * LED)
+
+
+def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED) -> list[StopReport]:
+    """Kill a run after its tools have gone up for ``led`` [s]; how each stopped, which nothing has checked yet.
+
+    ``posture`` is called when nothing commands the arms any more, and returns where they rest (nv,) [rad]. Raises
+    :class:`PlantError` where the arms do not go up.
+    """
+    robot = Robot.from_config(config)
+    plant = FriPlant(robot, config)
+    moments: list[Moment] = []
+    process = HelperProcess("leads the arms", __name__, moments.append)
+    process.send(config)
+    try:
+        while _led(moments) < led:
+            if not process.alive:
+                raise PlantError(process.fault or "the arms did not follow the hands")
+            time.sleep(_LOOKS)
+    finally:
+        killed = time.monotonic()
+        process.kill()
+    while not plant.is_released():
+        if time.monotonic() - killed > _PATIENCE:
+            raise PlantError(f"a run that was killed still holds the cabinets' ports after {_PATIENCE:g} s")
+        time.sleep(_LOOKS)
+    took = time.monotonic() - killed
+    last, rest = moments[-1], posture()
+    return [stop_report(robot, arm, "program killed", last, last.q, rest, took) for arm in robot.arms]
+
+
+def _led(moments: list[Moment]) -> float:
+    """For how long all arms have followed their hands by now [s]."""
+    if not moments or not all(moments[-1].engaged.values()):
+        return 0.0
+    begun = next((moment for moment in moments if all(moment.engaged.values())), moments[-1])
+    return moments[-1].now - begun.now

@@ -1,0 +1,39 @@
+"""A run that is killed in mid-motion, with real processes and sockets."""
+
+from __future__ import annotations
+
+import socket
+
+import numpy as np
+import pytest
+
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.fri import CabinetConfig
+from q2r2_control.errors import PlantError
+from q2r2_control.pipeline.killed_run import measure_kill
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import SIDES
+from tests.plants.fri.conftest import free_ports
+from tests.plants.fri.waiting_cabinets import waiting_cabinets
+
+
+@pytest.fixture
+def config() -> Config:
+    cabinets = {arm: CabinetConfig(port=port) for arm, port in zip(SIDES, free_ports(2), strict=True)}
+    return load_config("config/dual_iiwa7_fri.yaml").model_copy(update={"fri": cabinets})
+
+
+def test_arms_of_a_killed_run_come_to_rest_within_their_certified_stop(config: Config) -> None:
+    with waiting_cabinets(Robot.from_config(config), config) as cabinets:
+        reports = measure_kill(config, lambda: np.concatenate([cabinets[arm].arm.q for arm in SIDES]), led=0.3)
+    for report in reports:
+        assert 15.0 < report.tool_speed_mm_s < 40.0
+        assert 0.0 < report.stopped_mm < report.allowed_mm
+
+
+def test_a_run_that_cannot_begin_says_why(config: Config) -> None:
+    port = config.fri["left"].port
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", port))
+        with pytest.raises(PlantError, match=rf"fri\.left\.port = {port}: cannot be bound"):
+            measure_kill(config, lambda: np.zeros(14))
