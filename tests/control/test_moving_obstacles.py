@@ -3,179 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.kernel_model import kernel_model_of
-from q2r2_control.control.qp import DaqpSolver
-from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.kept_distances import kept_by_obstacles
-from q2r2_control.robot.obstacle_bodies import with_obstacle_bodies
-from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, StepStatus
-from q2r2_control.verification.fault_injection import FaultySolver, WorstSolver
-from tests.support.object_cell import BLOCK, cell
-
-RADIUS = 0.1  # of a hand [m]
-
-
-@cache
-def robot_of_cell() -> Robot:
-    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
-
-
-@cache
-def controller_and_solver() -> tuple[CartesianController, FaultySolver]:
-    robot = robot_of_cell()
-    settings = ControllerSettings(moving_obstacles=("hand",))
-    solver = FaultySolver(DaqpSolver(robot.model.nv), worst=WorstSolver(robot, np.random.default_rng(0)))
-    return CartesianController(robot, settings, solver=solver), solver
+from q2r2_control.types import StepStatus
+from tests.control.hunted_arms import (
+    RADIUS,
+    Coal,
+    Hunt,
+    controller_and_solver,
+    controller_at_home,
+    hand,
+    robot_of_cell,
+)
 
 
 @pytest.fixture
 def controller() -> Iterator[CartesianController]:
-    """At home, without an obstacle."""
-    made, solver = controller_and_solver()
-    solver.fault = None
-    made.move_obstacle("hand", None)
-    made.reset(made.robot.home)
+    made = controller_at_home()
     yield made
     made.move_obstacle("hand", None)
-
-
-def hand(at: Array, speed: float = 0.25, **more: Any) -> MovingObstacle:
-    return MovingObstacle(shape="sphere", size=(RADIUS,), position=tuple(at.tolist()), speed=speed, **more)
-
-
-BOX = (0.1, 0.3, 0.2)  # sides [m]
-
-
-class Coal:
-    """Distances of all bodies that move from a ball or a box, by Coal."""
-
-    def __init__(self, controller: CartesianController, shape: coal.CollisionGeometry | None = None) -> None:
-        self.model = controller.robot.model
-        self.collision_model = controller.robot.collision_model.copy()
-        self.collision_model.removeAllCollisionPairs()
-        thing = pin.GeometryObject("thing", 0, pin.SE3.Identity(), shape or coal.Sphere(RADIUS))
-        number = self.collision_model.addGeometryObject(thing)
-        bodies = [i for i in range(number) if self.collision_model.geometryObjects[i].parentJoint]
-        for body in bodies:
-            self.collision_model.addCollisionPair(pin.CollisionPair(body, number))
-        joints = [self.collision_model.geometryObjects[body].parentJoint for body in bodies]
-        self.moved_by = np.zeros((len(bodies), self.model.nv), dtype=bool)  # joints of each body
-        for row, joint in enumerate(joints):
-            self.moved_by[row, [self.model.joints[i].idx_v for i in list(self.model.supports[joint])[1:]]] = True
-        self.kept = kept_by_obstacles(controller.robot, controller.settings).values
-        self._data, self._geometry = self.model.createData(), self.collision_model.createData()
-
-    def distances(self, q: Array, at: Array) -> Array:
-        """(bodies,) [m]."""
-        return np.array([result.min_distance for result in self._results(q, at)])
-
-    def towards_nearest(self, q: Array, at: Array) -> Array:
-        """Unit vector (3,) from the ball to the nearest body."""
-        results = self._results(q, at)
-        nearest = results[int(np.argmin([result.min_distance for result in results]))]
-        way = np.asarray(nearest.getNearestPoint1()) - at
-        return np.asarray(way / np.linalg.norm(way))
-
-    def _results(self, q: Array, at: Array) -> Any:
-        self.collision_model.geometryObjects[-1].placement = pin.SE3(np.eye(3), at)
-        pin.computeDistances(self.model, self._data, self.collision_model, self._geometry, q)
-        return self._geometry.distanceResults
-
-
-class Hunt:
-    """A hand that goes after the nearest body at its full speed, for a while, and then anywhere for another.
-
-    At every tick and in its middle: a body that moves is as far from it as it has to be, or comes no closer to where
-    it was reported. A solver works against the arms; other pairs and joints keep their promises too.
-    """
-
-    def __init__(
-        self, controller: CartesianController, solver: FaultySolver, seed: int, lie: float = 1.0, box: bool = False
-    ) -> None:
-        """``lie``: how many times faster the hand, or a ``box``, is than it says."""
-        shape = coal.Box(*BOX) if box else coal.Sphere(RADIUS)
-        self.controller, self.solver, self.coal, self.box = controller, solver, Coal(controller, shape), box
-        self.random, self.lie = np.random.default_rng(seed), lie
-        robot = controller.robot
-        seen: Any = SimpleNamespace(model=robot.model, collision_model=self.coal.collision_model)
-        solver.worst = WorstSolver(seen, self.random)
-        solver.kept = self.coal.kept
-        self.at = robot.tool_pose(robot.home, "left").translation + np.array([0.0, 0.9, 0.0])
-        self.velocity, self.way = np.zeros(3), np.zeros(3)
-        self.broken: list[float] = []  # by how much a body that moved was too near [m]
-        self.nearest_moving, self.touched, self.moved, self.retreats = np.inf, 0, 0, 0
-
-    def run(self, seconds: float, speed: float, period: float, acceleration: float | None = None) -> None:
-        """Reports come every ``period`` [s]."""
-        controller, robot = self.controller, self.controller.robot
-        targets = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
-        q, v, t, due, change = robot.home, np.zeros(robot.model.nv), 0.0, 0.0, 0.0
-        while t < seconds:
-            dt = float(self.random.choice([0.001, 0.004, 0.0015, 0.01, 0.03], p=[0.5, 0.2, 0.2, 0.08, 0.02]))
-            if t >= change:
-                change = t + self.random.uniform(0.2, 0.9)
-                self.way = np.zeros(3) if self.random.random() < 0.6 else self.random.normal(size=3)
-                self.solver.fault = str(self.random.choice(["towards_nearest", "no_rows", "corner"], p=[0.7, 0.2, 0.1]))
-            if t >= due:
-                due = t + period
-                now = None if acceleration is None else min(float(np.linalg.norm(self.velocity)), speed)
-                known = hand(self.at, speed, acceleration=acceleration, speed_now=now)
-                box = {"shape": "box", "size": BOX} if self.box else {}
-                controller.move_obstacle("hand", known.model_copy(update=box))
-                reported = self.at
-            places = self._move(q, dt, speed * self.lie, acceleration)
-            self.solver.q = q
-            reference = controller.step(targets, dt)
-            middle = q + 0.5 * dt * (0.75 * v + 0.25 * reference.v)
-            postures = (middle, reference.q) if dt <= controller.settings.max_substep else (reference.q,)
-            self._check(q, reported, postures, places[-len(postures) :])
-            assert (robot.distance_values(reference.q) >= controller.kept_distances - ROUNDING).all()
-            q, v, t = reference.q, reference.v, t + dt
-
-    def _move(self, q: Array, dt: float, speed: float, acceleration: float | None) -> tuple[Array, Array]:
-        """The hand after half of a tick and after all of it."""
-        way = self.way if self.way.any() else self.coal.towards_nearest(q, self.at)
-        wanted = speed * way / np.linalg.norm(way)
-        change = wanted - self.velocity
-        most = np.inf if acceleration is None else acceleration * dt
-        before = self.velocity
-        self.velocity = before + change * min(1.0, most / max(float(np.linalg.norm(change)), 1e-12))
-        start = self.at
-        if acceleration is None:
-            before = self.velocity
-        halfway = start + 0.5 * dt * (0.75 * before + 0.25 * self.velocity)
-        self.at = start + 0.5 * dt * (before + self.velocity)
-        return halfway, self.at
-
-    def _check(self, q: Array, reported: Array, postures: tuple[Array, ...], places: tuple[Array, ...]) -> None:
-        before = self.coal.distances(q, reported)
-        for posture, place in zip(postures, places, strict=True):
-            moves = (self.coal.moved_by & (posture != q)).any(axis=1)
-            margin = self.coal.distances(posture, place) - self.coal.kept
-            self.touched += int(margin.min() < 0.0)
-            self.moved += int(moves.any())
-            if not moves.any():
-                continue
-            closer = self.coal.distances(posture, reported) < before - ROUNDING
-            self.nearest_moving = min(self.nearest_moving, float(margin[moves].min()))
-            self.retreats += int((moves & (margin < 0.0) & ~closer).any())
-            wrong = moves & closer & (margin < -ROUNDING)
-            self.broken += (-margin[wrong]).tolist()
 
 
 @pytest.mark.parametrize(
@@ -316,49 +171,6 @@ def test_arms_beside_a_hand_that_comes_too_near_may_leave_it_and_the_other_arm_m
         controller.move_obstacle("hand", hand(near))
         controller.step(away, 0.002)
     assert np.linalg.norm(controller.tool_pose("left").translation - away["left"].translation) < 5e-3
-
-
-def least_ahead(controller: CartesianController) -> float:
-    distances, kept = controller.pairs_ahead(0.05)
-    return float((distances(controller.step({}, 0.0).q) - kept).min())
-
-
-def test_a_look_ahead_finds_what_arms_beside_a_hand_keep_while_they_are_slow(controller: CartesianController) -> None:
-    side = controller.tool_pose("left").translation + np.array([0.0, RADIUS + 0.12, 0.0])
-    controller.move_obstacle("hand", hand(side))
-    for _ in range(250):
-        controller.move_obstacle("hand", hand(side))
-        reference = controller.step({}, 0.002)
-    assert "hand_0" in reference.report.tightest_pair
-    assert least_ahead(controller) == pytest.approx(reference.report.margin, abs=1e-6)
-    controller.move_obstacle("hand", None)
-    distances, kept = controller.pairs_ahead(0.05)
-    np.testing.assert_array_equal(kept, controller.kept_distances)
-    np.testing.assert_allclose(distances(reference.q), controller.robot.distance_values(reference.q), atol=2e-6)
-
-
-def test_a_held_box_keeps_away_too_once_it_is_held() -> None:
-    config = cell(BLOCK)
-    robot = Robot.from_config(config)
-    settings = config.control.model_copy(update={"moving_obstacles": ("hand",)})
-    geometry, plain = with_obstacle_bodies(robot, ("hand",)), with_obstacle_bodies(robot, ())
-    assert plain is robot.objects.geometry
-    hull = [item for item in geometry.geometryObjects if "hull" in item.name]
-    assert [item.name for item in hull] == ["left_object_hull"]
-    half = 0.5 * np.array(BLOCK["box"])
-    across = np.sqrt((half**2).sum() - half.max() ** 2)
-    assert hull[0].geometry.radius >= across - 1e-6
-    controller = CartesianController(robot, settings)
-    below = controller.tool_pose("left").act(np.array([0.0, 0.0, 0.05 + RADIUS]))
-    controller.move_obstacle("hand", hand(below, speed=0.0))
-    before = controller.step({}, 0.002).report
-    least = [least_ahead(controller)]
-    controller.set_holding("left", True)
-    after = controller.step({}, 0.002).report
-    least.append(least_ahead(controller))
-    assert least == pytest.approx([before.margin, after.margin], abs=1e-6)
-    assert after.margin < before.margin
-    assert "left_object_hull" in after.tightest_pair
 
 
 def test_the_reach_of_an_obstacle_is_that_of_a_point_that_gains_speed() -> None:
