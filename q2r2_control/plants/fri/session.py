@@ -195,14 +195,16 @@ class ArmSession:
             self._times.restart()
         if self.state.wanted is CommandKind.TORQUE:
             return self._torque(message, now)
-        time = self._times.at(message.counter, self._clock.expected, counter, message.reflected)
-        state = self.state
+        question = message.counter, self._clock.expected, counter, message.reflected
+        time, state = self._times.at(*question), self.state
+        wanted = self._clock.expected - DELAY
+        there = self.path.at(min(time, wanted))
+        if abs(wanted - time) > message.period and np.abs(there - self.path.rest).max() <= _AT_REST:
+            self._times.restart()  # where nothing moves, and nothing is known that will, an answer may be for any time
+            time = self._times.at(*question)
         state.answered, state.lag = max(state.answered, time), now - DELAY - time
         state.expected = self._clock.expected
-        there = self.path.at(time)
-        if abs(state.lag) > message.period and np.abs(there - self.path.rest).max() <= _AT_REST:
-            self._times.restart()  # where nothing moves, the next answer may be for any time
-        return FriCommand(counter, reflected, joints_of(there), io=self._outputs)
+        return FriCommand(counter, reflected, joints_of(self.path.at(time)), io=self._outputs)
 
     def _torque(self, message: Monitoring, now: float) -> FriCommand | None:
         """The newest overlay, or one that brakes, with the cabinet's own position as KUKA's example clients have it."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.events import ReasonKind
+from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
 from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand
 from q2r2_control.plants.fri.wire import (
@@ -185,6 +186,44 @@ def test_commands_for_a_time_that_was_answered_are_refused_for_both_arms_which_s
     now = cabinet.now
     assert follow({"left": cabinet.session}, {"left": ArmCommand(now, now, now + 0.002, state.rest, still, ones)})
     assert cabinet.session.path.end == now + 0.002
+
+
+def test_an_arm_that_rests_before_lost_messages_are_caught_up_begins_to_move_again_without_a_jump() -> None:
+    cabinet, fives, a = Cabinet(), (5.0,) * 7, 5.0
+    cabinet.ask(WAITING)
+    followed: list[tuple[float, ...]] = [IPO, IPO]
+    cabinet.ask(ACTIVE)
+    state, begun = cabinet.session.state, cabinet.now
+
+    def ask() -> None:
+        answer = cabinet.ask(ACTIVE)
+        assert answer is not None
+        assert answer.q is not None
+        followed.append(answer.q)
+
+    def command(start: float, end: float, way: float, speed: float) -> None:
+        there = tuple(q + way for q in IPO)
+        assert not cabinet.session.has_passed(ArmCommand(cabinet.now, start, end, there, (speed,) * 7, fives))
+        cabinet.session.follow(ArmCommand(cabinet.now, start, end, there, (speed,) * 7, fives))
+
+    for tick in range(1, 21):  # 50 ms of acceleration, 50 ms of braking
+        t, end = 0.005 * tick, cabinet.now + 0.003
+        way, speed = (0.5 * a * t**2, a * t) if tick <= 10 else (0.0125 - 0.5 * a * (0.1 - t) ** 2, a * (0.1 - t))
+        command(end - 0.005, end, way, speed)
+        if 8 <= tick <= 13:
+            cabinet.sent += 1  # lost
+        else:
+            ask()
+    while np.abs(np.subtract(followed[-1], state.rest)).max() > 1e-12:
+        ask()
+        assert cabinet.now < begun + 1.0
+    start = state.answered + 1e-4
+    for t in (0.0, 0.002, 0.004):  # ticks of the loop before the next message
+        command(start + t, start + t + 0.002, 0.0125 + 0.5 * a * (t + 0.002) ** 2, a * (t + 0.002))
+    for _ in range(10):
+        ask()
+    accelerations = np.diff(followed, n=2, axis=0) / 0.005**2
+    assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 * a + CATCH_UP_RAMP * a * 0.05
 
 
 def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> None:
