@@ -134,10 +134,11 @@ class AnswerTimes:
         self._question = -1  # the newest one
         self._answers: dict[int, _Answer] = {}  # the last ones by their counter
         self._newest: _Answer | None = None  # that is for the latest time
+        self._begin: tuple[int, _Answer] | None = None  # the first counter, and what the cabinet goes on from till then
 
     def restart(self) -> None:
-        """The arm stands still at a new path's begin, so that the next answer may be for any time."""
-        self._answers, self._newest = {}, None
+        """The arm stands still, so that the next answer may be for any time."""
+        self._answers, self._newest, self._begin = {}, None, None
 
     def at(self, question: int, expected: float, counter: int, heard: int) -> float:
         """The time that our answer ``counter`` to a ``question`` is for, that is ``expected`` at a time.
@@ -150,8 +151,11 @@ class AnswerTimes:
             self._answers[counter] = newest
             return newest.time
         wanted = expected - self._delay
+        if self._begin is None:
+            self._begin = counter, _Answer(wanted - self._period, 1.0)
+        first, standing = self._begin
         # From the answer that the cabinet goes on from: what it did not hear was never done.
-        before = self._answers.get(heard, newest) or _Answer(wanted - self._period, 1.0)
+        before = standing if heard < first or newest is None else self._answers.get(heard, newest)
         lag = (wanted - before.time) / self._period - 1.0  # in answers
         ramp = CATCH_UP_RAMP * self._period
         # The greatest excess of rate from which the ramp still comes back to 0 as the lag does.

@@ -39,14 +39,15 @@ class Cabinet:
     def now(self) -> float:
         return 0.005 * self.sent
 
-    def ask(self, message: Monitoring) -> FriCommand | None:
+    def ask(self, message: Monitoring, lost: bool = False) -> FriCommand | None:
+        """``lost``: the answer, which the cabinet does not hear."""
         self.sent += 1
         message = replace(message, counter=self.sent, reflected=self.heard)
         answer = self.session.answer(write_monitoring(message), self.now)
         if answer is None:
             return None
         command = read_command(answer)[1]
-        self.heard = command.counter
+        self.heard = self.heard if lost else command.counter
         return command
 
 
@@ -224,6 +225,28 @@ def test_an_arm_that_rests_before_lost_messages_are_caught_up_begins_to_move_aga
         ask()
     accelerations = np.diff(followed, n=2, axis=0) / 0.005**2
     assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 * a + CATCH_UP_RAMP * a * 0.05
+
+
+def test_an_arm_that_begins_to_move_while_no_answer_is_heard_begins_from_rest() -> None:
+    cabinet, fives, a = Cabinet(), (5.0,) * 7, 5.0
+    cabinet.ask(WAITING)
+    cabinet.ask(ACTIVE)
+    begun = cabinet.now
+    followed: list[tuple[float, ...]] = [IPO, IPO]
+    for tick in range(1, 31):
+        t, end = max(0.005 * (tick - 4), 0.0), cabinet.now + 0.003
+        there = tuple(q + 0.5 * a * t**2 for q in IPO)
+        cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, there, (a * t,) * 7, fives))
+        lost = tick <= 10  # the first ones at rest, where the time of an answer may jump
+        answer = cabinet.ask(ACTIVE, lost)
+        assert answer is not None
+        assert answer.q is not None
+        if not lost:
+            followed.append(answer.q)
+    assert cabinet.session.state.following
+    assert cabinet.session.state.answered > begun + 0.05
+    accelerations = np.diff(followed, n=2, axis=0) / 0.005**2
+    assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 * a + CATCH_UP_RAMP * a * 0.15
 
 
 def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> None:
