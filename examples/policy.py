@@ -26,7 +26,8 @@ class Circles:
         return poses.reshape(len(t), -1)
 
 
-config = load_config("config/dual_iiwa7.yaml")
-summary = Pipeline.from_config(config, input=PolicyInput(Circles()), plant="mujoco").run(4.0, realtime=False)
-for name, arm in summary.arms.items():
-    print(f"{name} arm: {arm.policy_s:.1f} s by the policy, tracking error {arm.position_error_mm_rms:.1f} mm RMS")
+if __name__ == "__main__":
+    config = load_config("config/dual_iiwa7.yaml")
+    summary = Pipeline.from_config(config, input=PolicyInput(Circles()), plant="mujoco").run(4.0, realtime=False)
+    for name, arm in summary.arms.items():
+        print(f"{name} arm: {arm.policy_s:.1f} s by the policy, tracking error {arm.position_error_mm_rms:.1f} mm RMS")

@@ -27,7 +27,7 @@ _FORMAT = 2
 class Rejection:
     """Why an episode is discarded."""
 
-    name: str  # of the threshold, or of what no threshold says: never_engaged, damaged, ended_by, operator
+    name: str  # of the threshold, or of what no threshold says: never_engaged, no_ticks, damaged ...
     text: str
 
 
@@ -138,6 +138,8 @@ def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Re
         yield Rejection("ended_by", f"a fault ended the run: {figures.ended_by}")
     if figures.damage is not None:
         yield Rejection("damaged", f"after {figures.duration_s:.2f} s {figures.damage}")
+    elif not figures.timing.ticks:
+        yield Rejection("no_ticks", "no tick of a controller was recorded")
     elif settings.needs_end and not figures.timing.ended:
         yield Rejection("needs_end", "the recording has no end: its process was killed, or the disk was full")
 

@@ -71,6 +71,12 @@ def test_an_input_a_plant_and_a_task_written_as_the_page_says_run_in_one_pipelin
     assert elbow_at_the_end(config) > elbow_at_the_end(without) + 0.05
 
 
+def test_an_input_of_the_page_engages_by_the_clock_of_a_real_run_too(file: Path) -> None:
+    loop = Pipeline.from_config(load_config(str(file)), plant="kinematic")
+    summary = loop.run(1.0)
+    assert {event.destination for event in summary.events} >= {"engaged"}
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [

@@ -71,6 +71,16 @@ def test_ctrl_c_while_importing_ends_a_command_and_prints_nothing(name: str) -> 
     assert run.returncode == -signal.SIGINT
 
 
+def test_help_of_an_executable_says_what_its_node_does_and_starts_none(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "q2r2_control.ros.launch.executables", "recorder", "--help"]
+    path = {"PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, env=os.environ | path)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout.startswith("``recorder``: keeps what the nodes of a cell publish")
+    assert "--ros-args -p NAME:=VALUE" in run.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_ctrl_c_before_the_interpreter_has_started_waits_for_the_executable_of_a_set() -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "q2r2_control.ros.launch.executables", "mujoco_robot"],

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
+from importlib.util import find_spec
 from pathlib import Path
+from typing import cast
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import urlopen
@@ -13,6 +15,7 @@ from cryptography.x509 import SubjectAlternativeName, load_pem_x509_certificate
 
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.inputs.webxr.certificate import own_certificate
+from q2r2_control.inputs.webxr.exchange import Display
 from q2r2_control.inputs.webxr.webxr import WebXrInput
 from tests.support.processes import cell
 from tests.web.headset_page import Listen, refused
@@ -104,6 +107,19 @@ def test_hosts_outside_the_allowed_networks_get_nothing(listen: Listen) -> None:
     source = listen(allow=allow)
     assert status(str(source.url)) == 403
     assert refused(source)
+
+
+@pytest.mark.parametrize(("package", "shows"), [("websockets", False), ("trimesh", True)])
+def test_a_package_that_is_missing_is_named_with_the_extra_that_has_it(
+    package: str, shows: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = {name: find_spec(name) for name in ("websockets", "trimesh") if name != package}
+    monkeypatch.setattr("q2r2_control.inputs.webxr.webxr.find_spec", found.get)
+    source = WebXrInput()
+    if shows:
+        source.show_on(cast(Display, object()))
+    with pytest.raises(InputError, match=rf"--input webxr needs {package}: pip install 'q2r2_control\[web\]'"):
+        source.start()
 
 
 def test_a_port_that_is_taken_and_a_cable_to_another_address_are_one_clear_line(

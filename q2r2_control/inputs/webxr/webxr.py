@@ -121,8 +121,9 @@ class WebXrInput:
         """Serve the page. Raises :class:`InputError` or :class:`ConfigError` where that is not possible."""
         if self._process is not None:
             raise InputError(f"webxr: already serving {self.url}")
-        if find_spec("websockets") is None:
-            raise InputError("--input webxr needs websockets: pip install 'q2r2_control[web]'")
+        for package in ("websockets", *(("trimesh",) if self._display is not None else ())):
+            if find_spec(package) is None:
+                raise InputError(f"--input webxr needs {package}: pip install 'q2r2_control[web]'")
         host, port = self.address
         certificate, token = None, ""
         if not is_loopback(host):  # a browser trusts localhost without

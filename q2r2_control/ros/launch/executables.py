@@ -36,7 +36,11 @@ def _executable(name: str) -> Callable[[], int]:
         # q2r2 ros up blocks it, so that the interpreter's own start is not interrupted either.
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         module, made = NODES[name]
-        node_or_run = getattr(import_module(f"q2r2_control.ros.nodes.{module}"), made)
+        imported = import_module(f"q2r2_control.ros.nodes.{module}")
+        if {"-h", "--help"} & set(sys.argv):
+            print(f"{imported.__doc__}\nParameters, which docs/ros.md has: {name} --ros-args -p NAME:=VALUE")
+            return 0
+        node_or_run = getattr(imported, made)
         from q2r2_control.ros.base_node import run_node
 
         code = run_node(node_or_run) if isinstance(node_or_run, type) else int(node_or_run())
