@@ -149,7 +149,7 @@ def let_go_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
     led = [index for index, moment in enumerate(moments) if moment.engaged[arm]]
     if not led:
         raise PlantError(f"the {arm} arm did not follow the hand")
-    rest, released = moments[-1].q, moments[led[-1] + 1]
+    rest, released = moments[-1].q, moments[min(led[-1] + 1, len(moments) - 1)]
     joints = robot.arms[arm].joints
     moving = [moment.now for moment in moments[led[-1] + 1 :] if np.abs(moment.q - rest)[joints].max() > _STANDS]
     took = max(moving, default=released.now) - released.now
