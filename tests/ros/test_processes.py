@@ -22,6 +22,7 @@ from q2r2_control import Robot
 from q2r2_control.ros.launch import executables
 from q2r2_control.ros.launch.processes import NO_INPUT, NodeProcess, nodes_of
 from q2r2_control.types import SIDES
+from tests.cli.command import q2r2
 from tests.ros.cell import JointRecorder
 from tests.ros.conftest import need_ros
 from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess, wait_until
@@ -129,6 +130,24 @@ def test_a_set_has_the_controller_that_its_preset_needs_with_its_topics_and_fram
     for arm in SIDES:
         assert parameters[f"{arm}.output_topic"] == f"/{arm}/command/lbr_joint_position_command"
         assert parameters[f"{arm}.target_frame_id"] == "bh_robot_base"
+
+
+def test_the_command_adds_a_recorder_first_and_a_page_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[NodeProcess] = []
+
+    def start(nodes: list[NodeProcess], say: object) -> int:
+        started.extend(nodes)
+        return 0
+
+    monkeypatch.setattr("q2r2_control.cli.ros.run_together", start)
+    command = f"ros up {CONFIG} --input scripted --record DIR --web --web-port 0"
+    assert q2r2(*command.split()).exit_code == 0
+    assert names(started) == [
+        *("recorder", "mujoco_robot", "cartesian_controller", "arm_controllers", "SimulationInput", "web_page")
+    ]
+    assert started[0].parameters == {"config": CONFIG, "folder": "DIR"}
+    assert started[-1].parameters["web_port"] == 0
+    assert started[-1].parameters["recorded"]
 
 
 def test_arms_have_a_process_each_where_that_is_asked_for_and_a_cell_with_one_arm_has_its_nodes(tmp_path: Path) -> None:
