@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -18,20 +19,36 @@ from q2r2_control.plants.fri.wire import FriCommand, Monitoring, Quality, Sessio
 from tests.support.headset_server import eventually
 
 Q = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
+ANSWERS = 50
 STILL, ONES = (0.0,) * 7, (1.0,) * 7
 MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.005, 1, Q)
+
+
+class LongMotion(ArmSession):
+    """It is over after ``answers`` of them."""
+
+    def __init__(self, answers: int) -> None:
+        super().__init__("left", "cabinet")
+        self._left = answers
+
+    def answer(self, datagram: bytes, now: float) -> bytes | None:
+        self._left -= 1
+        return super().answer(datagram, now)
+
+    def is_still(self, now: float) -> bool:
+        return self._left <= 0
 
 
 class Between:
     """The process, with this test as its cabinet and its loop."""
 
-    def __init__(self) -> None:
+    def __init__(self, session: ArmSession) -> None:
         self.cabinet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.cabinet.bind(("127.0.0.1", 0))
         ours = open_socket("127.0.0.1", 0)
         self.address, self.sent = ours.getsockname(), 0
         file = ours.detach()
-        self.process = AnsweringProcess([Line(ArmSession("left", "cabinet"), "127.0.0.1", file)])
+        self.process = AnsweringProcess([Line(session, "127.0.0.1", file)])
         socket.close(file)
         self.states: list[SessionState] = []
         self.cabinet.settimeout(0.2)
@@ -54,14 +71,20 @@ class Between:
         return bool(self.states) and self.states[-1].newest == replace(MONITORING, counter=self.sent)
 
 
-@pytest.fixture
-def between() -> Iterator[Between]:
-    made = Between()
+@contextmanager
+def between_of(session: ArmSession) -> Iterator[Between]:
+    made = Between(session)
     try:
         yield made
     finally:
         made.process.close()
         made.cabinet.close()
+
+
+@pytest.fixture
+def between() -> Iterator[Between]:
+    with between_of(ArmSession("left", "cabinet")) as made:
+        yield made
 
 
 def test_the_loop_gets_the_state_after_each_message_and_an_answer_goes_by_what_was_sent_before_it(
@@ -87,6 +110,16 @@ def test_messages_from_elsewhere_are_not_answered(between: Between) -> None:
 
 def test_it_ends_with_the_loop(between: Between) -> None:
     between.process.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(between.process.pid, 0)
+
+
+def test_it_outlives_the_loop_until_the_arms_rest() -> None:
+    with between_of(LongMotion(ANSWERS)) as between:
+        between.process._commands.close()  # as the end of the loop's process does
+        while between.sent < ANSWERS:
+            assert between.ask().reflected == between.sent
+        between.process.close()
     with pytest.raises(ProcessLookupError):
         os.kill(between.process.pid, 0)
 
