@@ -2,17 +2,21 @@
 
 import os
 import signal
+import sys
 
 
 def main() -> None:
-    """Run the command. While it is importing Ctrl-C ends it at once, without a traceback."""
+    """Run the command. Until it begins Ctrl-C ends it at once, without a traceback."""
     # Matrices are small here: threads that wait for each other cost ten times what they do.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     handler = signal.signal(signal.SIGINT, signal.SIG_DFL)
     from q2r2_control.cli.app import app
 
     signal.signal(signal.SIGINT, handler)
-    app()
+    try:
+        app()
+    except KeyboardInterrupt:  # while the command line is read
+        sys.exit(128 + signal.SIGINT)
 
 
 if __name__ == "__main__":

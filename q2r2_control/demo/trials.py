@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 
 from q2r2_control.config.cell import Config
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, held_to_promises, tasks_named, with_controls
@@ -59,6 +59,10 @@ def try_tasks(
             if failure:
                 failures[task][seed] = failure
             progress(f"{task}, seed {seed}: {failure or 'succeeded'}")
+    except KeyboardInterrupt:
+        for worker in active_children():  # a trial has nothing to close, and takes a while
+            worker.kill()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
     return [TrialReport(task, seeds, failed) for task, failed in failures.items()]

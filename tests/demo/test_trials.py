@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from q2r2_control.demo.assembly_tasks import tasks_named
 from q2r2_control.demo.trials import TrialReport, try_task, try_tasks
 from q2r2_control.types import CommandMode
 from tests.demo.test_assembly_tasks import coarse
+from tests.support.processes import alive, children, wait_until
 
 
 @pytest.mark.slow
@@ -20,6 +27,28 @@ def test_every_seed_is_tried_and_those_that_fail_say_why() -> None:
     objects = {**config.mujoco.objects, "flat_block": elsewhere}
     moved = config.model_copy(update={"mujoco": config.mujoco.model_copy(update={"objects": objects})})
     assert "flat_block: held 95 mm up for 0.0 s" in try_task(moved, CommandMode.POSITION, False, ("grasp", 0))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_ctrl_c_does_not_wait_for_trials() -> None:
+    command = (sys.executable, "-m", "q2r2_control", "demo", "grasp", "--seeds", "2")
+    demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    def trying() -> list[int]:
+        its = {pid: Path(f"/proc/{pid}") for pid in children(demo.pid)}
+        workers = {pid: folder for pid, folder in its.items() if b"spawn_main" in (folder / "cmdline").read_bytes()}
+        return [pid for pid, folder in workers.items() if "libmujoco" in (folder / "maps").read_text()]
+
+    try:
+        wait_until(trying)
+        trial = trying()[0]
+        os.kill(trial, signal.SIGSTOP)  # it never ends
+        demo.send_signal(signal.SIGINT)
+        wait_until(lambda: not alive(trial))
+        assert demo.wait() == 130
+        assert "Traceback" not in demo.communicate()[1]
+    finally:
+        demo.kill()
 
 
 @pytest.mark.parametrize(("failed", "reliable"), [(0, True), (1, True), (2, False)])
