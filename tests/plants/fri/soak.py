@@ -25,7 +25,7 @@ from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 ACCELERATION = 4.0  # of the reference [rad/s^2]
 _ALLOWANCE, _STILL = 0.05, 1e-3  # after the braking time the reference rests [s], [rad/s]
-_MAKES_ROOM = 0.02  # of a new reference, which begins where springs left the arms, nearer than it would rest [rad/s]
+_MAKES_ROOM = 0.02  # of a new reference, which begins where the arms were left, nearer than it would rest [rad/s]
 
 
 class Rest(NamedTuple):
@@ -142,7 +142,7 @@ class Soak:
         self._was_active = is_active
         if now > self._braked_by:
             self._braked_by = math.inf
-            if held and speed > (_MAKES_ROOM if self._begun_anew else _STILL):
+            if held and speed > self._resting:
                 self.faults.append(f"{now:.3f} s, {self._end}: the reference moves at {speed:.4f} rad/s")
         if now > self._slow_by:
             self._look_at_rest(now, held)
@@ -157,11 +157,16 @@ class Soak:
             self._moving_since = None
             self._end_session(now, tick)
 
+    @property
+    def _resting(self) -> float:
+        """The greatest speed of a reference at rest [rad/s]."""
+        return _MAKES_ROOM if self._begun_anew else _STILL
+
     def _look_at_rest(self, now: float, held: bool) -> None:
         """Wait until the arms have settled, or move faster than they may by now."""
         rest, passed = self._rest, now - self._slow_by + self._rest.slow_after
         settled = passed >= rest.settled_after
-        allowed = rest.settled if settled else rest.slow
+        allowed = max(rest.settled if settled else rest.slow, self._resting)
         speeds = {arm: self._fastest(arm) for arm in self.plant.cabinets} if held else {}
         for arm, fastest in speeds.items():
             if fastest > allowed:
