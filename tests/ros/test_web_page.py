@@ -35,7 +35,7 @@ from tests.support.processes import children
 CAMERA = {"front": {"topic": "/front/compressed"}}
 PATIENCE = 120.0  # for a whole set on a busy machine [s]
 RATE = 60.0  # a quarter of the default: a page shows the same, and six nodes share what a busy machine leaves [Hz]
-# What `q2r2 ros up` does, with parameters of its nodes by which none is lost beside other load.
+# Does as `q2r2 ros up` does, with parameters of its nodes by which none is lost beside other load.
 SET = """
 import json, sys
 from dataclasses import replace
