@@ -12,6 +12,7 @@ import pinocchio as pin
 import trimesh
 
 from q2r2_control.config.cell import Config
+from q2r2_control.robot.pairs import ENVELOPE, link_of
 from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 
@@ -57,10 +58,11 @@ class JointTree:
             for kind in (pin.GeometryType.VISUAL, pin.GeometryType.COLLISION)
         )
         drawn = {shape.parentFrame for shape in visual.geometryObjects}
-        # A link that is drawn as nothing is drawn as what may not be touched.
+        # A link that is drawn as nothing is drawn as what may not be touched; an envelope would hide what it is around.
+        undrawn = (shape for shape in solid.geometryObjects if shape.parentFrame not in drawn)
         self._shapes = [
             *visual.geometryObjects,
-            *(shape for shape in solid.geometryObjects if shape.parentFrame not in drawn),
+            *(shape for shape in undrawn if not link_of(shape.name).endswith(ENVELOPE)),
         ]
 
     def posture(self, q: Array, openings: Mapping[str, float]) -> Array:
