@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -47,6 +48,18 @@ def stand_stills(processor: int, duration: float) -> list[tuple[float, float]]:
             if (now := time.monotonic()) - before > _SLEEP + _STILL:
                 found.append((before + _SLEEP, now))
     return found
+
+
+def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) -> int:
+    """How many answers waited for a processor that stood still, or for an answer before them that did.
+
+    Both from when to when [s].
+    """
+    count, until = 0, -math.inf
+    for begin, end in sorted(late):
+        if begin < until or any(start < end and stop > begin for start, stop in stills):
+            count, until = count + 1, max(until, end)
+    return count
 
 
 class ToolWay:
@@ -131,7 +144,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
         "answers": len(took),
         "answer_ms": dict(zip(("p50", "p99", "max"), 1e3 * np.percentile(took, (50, 99, 100)), strict=True)),
         "late_answers": len(late),
-        "late_answers_in_stand_stills": sum(any(a < end and b > begin for a, b in moments) for begin, end in late),
+        "late_answers_in_stand_stills": held_up(late, moments),
         "stand_stills_ms": sorted((round(1e3 * (b - a), 1) for a, b in moments), reverse=True),
         "lost_messages": {arm: state.lost for arm, state in plant.states().items()},
         "engaged_s": {arm: figures.engaged_s for arm, figures in summary.arms.items()},
@@ -161,7 +174,7 @@ def main(
     times = data["answer_ms"]
     notes = [
         f"answers after {times['p50']:.2f} ms in the median, {times['p99']:.2f} ms at 99 %",
-        f"{data['late_answers']} answers after more than a period, {data['late_answers_in_stand_stills']} of them while"
+        f"{data['late_answers']} answers after more than a period, {data['late_answers_in_stand_stills']} of them since"
         " this machine kept a processor waiting",
         f"it did so for {max(data['stand_stills_ms'], default=0.0):.1f} ms at most",
         f"the tools are {data['delay_ms']:.0f} ms behind the reference, and apart from that"
