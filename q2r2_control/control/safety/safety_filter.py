@@ -113,6 +113,8 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
     if _certify_mixture(model, data, 1.0, h, too_close):
         _keep_stop(data)
         return FOLLOWED
+    if is_too_close(model, data, data.unproven[0]) and not data.state.v.any():
+        return STOPPED  # less of a motion from rest would come closer too, and trying takes long beside many pairs
     low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):
         share = 0.5 * (low + high)
