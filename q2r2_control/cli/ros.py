@@ -34,6 +34,7 @@ from q2r2_control.ros.launch.processes import check_rclpy, nodes_of, run_togethe
 from q2r2_control.ros.watching.findings import Finding, examine_environment, examine_set
 from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView
 from q2r2_control.viewer.tables import Cell, figure_table
+from q2r2_control.viewer.web.page import check_viser
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
 _ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
@@ -197,7 +198,7 @@ class RobotSource(StrEnum):
 def build_interfaces_command(
     force: Annotated[bool, Option("--force", help="Build again what this environment holds.")] = False,
 ) -> None:
-    """Build the message packages that cannot be imported: quest2ros, and tf2_msgs and control_msgs where missing.
+    """Build the message packages that cannot be imported: quest2ros, lbr_fri_idl, and tf2_msgs and control_msgs.
 
     They land in the running virtual environment; what a sourced ROS has is left alone. Exit 1 when a tool is missing.
     """
@@ -230,5 +231,7 @@ def up(
     notes = notes_of(task, operator, record)
     recording = None if record is None else {"folder": record, **notes}
     page = (web_host, web_port) if web else None
+    if web:
+        check_viser()  # before any node starts
     nodes = nodes_of(config, input, robot.value, recording, separate, page)
     raise Exit(run_together(nodes, lambda line: print(line, flush=True)))

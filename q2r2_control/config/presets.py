@@ -142,5 +142,5 @@ def preset_of(name: str, mode: str) -> tuple[Preset, Mode]:
     preset = PRESETS[name]
     if mode == Mode.RAW and not preset.takes_poses:
         takes = "it takes joint positions, which the built-in controller has to make of the hand's target"
-        raise ConfigError(f"preset = {name!r} with mode = {mode!r}: {takes}; allowed is mode {Mode.FILTERED.value}")
+        raise ConfigError(f"preset = {name!r} with mode = '{Mode.RAW}': {takes}; allowed is mode {Mode.FILTERED}")
     return preset, Mode(mode)

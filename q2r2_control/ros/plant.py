@@ -35,6 +35,7 @@ from q2r2_control.wording import sentence
 
 _WAIT = 5.0  # for joint states and for whatever takes the commands [s]
 _QUIET = 1.0  # nobody else commands the arms for so long before, in which all others are discovered [s]
+_CURE = "; start the robot, and see q2r2 ros doctor"
 _AWAY = 0.02  # from the measured joints: to a receiver that is new such a command is a jump [rad]
 
 
@@ -100,7 +101,7 @@ class RosPlant:
 
     def _problem(self) -> Reason | None:
         if self._joints.state is None:
-            return self._bad or Reason.of(ReasonKind.NO_STATES_YET, source="")
+            return self._bad or Reason.of(ReasonKind.NO_STATES_YET, source=_CURE)
         if not self._publisher.listeners:
             return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=self._publisher.topic_name)
         return self._bad

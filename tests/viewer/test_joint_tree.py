@@ -1,4 +1,4 @@
-"""What a page draws of a robot."""
+"""Pages draw hands and links, and no envelopes."""
 
 from __future__ import annotations
 

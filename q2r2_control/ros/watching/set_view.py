@@ -163,14 +163,14 @@ def _why_engaged(values: Mapping[str, Any], controller: NodeView | None, arm: st
     age = values.get("hand_age")
     if isinstance(age, int | float) and age > SILENT:
         return f"engaged, but no pose of the {values.get('hand')} hand for {age:.0f} s"
+    if controller is not None:
+        why = controller.reason("fault") or controller.reason(f"{arm}_target_refusal")
+        if why is not None:
+            return f"engaged; {controller.name}: {sentence(why)}"
     slip = values.get("slip")
     if isinstance(slip, int | float) and slip > _SLIPPED:
         nearest: Mapping[str, Any] = {} if controller is None else controller.values
         distance, pair = nearest.get("closest_distance_m"), str(nearest.get("closest_pair", "")).replace("|", " | ")
         near = f"; nearest pair {pair}, {1e3 * distance:.0f} mm" if isinstance(distance, int | float) else ""
         return f"held up, {1e3 * slip:.0f} mm short of the hand{near}"
-    if controller is not None:
-        why = controller.reason("fault") or controller.reason(f"{arm}_target_refusal")
-        if why is not None:
-            return f"engaged; {controller.name}: {sentence(why)}"
     return "follows the hand"

@@ -19,6 +19,12 @@ _READY = 120.0  # for the process to be ready, before the run, on a busy compute
 _PATIENCE = 2.0  # for it to end [s]
 
 
+def check_viser() -> None:
+    """Raises :class:`ConfigError` where it is not installed."""
+    if find_spec("viser") is None:
+        raise ConfigError("--web needs viser: pip install 'q2r2_control[web]'")
+
+
 class Page:
     """A page and its process, as a context. Nothing in a browser can keep this process waiting."""
 
@@ -27,8 +33,7 @@ class Page:
 
         ``on_answer`` gets what browsers ask for, in a thread of its own.
         """
-        if find_spec("viser") is None:
-            raise ConfigError("--web needs viser: pip install 'q2r2_control[web]'")
+        check_viser()
         self._host, self._port, self._on_request = host, port, on_answer
         self._ready = Flag()
         self.url: str | None = None  # None: not begun
