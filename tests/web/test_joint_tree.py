@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import pytest
 
-pytest.importorskip("trimesh", reason="the extra web brings it")
-
 from q2r2_control import Robot
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.viewer.joint_tree import JointTree
@@ -26,9 +24,11 @@ class Shown:
 
 
 @pytest.fixture
-def shown(robot: Robot) -> Shown:
+def shown() -> Shown:
+    config = load_config(CELL)
+    robot = Robot.from_config(config)
     fingers = {arm: its.finger_joints for arm, its in robot.arms.items()}
-    return Shown(load_config(CELL), robot.urdf, robot.joint_names, fingers)
+    return Shown(config, robot.urdf, robot.joint_names, fingers)
 
 
 def colours(shown: Shown, joint: str) -> set[tuple[int, int, int]]:
