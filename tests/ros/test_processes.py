@@ -133,6 +133,7 @@ def test_a_set_has_the_controller_that_its_preset_needs_with_its_topics_and_fram
 
 
 def test_the_command_adds_a_recorder_first_and_a_page_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("viser", reason="the extra web brings it")
     started: list[NodeProcess] = []
 
     def start(nodes: list[NodeProcess], say: object) -> int:
