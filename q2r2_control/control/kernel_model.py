@@ -20,7 +20,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 # Of pairs that may touch: rows that aim at the very distance would leave the certificate nothing [m].
-_LEAST_BUFFER = 0.00025
+LEAST_BUFFER = 0.00025
 # How far before contact pairs that may touch are slowed down; bodies are a little larger than what they enclose [m].
 _CONTACT_ZONE = 0.002
 # Of the depth at which the cores of two bodies meet: as far as they may get into each other.
@@ -90,7 +90,7 @@ def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) 
 
 def stop_buffer(min_distance: Array, settings: ControllerSettings) -> Array:
     """How much farther from each other pairs stop in the QP (p,) [m]."""
-    return np.minimum(settings.distance_buffer, np.maximum(0.5 * min_distance, _LEAST_BUFFER))
+    return np.minimum(settings.distance_buffer, np.maximum(0.5 * min_distance, LEAST_BUFFER))
 
 
 class KernelData(NamedTuple):

@@ -10,7 +10,8 @@ reference and the bound S of how much closer the stop brings it (stop_certificat
 - never falls while it grows. A pair that is nearer than asked for is not pushed apart.
 
 After a reset pairs keep at once what the posture leaves them, and the controller's first settings in any case. Out of a
-start nearer than that it recovers.
+start nearer than that it recovers, up to the whole buffer. Pairs that start within the buffer stop where they are. It
+grows with d - S as above. Arms that were left so are not pushed apart, and nothing moves before it is asked to.
 
 **Held objects.** A pair that does not count keeps minus infinity. One that appears keeps d - S - buffer, or its own
 distance where that is less. The stop at hand is then proven with the object too, and it never has to be refused. It
@@ -31,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.kernel_model import KernelData, KernelModel, stop_buffer
+from q2r2_control.control.kernel_model import LEAST_BUFFER, KernelData, KernelModel, stop_buffer
 from q2r2_control.control.safety.safety_data import provable_distances
 from q2r2_control.control.tasks.built_in import task_model_of
 from q2r2_control.errors import RobotError
@@ -130,7 +131,8 @@ class LiveSettings:
         self._gains, self._ramp = self._gains_of(settings), 0.0  # asked for, and the time until they are reached [s]
         self._changing: list[tuple[Array, Array]] = []  # what kernels read of these, and what it goes to
         self._goal = self._least = kept_distances(robot, settings).values  # least: without any change
-        self._growing, self._due = False, 0.0
+        self._stops = model.safety.approach.stop_distance[: len(self._goal)]  # where the QP stops pairs
+        self._growing, self._crowded, self._due = False, False, 0.0  # crowded: a pair is within its buffer
         self.settings = settings
         self.kept = self._goal  # by every monitored pair now (p,) [m]; another array whenever something has changed
 
@@ -168,11 +170,13 @@ class LiveSettings:
         self._due = 0.0
         if self._growing:
             self._write(np.minimum(self._goal, self._least))
+        self._stops[:] = self.kept + stop_buffer(self.kept, self.settings)
         self._approach_gains(self._ramp)
 
     def begin(self) -> None:
-        """After a reset was observed: keep what the posture allows."""
+        """After a reset was observed: keep what the posture allows, and stop no farther away than that."""
         self._grow(np.inf)
+        self._stop_from(np.where(self._lasting() < self.kept, self._stops, self.kept))
 
     def step(self, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference."""
@@ -180,17 +184,17 @@ class LiveSettings:
             self._objects.step(h)
         if self._ramp:
             self._approach_gains(h)
-        if self._growing:
+        if self._growing or self._crowded:
             self._due -= h
             if self._due <= 0.0:
                 self._due = _PERIOD
                 self._grow(GROWTH * max(_PERIOD, h))
+                self._stop_from(self._stops)
 
     def _grow(self, most: float) -> None:
         """Keep more, by at most ``most`` [m], where the stop at hand proves it."""
         if self._growing:
-            lasting = provable_distances(self._safety, self._data)[: len(self._goal)]
-            room = lasting - stop_buffer(self._goal, self.settings)
+            room = self._lasting() - stop_buffer(self._goal, self.settings)
             self._write(np.maximum(self.kept, np.minimum(np.minimum(self._goal, self.kept + most), room)))
 
     def _write(self, kept: Array) -> None:
@@ -198,7 +202,18 @@ class LiveSettings:
         if not np.array_equal(kept, self.kept):
             self.kept = kept
             self._safety.min_distance[: len(kept)] = kept
-            self._safety.approach.stop_distance[: len(kept)] = kept + stop_buffer(kept, self.settings)
+            self._stop_from(self._stops)
+
+    def _stop_from(self, before: Array) -> None:
+        """Let the QP stop pairs with their buffer, or where they are within it, and no nearer than ``before`` (p,) [m]."""
+        wanted = self.kept + stop_buffer(self.kept, self.settings)
+        least = np.maximum(before, self.kept + LEAST_BUFFER)
+        self._stops[:] = np.minimum(np.maximum(self._lasting(), least), wanted)
+        self._crowded = bool((self._stops < wanted).any())
+
+    def _lasting(self) -> Array:
+        """d - S of every monitored pair (p,) [m]."""
+        return provable_distances(self._safety, self._data)[: len(self._goal)]
 
     def _gains_of(self, settings: ControllerSettings) -> tuple[Array, ...]:
         tasks = task_model_of(self._robot, settings, self._model.tasks.chain)

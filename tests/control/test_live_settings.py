@@ -139,6 +139,23 @@ def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(co
     assert run.contract.uncertified == 0
 
 
+def test_arms_that_were_left_within_their_buffer_rest_after_a_reset_and_it_grows_as_they_part(
+    controller: CartesianController,
+) -> None:
+    run = Driven(controller)
+    run.drive(4.0, SCENARIOS["crossing"])
+    run.drive(0.5)
+    within = ControllerSettings(min_distance=NEAR + margins(run).min() - 0.001)
+    left = Driven(CartesianController(controller.robot, within), run.q)
+    left.drive(0.5)
+    np.testing.assert_allclose(left.q, run.q, atol=1e-6)
+    left.drive(3.0, run.start)
+    left.drive(3.0, lambda t, _: SCENARIOS["crossing"](t, run.start))
+    left.drive(0.5)
+    assert margins(left).min() > 0.002
+    assert left.contract.uncertified == 0
+
+
 def test_a_pair_that_closes_in_keeps_no_more_than_the_stop_leaves_it(controller: CartesianController) -> None:
     run, robot = Driven(controller), controller.robot
     lost = np.zeros(0)

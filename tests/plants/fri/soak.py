@@ -18,14 +18,12 @@ from q2r2_control.plants.fri.cabinet_server import SimulatedArms
 from q2r2_control.plants.fri.wire import CommandKind, Safety, write_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
-from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.types import SIDES, Array, CommandMode, HandInputs, HandSample
 from tests.pipeline.loops import FreezingLoop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 ACCELERATION = 4.0  # of the reference [rad/s^2]
 _ALLOWANCE, _STILL = 0.05, 1e-3  # after the braking time the reference rests [s], [rad/s]
-_MAKES_ROOM = 0.02  # of a new reference, which begins where the arms were left, nearer than it would rest [rad/s]
 
 
 class Rest(NamedTuple):
@@ -115,7 +113,6 @@ class Soak:
         if self.pipeline.drive.mode is CommandMode.TORQUE:  # torques end the session by themselves then
             self._late.add("loop freezes")
         self._moving_since: float | None = None
-        self._was_active = self._begun_anew = False
         self._lasts = 0.3
         self._rest = _RESTS[self.pipeline.drive.mode]
         self._braked_by, self._slow_by, self._start_at = math.inf, math.inf, 0.0
@@ -137,12 +134,9 @@ class Soak:
         speed = float(np.abs(tick.reference.v).max())
         self.moved = max(self.moved, speed)
         held = not any(tick.engaged.values())
-        is_active = self.pipeline.loop.supervisor.phase is Phase.ACTIVE
-        self._begun_anew |= is_active and not self._was_active
-        self._was_active = is_active
         if now > self._braked_by:
             self._braked_by = math.inf
-            if held and speed > self._resting:
+            if held and speed > _STILL:
                 self.faults.append(f"{now:.3f} s, {self._end}: the reference moves at {speed:.4f} rad/s")
         if now > self._slow_by:
             self._look_at_rest(now, held)
@@ -157,16 +151,11 @@ class Soak:
             self._moving_since = None
             self._end_session(now, tick)
 
-    @property
-    def _resting(self) -> float:
-        """The greatest speed of a reference at rest [rad/s]."""
-        return _MAKES_ROOM if self._begun_anew else _STILL
-
     def _look_at_rest(self, now: float, held: bool) -> None:
         """Wait until the arms have settled, or move faster than they may by now."""
         rest, passed = self._rest, now - self._slow_by + self._rest.slow_after
         settled = passed >= rest.settled_after
-        allowed = max(rest.settled if settled else rest.slow, self._resting)
+        allowed = rest.settled if settled else rest.slow
         speeds = {arm: self._fastest(arm) for arm in self.plant.cabinets} if held else {}
         for arm, fastest in speeds.items():
             if fastest > allowed:
@@ -207,7 +196,6 @@ class Soak:
         braking = np.abs(tick.reference.v) / self.pipeline.controller.stop_deceleration
         self._braked_by = now + float(braking.max()) + _ALLOWANCE
         self._slow_by = self._braked_by + self._rest.slow_after
-        self._begun_anew = False
 
     def _send_garbage(self) -> None:
         """Some bytes of each datagram are wrong, or missing."""
