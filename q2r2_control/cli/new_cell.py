@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,12 +20,14 @@ from q2r2_control.cli.cell_report import check_cell
 from q2r2_control.cli.cell_yaml import commented_yaml
 from q2r2_control.cli.output import Json, as_json_text, counting, say
 from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.compose import compose
-from q2r2_control.robot.description import LinkTree, joint_limits, load_description
+from q2r2_control.robot.description import MJCF_ENDS, LinkTree, joint_limits, load_description
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.home_search import find_home, mirrored_home
 from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.mjcf import urdf_of_mjcf
 from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, lacks_of, tip_of, tips_by_side
 from q2r2_control.robot.near_pairs import spreads_of
 from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_names
@@ -39,7 +42,7 @@ _LEAST_JOINTS = 3  # of an arm
 _OFF_FLOOR = 0.03  # that each link can get at least [m]
 _BARELY = 0.003  # a pair that parts by no more than this beyond what it keeps hardly does [m]
 
-Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, package:// or example-robot-data:NAME.")]
+Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, MJCF, package:// or example-robot-data:NAME.")]
 Tip = Annotated[str | None, Option(metavar="LINK", help="Last link of that arm, where the model leaves a doubt.")]
 Metres = Annotated[float | None, Option(min=-3, max=5, help="[m]")]
 
@@ -76,6 +79,9 @@ def new_cell(
     right_tip: Tip = None,
     distance: Annotated[float | None, Option(min=0, max=5, help="Between the bases of both arms [m].")] = None,
     height: Annotated[float | None, Option(min=-3, max=5, help="Of the bases above the floor [m].")] = None,
+    velocity: Annotated[
+        float | None, Option(min=0.01, max=10, help="Of an MJCF's joints, at most: it has no limits of speed [rad/s].")
+    ] = None,
     samples: Annotated[int, Option(help="Random postures that pairs of links are looked at in.")] = 2000,
     yes: Annotated[bool, Option("--yes", help="Ask nothing: take what was found.")] = False,
     json: Json = False,
@@ -96,7 +102,9 @@ def new_cell(
     if xacro_arg and not any(model.endswith(".xacro") for model in (left, right, robot) if model is not None):
         raise ConfigError("--xacro-arg: allowed with a model that ends in .xacro")
     tips = {"left": left_tip, "right": right_tip}
-    models = {side: model for side, model in (("left", left), ("right", right)) if model is not None}
+    given = {side: model for side, model in (("left", left), ("right", right), ("robot", robot)) if model is not None}
+    models = _without_mjcf(given, name, velocity, yes)
+    robot = models.get("robot")
     _survey(draft, dict.fromkeys(tips, robot) if robot else models, tips, shared=robot)
     _mount(draft, distance, height, yes)
     _place(draft, yes)
@@ -134,6 +142,27 @@ def _xacro_args(given: list[str]) -> dict[str, str]:
         if not text.partition("=")[0].strip() or "=" not in text:
             raise ConfigError(f"--xacro-arg {text!r:.80}: allowed: NAME=VALUE")
     return {name: value for name, _, value in (text.partition("=") for text in given)}
+
+
+def _without_mjcf(models: dict[str, str], name: str, velocity: float | None, yes: bool) -> dict[str, str]:
+    """The models, with a URDF that is written here in place of each MJCF file. Raises :class:`Q2R2Error`."""
+    written: dict[str, str] = {}
+    for side, model in models.items():
+        if not model.endswith(MJCF_ENDS) or model in written:
+            continue
+        written[model] = f"{name}_{side}.urdf"
+        if (file := Path(written[model])).exists():
+            raise ConfigError(f"{file}: exists; give it as --{side}, or the cell another name")
+        if velocity is None and yes:
+            raise ConfigError("--velocity: an MJCF has no limits of speed; allowed: what each joint bears [rad/s]")
+        if velocity is None:
+            velocity = _asked("limit of the joints' speed, which an MJCF does not have, in rad/s", 1.0, yes)
+        urdf = urdf_of_mjcf(find_resource(model), file.parent, velocity)
+        ET.indent(urdf)
+        file.write_text(ET.tostring(urdf, encoding="unicode"), encoding="utf-8")
+    if not written and velocity is not None:
+        raise ConfigError(f"--velocity: allowed with a model that ends in {' or '.join(MJCF_ENDS)}")
+    return {side: written.get(model, model) for side, model in models.items()}
 
 
 def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], shared: str | None) -> None:

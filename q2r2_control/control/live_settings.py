@@ -205,7 +205,7 @@ class LiveSettings:
             self._stop_from(self._stops)
 
     def _stop_from(self, before: Array) -> None:
-        """Let the QP stop pairs with their buffer, or where they are within it, and no nearer than ``before`` (p,) [m]."""
+        """Let the QP stop pairs with their buffer, or where they are within it; no nearer than ``before`` (p,) [m]."""
         wanted = self.kept + stop_buffer(self.kept, self.settings)
         least = np.maximum(before, self.kept + LEAST_BUFFER)
         self._stops[:] = np.minimum(np.maximum(self._lasting(), least), wanted)

@@ -18,6 +18,7 @@ from q2r2_control.robot.packages import expand_xacro, package_file
 from q2r2_control.robot.urdf_parts import ATTRIBUTES
 
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
+MJCF_ENDS = (".xml", ".mjcf")
 
 # Range given to a joint without limits: two turns each way.
 CONTINUOUS_RANGE = 4 * math.pi
@@ -99,8 +100,8 @@ def _shipped_model(model: str) -> Path:
     except ConfigError:
         if Path(model).name == model and not Path(model).suffix:
             raise
-        if Path(model).suffix in (".xml", ".mjcf"):
-            raise ConfigError("MJCF is not read; convert it to a .urdf, as docs/my_robot.md says") from None
+        if model.endswith(MJCF_ENDS):
+            raise ConfigError("a cell has no MJCF; q2r2 new-cell writes a .urdf of it") from None
         kinds = f"a name in robots/, a path that ends in .urdf or .xacro, or {EXAMPLE_ROBOT_DATA}NAME"
         raise ConfigError(f"neither a name nor a model's file; allowed: {kinds}") from None
 

@@ -28,7 +28,9 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     [
         pytest.param(ONE_JOINT, "--left arm.urdf", "joints that move b: 1; allowed: an arm", id="a single joint"),
         pytest.param("hello", "--left arm.urdf", "not XML", id="no robot"),
-        pytest.param("<mujoco/>", "--left arm.xml", "MJCF is not read; convert it", id="MJCF"),
+        pytest.param("<mujoco/>", "--left arm.xml", "--velocity: an MJCF has no limits of speed", id="no speed"),
+        pytest.param("<mujoco/>", "--left arm.xml --velocity 1", "no joint that turns or slides", id="an empty MJCF"),
+        pytest.param(IIWA, "--left arm.urdf --velocity 1", "--velocity: allowed with a model", id="speed of a URDF"),
         pytest.param(
             re.sub(r' (velocity|effort)="[^"]*"', "", IIWA),
             "--left arm.urdf",
@@ -86,6 +88,28 @@ def test_arguments_of_xacro_go_into_the_cell(tmp_path: Path) -> None:
     cell = load_config(tmp_path / "cell.yaml")
     assert cell.arms["left"].xacro_args == {"fast": "1.25"}
     assert Robot.from_config(cell).velocity_limit.tolist() == [1.25] * 7
+
+
+def test_an_mjcf_becomes_a_urdf_beside_the_cell_which_runs(tmp_path: Path) -> None:
+    bodies = "".join(
+        f"""<body name="link_{i}" pos="0 0 {0.1 if i == 1 else 0.25}"><joint name="j{i}" axis="{axis}"
+        range="-110 110" actuatorfrcrange="-200 200"/><geom type="capsule" fromto="0 0 0.06 0 0 0.19" size="0.05"/>"""
+        for i, axis in enumerate(("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1"), start=1)
+    )
+    base = '<body name="base"><geom type="cylinder" size="0.08 0.05"/>'
+    Path("arm.xml").write_text(f"<mujoco><worldbody>{base}{bodies}{7 * '</body>'}</worldbody></mujoco>")
+    models = ("--left", "arm.xml", "--right", "arm.xml")
+    result = q2r2("new-cell", "cell", *models, "--samples", "100", typed="1.5\n1.0\n0.1\n\n\n")
+    assert result.exit_code == 0, result.output
+    assert {arm.model for arm in load_config(tmp_path / "cell.yaml").arms.values()} == {
+        str(tmp_path / "cell_left.urdf")
+    }
+    run = q2r2("run", "cell.yaml", *["--plant", "mujoco", "--fast", "--headless", "--duration", "2", "--json"])
+    assert run.exit_code == 0, run.output
+    assert max(arm["position_error_mm_rms"] for arm in one_object(run.stdout)["arms"].values()) < 1.0
+    Path("cell.yaml").unlink()
+    Path("cell.srdf").unlink(missing_ok=True)
+    assert "cell_left.urdf: exists; give it as --left" in q2r2("new-cell", "cell", *models, "--yes").stderr
 
 
 @pytest.mark.parametrize(

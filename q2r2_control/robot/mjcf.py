@@ -1,0 +1,214 @@
+"""A URDF of the robot in an MJCF file: what MuJoCo compiles it to, written down.
+
+MJCF has no limits of speed, which the caller gives. The scene beside the robot is left out, and all that moves freely
+in it. Loops that constraints close stay open.
+"""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.urdf_parts import numbers
+from q2r2_control.types import Array
+
+_BASE = "mjcf_world"  # root link of a robot that moves against the world without a base of its own
+_MESHES = (".stl", ".obj")  # that others than MuJoCo read
+_Joint, _Geom = mujoco.mjtJoint, mujoco.mjtGeom
+
+
+def urdf_of_mjcf(file: Path, folder: Path, velocity: float) -> ET.Element:
+    """The robot of an MJCF ``file`` as a URDF tree, for a file in ``folder``, from where meshes are named.
+
+    Joints that turn get a limit of ``velocity`` [rad/s], those that slide none. Raises :class:`RobotError` for a file
+    that MuJoCo cannot read, and for joints and shapes that a URDF has not.
+    """
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file.resolve()))
+    except ValueError as error:
+        raise RobotError(f"{file}: MuJoCo cannot read it: {' '.join(str(error).split())}") from error
+    try:
+        return _Writer(model, file.stem, folder, velocity).robot()
+    except RobotError as error:
+        raise RobotError(f"{file}: {error}") from None
+
+
+class _Writer:
+    """One model on its way into a URDF.
+
+    A link's frame is where the last joint of its body is, with the body's axes.
+    """
+
+    def __init__(self, model: mujoco.MjModel, name: str, folder: Path, velocity: float) -> None:
+        self._model, self._folder, self._velocity = model, folder, velocity
+        self._urdf = ET.Element("robot", name=name)
+        self._links: dict[int, str] = {}  # of bodies
+        self._within: dict[int, pin.SE3] = {}  # frame of a body's link in the body's frame
+
+    def robot(self) -> ET.Element:
+        model = self._model
+        if _Joint.mjJNT_BALL in model.jnt_type:
+            raise RobotError(f"joint {model.joint(list(model.jnt_type).index(_Joint.mjJNT_BALL)).name} is a ball joint")
+        roots = dict.fromkeys(int(model.body_rootid[body]) for body in range(model.nbody) if self._joints(body))
+        if not roots:
+            raise RobotError("no joint that turns or slides")
+        if len(roots) > 1 or self._joints(next(iter(roots))):
+            self._add_link(0, _BASE, pin.SE3.Identity())
+        for body in range(1, model.nbody):  # parents come first
+            if int(model.body_rootid[body]) in roots:
+                self._add_body(body)
+        self._add_mimics()
+        return self._urdf
+
+    def _joints(self, body: int) -> list[int]:
+        first, count = self._model.body_jntadr[body], self._model.body_jntnum[body]
+        return [j for j in range(first, first + count) if self._model.jnt_type[j] != _Joint.mjJNT_FREE]
+
+    def _add_body(self, body: int) -> None:
+        model, parent = self._model, int(self._model.body_parentid[body])
+        name, within = model.body(body).name or f"body_{body}", pin.SE3.Identity()
+        if parent in self._links:
+            link = self._links[parent]
+            at = self._within[parent].inverse() * _pose(model.body_pos[body], model.body_quat[body])
+            joints = self._joints(body)
+            for j in joints:
+                within = pin.SE3(np.eye(3), model.jnt_pos[j].copy())
+                child = name if j == joints[-1] else f"{name}_before_{self._name(j)}"
+                if child != name:
+                    ET.SubElement(self._urdf, "link", name=child)
+                self._add_moving_joint(j, link, child, at * within)
+                link, at = child, within.inverse()
+            if not joints:
+                self._add_joint(f"{name}_fixed", "fixed", link, name, at)
+        self._add_link(body, name, within)
+
+    def _name(self, j: int) -> str:
+        return self._model.joint(j).name or f"joint_{j}"
+
+    def _add_joint(self, name: str, kind: str, parent: str, child: str, at: pin.SE3) -> ET.Element:
+        joint = ET.SubElement(self._urdf, "joint", name=name, type=kind)
+        ET.SubElement(joint, "parent", link=parent)
+        ET.SubElement(joint, "child", link=child)
+        _add_origin(joint, at)
+        return joint
+
+    def _add_moving_joint(self, j: int, parent: str, child: str, at: pin.SE3) -> None:
+        """Joint ``j`` at the pose that it has with the position for which the file places its body."""
+        model = self._model
+        axis, there = model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
+        turns, limited = model.jnt_type[j] == _Joint.mjJNT_HINGE, bool(model.jnt_limited[j])
+        zero = pin.SE3(pin.exp3(-there * axis), np.zeros(3)) if turns else pin.SE3(np.eye(3), -there * axis)
+        kind = "prismatic" if not turns else "revolute" if limited else "continuous"
+        joint = self._add_joint(self._name(j), kind, parent, child, at * zero)
+        ET.SubElement(joint, "axis", xyz=numbers(axis))
+        limit = ET.SubElement(joint, "limit", effort=repr(self._effort(j)), velocity=repr(self._velocity * turns))
+        if limited:
+            limit.set("lower", repr(float(model.jnt_range[j, 0])))
+            limit.set("upper", repr(float(model.jnt_range[j, 1])))
+        dof = model.jnt_dofadr[j]
+        damping, friction = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
+        ET.SubElement(joint, "dynamics", damping=repr(damping), friction=repr(friction))
+        if model.dof_armature[dof] > 0.0:
+            ET.SubElement(joint, "rotor", inertia=repr(float(model.dof_armature[dof])), gear="1")
+
+    def _effort(self, j: int) -> float:
+        """The least that the file limits the joint's force to [N, Nm]; 0 where nothing does."""
+        model, found = self._model, []
+        if model.jnt_actfrclimited[j]:
+            found.append(np.abs(model.jnt_actfrcrange[j]).max())
+        for a in range(model.nu):
+            if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[a, 0] == j:
+                gear = abs(model.actuator_gear[a, 0])
+                if model.actuator_forcelimited[a]:
+                    found.append(gear * np.abs(model.actuator_forcerange[a]).max())
+                elif model.actuator_ctrllimited[a] and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
+                    found.append(gear * model.actuator_gainprm[a, 0] * np.abs(model.actuator_ctrlrange[a]).max())
+        return float(min(found, default=0.0))
+
+    def _add_link(self, body: int, name: str, within: pin.SE3) -> None:
+        model = self._model
+        self._links[body], self._within[body] = name, within
+        link = ET.SubElement(self._urdf, "link", name=name)
+        if body == 0:  # its shapes are the scene's
+            return
+        if model.body_mass[body] > 0.0:
+            inertial = ET.SubElement(link, "inertial")
+            _add_origin(inertial, within.inverse() * _pose(model.body_ipos[body], model.body_iquat[body]))
+            ET.SubElement(inertial, "mass", value=repr(float(model.body_mass[body])))
+            ixx, iyy, izz = map(repr, model.body_inertia[body].tolist())
+            ET.SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy="0", ixz="0", iyz="0")
+        first = model.body_geomadr[body]
+        geoms = range(first, first + model.body_geomnum[body])
+        touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+        for g in geoms:
+            at = within.inverse() * _pose(model.geom_pos[g], model.geom_quat[g])
+            # A body of which nothing may touch would be one that nobody watches: then all that is drawn counts.
+            if g in touching or not touching:
+                self._add_shape(link, "collision", g, at)
+            if g not in touching:
+                self._add_shape(link, "visual", g, at)
+
+    def _add_shape(self, link: ET.Element, kind: str, g: int, at: pin.SE3) -> None:
+        model, size = self._model, self._model.geom_size[g].tolist()
+        name, form = f"{link.get('name')}_{kind}_{g}", _Geom(int(model.geom_type[g]))
+        shape = ET.SubElement(link, kind, name=name)
+        geometry = ET.SubElement(shape, "geometry")
+        if form == _Geom.mjGEOM_MESH:
+            mesh = int(model.geom_dataid[g])
+            at = at * _pose(model.mesh_pos[mesh], model.mesh_quat[mesh]).inverse()  # MuJoCo centres what it reads
+            scale = numbers(model.mesh_scale[mesh])
+            ET.SubElement(geometry, "mesh", filename=self._mesh_file(mesh), scale=scale)
+        elif form == _Geom.mjGEOM_SPHERE:
+            ET.SubElement(geometry, "sphere", radius=repr(size[0]))
+        elif form in (_Geom.mjGEOM_CAPSULE, _Geom.mjGEOM_CYLINDER):
+            ET.SubElement(geometry, "cylinder", radius=repr(size[0]), length=repr(2.0 * size[1]))
+            if form == _Geom.mjGEOM_CAPSULE and kind == "collision":
+                ET.SubElement(ET.SubElement(link, "collision_checking"), "capsule", name=name)
+        elif form in (_Geom.mjGEOM_BOX, _Geom.mjGEOM_ELLIPSOID):  # the box that holds it
+            ET.SubElement(geometry, "box", size=numbers([2.0 * half for half in size]))
+        else:
+            raise RobotError(f"body {link.get('name')} has a shape of kind {form.name}; allowed: solids and meshes")
+        _add_origin(shape, at)
+        if kind == "visual":
+            material = model.geom_matid[g]
+            colour = model.geom_rgba[g] if material < 0 else model.mat_rgba[material]
+            ET.SubElement(ET.SubElement(shape, "material", name=f"{name}_colour"), "color", rgba=numbers(colour))
+
+    def _mesh_file(self, mesh: int) -> str:
+        model, start = self._model, int(self._model.mesh_pathadr[mesh])
+        path = Path("" if start < 0 else model.paths[start : model.paths.index(b"\0", start)].decode())
+        if path.suffix.lower() not in _MESHES:
+            raise RobotError(
+                f"mesh {model.mesh(mesh).name}: {path}; allowed: a file that ends in {' or '.join(_MESHES)}"
+            )
+        return os.path.relpath(path, self._folder.resolve())
+
+    def _add_mimics(self) -> None:
+        """Joints that a constraint lets follow another one on a straight line."""
+        model, joints = self._model, {joint.get("name"): joint for joint in self._urdf.findall("joint")}
+        for e in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0):
+            (follower, leader), factors = (int(model.eq_obj1id[e]), int(model.eq_obj2id[e])), model.eq_data[e, :5]
+            if leader >= 0 and not factors[2:].any() and self._name(follower) in joints:
+                zero = [float(model.qpos0[model.jnt_qposadr[j]]) for j in (follower, leader)]
+                offset = float(factors[0] + zero[0] - factors[1] * zero[1])
+                attributes = {
+                    "joint": self._name(leader),
+                    "multiplier": repr(float(factors[1])),
+                    "offset": repr(offset),
+                }
+                ET.SubElement(joints[self._name(follower)], "mimic", attributes)
+
+
+def _pose(position: Array, quaternion: Array) -> pin.SE3:
+    """Of MuJoCo's arrays, whose quaternions are w, x, y, z."""
+    return pin.SE3(pin.Quaternion(*quaternion.tolist()).normalized().matrix(), position.copy())
+
+
+def _add_origin(element: ET.Element, pose: pin.SE3) -> None:
+    ET.SubElement(element, "origin", xyz=numbers(pose.translation), rpy=numbers(pin.rpy.matrixToRpy(pose.rotation)))

@@ -1,0 +1,162 @@
+"""The URDF of an MJCF file: it moves, weighs and is shaped as MuJoCo says."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import coal
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+import trimesh
+
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.description import LinkTree, parse_urdf
+from q2r2_control.robot.mjcf import urdf_of_mjcf
+
+ARM = """<mujoco>
+<compiler meshdir="parts"/>
+<asset><mesh name="wedge" file="wedge.stl" scale="0.5 1 2"/></asset>
+<worldbody>
+<geom type="plane" size="2 2 0.1"/>
+<body name="cup" pos="1 0 0.1"><freejoint/><geom type="box" size="0.03 0.03 0.05"/></body>
+<body name="base" pos="0.3 0 0.7" euler="0 0 90">
+  <geom type="cylinder" size="0.1 0.05"/>
+  <body name="shoulder" pos="0 0 0.1" euler="20 0 -30">
+    <joint name="turn" axis="0 0 1" pos="0.02 0 0" range="-150 150" ref="15" armature="0.2" damping="0.4"/>
+    <joint name="lift" axis="0 1 0" pos="0 0.03 0.1" range="-90 90" ref="-10" actuatorfrcrange="-80 60"/>
+    <geom type="capsule" fromto="0 0 0 0.1 0 0.4" size="0.06"/>
+    <geom type="mesh" mesh="wedge" contype="0" conaffinity="0" pos="0.1 0 0.2" euler="0 30 0" rgba="1 0 0 1"/>
+    <body name="slide" pos="0.1 0 0.4">
+      <joint name="out" type="slide" axis="1 0 1" range="0 0.3" ref="0.1"/>
+      <geom type="ellipsoid" size="0.03 0.05 0.07" pos="0 0 0.05"/>
+      <body name="spinner" pos="0 0.05 0.1" euler="0 40 0">
+        <joint name="spin" axis="1 0 0"/>
+        <geom type="mesh" mesh="wedge" contype="0" conaffinity="0"/>
+        <body name="finger_a"><joint name="a" type="slide" axis="0 1 0" range="0 0.04"/><geom size="0.01"/></body>
+        <body name="finger_b"><joint name="b" type="slide" axis="0 1 0" range="-0.04 0"/><geom size="0.01"/></body>
+      </body>
+    </body>
+  </body>
+</body></worldbody>
+<equality><joint joint1="b" joint2="a" polycoef="0 -1 0 0 0"/></equality>
+<actuator><motor joint="turn" gear="50" ctrlrange="-2 2"/><position joint="spin" kp="100" forcerange="-9 9"/></actuator>
+</mujoco>"""
+JOINTS = ("turn", "lift", "out", "spin", "a", "b")
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Path:
+    """The file, with its mesh, which is not centred where it is drawn."""
+    (tmp_path / "parts").mkdir()
+    corners = np.array([[0.1, 0, 0], [0.3, 0, 0], [0.1, 0.1, 0], [0.1, 0, 0.05]])
+    trimesh.Trimesh(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]).export(tmp_path / "parts" / "wedge.stl")
+    file = tmp_path / "arm.xml"
+    file.write_text(ARM)
+    return file
+
+
+def read(file: Path) -> tuple[ET.Element, pin.Model, pin.GeometryModel]:
+    text = ET.tostring(urdf_of_mjcf(file, file.parent, 2.0), encoding="unicode")
+    urdf = parse_urdf(text, "arm.urdf", file.parent)
+    text = ET.tostring(urdf, encoding="unicode")
+    model = pin.buildModelFromXML(text)
+    return urdf, model, pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+
+
+def test_bodies_shapes_and_weights_are_where_mujoco_has_them(arm: Path) -> None:
+    urdf, model, geometry = read(arm)
+    theirs = mujoco.MjModel.from_xml_path(str(arm))
+    assert LinkTree(urdf, "arm").root == "base", "what moves freely and the floor are no part of it"
+    base = theirs.body("base")
+    data, state, shapes = model.createData(), mujoco.MjData(theirs), geometry.createData()
+    root = pin.XYZQUATToSE3(np.r_[base.pos, base.quat[[1, 2, 3, 0]]])
+    model.gravity.linear = root.rotation.T @ theirs.opt.gravity
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        values = random.uniform(-1.0, 1.0, len(JOINTS))
+        q = np.zeros(model.nq)
+        for name, value in zip(JOINTS, values, strict=True):
+            state.joint(name).qpos = q[model.joints[model.getJointId(name)].idx_q] = value
+        mujoco.mj_forward(theirs, state)
+        pin.updateGeometryPlacements(model, data, geometry, shapes, q)
+        forces = pin.computeGeneralizedGravity(model, data, q)
+        for name in JOINTS:
+            mine = forces[model.joints[model.getJointId(name)].idx_v]
+            assert mine == pytest.approx(float(state.joint(name).qfrc_bias[0]), abs=1e-9), name
+        for item, placement in zip(geometry.geometryObjects, shapes.oMg, strict=True):
+            link = item.name.rpartition("_")[0]
+            centre = (root * placement).act(_centre(item.geometry))
+            geoms = range(theirs.body(link).geomadr[0], theirs.body(link).geomadr[0] + theirs.body(link).geomnum[0])
+            theirs_at = [_geom_centre(theirs, state, g) for g in geoms]
+            assert min(np.linalg.norm(centre - at) for at in theirs_at) < 1e-6, item.name
+
+
+def _centre(shape: coal.CollisionGeometry) -> np.ndarray:
+    return np.array(shape.vertices()).mean(axis=0) if isinstance(shape, coal.BVHModelBase) else np.zeros(3)
+
+
+def _geom_centre(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarray:
+    if (mesh := model.geom_dataid[g]) < 0:
+        return data.geom_xpos[g]
+    first = model.mesh_vertadr[mesh]
+    corners = np.unique(model.mesh_vert[first : first + model.mesh_vertnum[mesh]].round(9), axis=0)
+    return data.geom_xpos[g] + data.geom_xmat[g].reshape(3, 3) @ corners.mean(axis=0)
+
+
+def test_limits_are_the_files_and_speed_is_the_callers(arm: Path) -> None:
+    urdf, _, _ = read(arm)
+
+    def written(joint: str, element: str) -> dict[str, str]:
+        return urdf.findall(f"joint[@name='{joint}']/{element}")[0].attrib
+
+    efforts = [float(written(name, "limit")["effort"]) for name in JOINTS]
+    speeds = [float(written(name, "limit")["velocity"]) for name in JOINTS]
+    assert (efforts, speeds) == ([100, 80, 0, 9, 0, 0], [2, 2, 0, 2, 0, 0])
+    assert float(written("turn", "limit")["upper"]) == pytest.approx(np.deg2rad(150))
+    assert float(written("out", "limit")["upper"]) == 0.3
+    assert written("b", "mimic") == {"joint": "a", "multiplier": "-1.0", "offset": "0.0"}
+    assert written("turn", "rotor") == {"inertia": "0.2", "gear": "1"}
+
+
+def test_a_capsule_stays_one_and_what_only_is_drawn_counts_where_nothing_else_does(arm: Path) -> None:
+    urdf, _, geometry = read(arm)
+    shapes = {item.name.rpartition("_")[0]: item.geometry for item in geometry.geometryObjects}
+    assert isinstance(shapes["shoulder"], coal.Capsule)
+    assert isinstance(shapes["spinner"], coal.BVHModelBase)
+    assert len(urdf.findall("link[@name='shoulder']/visual/geometry/mesh")) == 1
+    assert 2.0 * shapes["slide"].halfSide == pytest.approx([0.06, 0.1, 0.14])  # around the ellipsoid
+
+
+def test_arms_that_turn_against_the_world_and_two_in_one_file_get_a_root(arm: Path) -> None:
+    text = re.sub(r'<body name="base"', '<body name="other" pos="0 1 0"><joint/><geom size="0.1"/></body>\\g<0>', ARM)
+    arm.write_text(text)
+    urdf, model, _ = read(arm)
+    assert LinkTree(urdf, "arm").root == "mjcf_world"
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    for name in ("base", "other"):
+        theirs = mujoco.MjModel.from_xml_path(str(arm)).body(name).pos
+        assert data.oMf[model.getFrameId(name)].translation == pytest.approx(theirs)
+
+
+@pytest.mark.parametrize(
+    ("change", "to", "says"),
+    [
+        ("<worldbody>", "<worldbod>", "arm.xml: MuJoCo cannot read it"),
+        ('name="spin" axis="1 0 0"', 'name="spin" type="ball"', "arm.xml: joint spin is a ball joint"),
+        ('type="cylinder" size="0.1 0.05"', 'type="plane" size="1 1 1"', "body base has a shape of kind mjGEOM_PLANE"),
+        ('file="wedge.stl" scale="0.5 1 2"', 'vertex="0 0 0 1 0 0 0 1 0 0 0 1"', "mesh wedge: .*allowed: a file that"),
+        ('<body name="base".*?</worldbody>.*</actuator>', "</worldbody>", "arm.xml: no joint that turns or slides"),
+    ],
+)
+def test_a_file_that_makes_no_urdf_gets_one_line(arm: Path, change: str, to: str, says: str) -> None:
+    text = re.sub(change, to, ARM, flags=re.DOTALL)
+    assert text != ARM
+    arm.write_text(text)
+    with pytest.raises(RobotError, match=says) as raised:
+        read(arm)
+    assert "\n" not in str(raised.value)
