@@ -186,7 +186,7 @@ def test_sentences_open_with_their_subject() -> None:
 
 def test_the_page_of_ros_names_every_parameter_that_a_node_declares() -> None:
     page = (ROOT / "docs" / "ros.md").read_text(encoding="utf-8")
-    sources = [file.read_text(encoding="utf-8") for file in (ROOT / PACKAGE / "ros" / "nodes").glob("*.py")]
-    declared = {name for text in sources for name in re.findall(r'self\.parameter\(\s*"([a-z_.]+)"', text)}
+    sources = [file.read_text(encoding="utf-8") for file in (ROOT / PACKAGE / "ros").rglob("*.py")]
+    declared = {name for text in sources for name in re.findall(r'(?:parameter|declare)\(\s*"([a-z_.]+)"', text)}
     assert "trajectory" in declared
     assert {name for name in declared if f"`{name}`" not in page} == set()

@@ -40,6 +40,7 @@ from q2r2_control.viewer.tables import figure_table, print_table
 _FITS = 8  # capsules in the table
 _LEAST_JOINTS = 3  # of an arm
 _OFF_FLOOR = 0.03  # that each link can get at least [m]
+_SPEEDS = 0.01, 10.0  # that a joint's limit may be [rad/s]
 _BARELY = 0.003  # a pair that parts by no more than this beyond what it keeps hardly does [m]
 
 Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, MJCF, package:// or example-robot-data:NAME.")]
@@ -80,9 +81,10 @@ def new_cell(
     distance: Annotated[float | None, Option(min=0, max=5, help="Between the bases of both arms [m].")] = None,
     height: Annotated[float | None, Option(min=-3, max=5, help="Of the bases above the floor [m].")] = None,
     velocity: Annotated[
-        float | None, Option(min=0.01, max=10, help="Of an MJCF's joints, at most: it has no limits of speed [rad/s].")
+        float | None,
+        Option(min=_SPEEDS[0], max=_SPEEDS[1], help="Of an MJCF's joints, at most: it has no limits of speed [rad/s]."),
     ] = None,
-    samples: Annotated[int, Option(help="Random postures that pairs of links are looked at in.")] = 2000,
+    samples: Annotated[int, Option(min=100, help="Random postures that pairs of links are looked at in.")] = 2000,
     yes: Annotated[bool, Option("--yes", help="Ask nothing: take what was found.")] = False,
     json: Json = False,
 ) -> None:
@@ -146,23 +148,27 @@ def _xacro_args(given: list[str]) -> dict[str, str]:
 
 def _without_mjcf(models: dict[str, str], name: str, velocity: float | None, yes: bool) -> dict[str, str]:
     """The models, with a URDF that is written here in place of each MJCF file. Raises :class:`Q2R2Error`."""
-    written: dict[str, str] = {}
-    for side, model in models.items():
-        if not model.endswith(MJCF_ENDS) or model in written:
-            continue
-        written[model] = f"{name}_{side}.urdf"
-        if (file := Path(written[model])).exists():
-            raise ConfigError(f"{file}: exists; give it as --{side}, or the cell another name")
-        if velocity is None and yes:
-            raise ConfigError("--velocity: an MJCF has no limits of speed; allowed: what each joint bears [rad/s]")
-        if velocity is None:
-            velocity = _asked("limit of the joints' speed, which an MJCF does not have, in rad/s", 1.0, yes)
-        urdf = urdf_of_mjcf(find_resource(model), file.parent, velocity)
+    sides = {model: side for side, model in reversed(models.items()) if model.endswith(MJCF_ENDS)}
+    files = {model: Path(f"{name}_{side}.urdf") for model, side in sides.items()}
+    for model, file in files.items():
+        if file.exists():
+            raise ConfigError(f"{file}: exists; give it as --{sides[model]}, without --velocity, or another NAME")
+    if not files:
+        if velocity is not None:
+            raise ConfigError(f"--velocity: allowed with a model that ends in {' or '.join(MJCF_ENDS)}")
+        return models
+    if velocity is None and yes:
+        raise ConfigError("--velocity: an MJCF has no limits of speed; allowed: what each joint bears [rad/s]")
+    if velocity is None:
+        question = "limit of the joints' speed, which an MJCF does not have, in rad/s"
+        velocity = _asked(question, 1.0, yes)
+        if not _SPEEDS[0] <= velocity <= _SPEEDS[1]:
+            raise ConfigError(f"{question} = {velocity:g}: allowed: {_SPEEDS[0]:g} .. {_SPEEDS[1]:g}")
+    urdfs = {model: urdf_of_mjcf(find_resource(model), file.parent, velocity) for model, file in files.items()}
+    for model, urdf in urdfs.items():
         ET.indent(urdf)
-        file.write_text(ET.tostring(urdf, encoding="unicode"), encoding="utf-8")
-    if not written and velocity is not None:
-        raise ConfigError(f"--velocity: allowed with a model that ends in {' or '.join(MJCF_ENDS)}")
-    return {side: written.get(model, model) for side, model in models.items()}
+        files[model].write_text(ET.tostring(urdf, encoding="unicode"), encoding="utf-8")
+    return {side: str(files.get(model, model)) for side, model in models.items()}
 
 
 def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], shared: str | None) -> None:

@@ -70,7 +70,10 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     allowed = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
         allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1], model))}"
-    return f"{key} = {shown(fault['input'])}: {allowed}{more}"
+    # Of a whole block the text says itself which of its keys do not go together.
+    is_block = fault["type"] == "value_error" and isinstance(fault["input"], dict)
+    value = "" if is_block else f" = {shown(fault['input'])}"
+    return f"{key}{value}: {allowed}{more}"
 
 
 def _keys_at(location: tuple[int | str, ...], root: type[BaseModel]) -> list[str]:

@@ -10,8 +10,8 @@ reference and the bound S of how much closer the stop brings it (stop_certificat
 - never falls while it grows. A pair that is nearer than asked for is not pushed apart.
 
 After a reset pairs keep at once what the posture leaves them, and the controller's first settings in any case. Out of a
-start nearer than that it recovers, up to the whole buffer. Pairs that start within the buffer stop where they are. It
-grows with d - S as above. Arms that were left so are not pushed apart, and nothing moves before it is asked to.
+start nearer than that it recovers, up to the whole buffer. Pairs that start within the buffer stop where they are, with
+``LEAST_BUFFER`` at least. It grows with d - S as above. Arms that were left so are not pushed apart.
 
 **Held objects.** A pair that does not count keeps minus infinity. One that appears keeps d - S - buffer, or its own
 distance where that is less. The stop at hand is then proven with the object too, and it never has to be refused. It
@@ -33,7 +33,7 @@ import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.kernel_model import LEAST_BUFFER, KernelData, KernelModel, stop_buffer
-from q2r2_control.control.safety.safety_data import provable_distances
+from q2r2_control.control.safety.safety_data import ROUNDING, provable_distances
 from q2r2_control.control.tasks.built_in import task_model_of
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances, too_close_at_home
@@ -168,15 +168,16 @@ class LiveSettings:
     def restart(self) -> None:
         """Before a reset is observed: begin with what does not depend on where that is."""
         self._due = 0.0
-        if self._growing:
-            self._write(np.minimum(self._goal, self._least))
+        self._write(np.minimum(self._goal, self._least))
         self._stops[:] = self.kept + stop_buffer(self.kept, self.settings)
         self._approach_gains(self._ramp)
 
     def begin(self) -> None:
         """After a reset was observed: keep what the posture allows, and stop no farther away than that."""
         self._grow(np.inf)
-        self._stop_from(np.where(self._lasting() < self.kept, self._stops, self.kept))
+        distance = self._data.distance[: len(self.kept)]
+        is_within = (distance >= self.kept - ROUNDING) & (distance < self._stops)
+        self._stop_from(np.where(is_within, self.kept, self._stops))
 
     def step(self, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference."""

@@ -18,9 +18,11 @@ from q2r2_control.errors import RobotError
 from q2r2_control.robot.urdf_parts import numbers
 from q2r2_control.types import Array
 
-_BASE = "mjcf_world"  # root link of a robot that moves against the world without a base of its own
 _MESHES = (".stl", ".obj")  # that others than MuJoCo read
 _Joint, _Geom = mujoco.mjtJoint, mujoco.mjtGeom
+_ON_JOINTS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+# Of links between two joints of one body, without which no simulation takes them [kg], [kg m^2].
+_NEXT_TO_NONE = 1e-6, np.full(3, 1e-9)
 
 
 def urdf_of_mjcf(file: Path, folder: Path, velocity: float) -> ET.Element:
@@ -30,10 +32,17 @@ def urdf_of_mjcf(file: Path, folder: Path, velocity: float) -> ET.Element:
     that MuJoCo cannot read, and for joints and shapes that a URDF has not.
     """
     try:
-        model = mujoco.MjModel.from_xml_path(str(file.resolve()))
-    except ValueError as error:
+        if (kind := ET.parse(file).getroot().tag) != "mujoco":
+            raise RobotError(f"{file}: the root element is <{kind}>; an MJCF starts with <mujoco>")
+        spec = mujoco.MjSpec.from_file(str(file.resolve()))
+        spec.compiler.fusestatic = False  # a base is one of the robot's links
+        model = spec.compile()
+    except (ValueError, OSError, ET.ParseError) as error:
         raise RobotError(f"{file}: MuJoCo cannot read it: {' '.join(str(error).split())}") from error
     try:
+        for mesh in spec.meshes:
+            if mesh.refpos.any() or mesh.refquat[1:].any():
+                raise RobotError(f"mesh {mesh.name} has refpos or refquat; allowed: a mesh that is in place as it is")
         return _Writer(model, file.stem, folder, velocity).robot()
     except RobotError as error:
         raise RobotError(f"{file}: {error}") from None
@@ -48,6 +57,8 @@ class _Writer:
     def __init__(self, model: mujoco.MjModel, name: str, folder: Path, velocity: float) -> None:
         self._model, self._folder, self._velocity = model, folder, velocity
         self._urdf = ET.Element("robot", name=name)
+        self._names = {model.body(body).name for body in range(model.nbody)}
+        self._names |= {model.joint(j).name for j in range(model.njnt)}
         self._links: dict[int, str] = {}  # of bodies
         self._within: dict[int, pin.SE3] = {}  # frame of a body's link in the body's frame
 
@@ -59,7 +70,7 @@ class _Writer:
         if not roots:
             raise RobotError("no joint that turns or slides")
         if len(roots) > 1 or self._joints(next(iter(roots))):
-            self._add_link(0, _BASE, pin.SE3.Identity())
+            self._add_link(0, self._new_name("mjcf_world"), pin.SE3.Identity())
         for body in range(1, model.nbody):  # parents come first
             if int(model.body_rootid[body]) in roots:
                 self._add_body(body)
@@ -72,21 +83,29 @@ class _Writer:
 
     def _add_body(self, body: int) -> None:
         model, parent = self._model, int(self._model.body_parentid[body])
-        name, within = model.body(body).name or f"body_{body}", pin.SE3.Identity()
+        name, within = model.body(body).name or self._new_name(f"body_{body}"), pin.SE3.Identity()
         if parent in self._links:
             link = self._links[parent]
             at = self._within[parent].inverse() * _pose(model.body_pos[body], model.body_quat[body])
             joints = self._joints(body)
             for j in joints:
                 within = pin.SE3(np.eye(3), model.jnt_pos[j].copy())
-                child = name if j == joints[-1] else f"{name}_before_{self._name(j)}"
+                child = name if j == joints[-1] else self._new_name(f"{name}_before_{self._name(j)}")
                 if child != name:
-                    ET.SubElement(self._urdf, "link", name=child)
+                    self._add_inertial(
+                        ET.SubElement(self._urdf, "link", name=child), pin.SE3.Identity(), *_NEXT_TO_NONE
+                    )
                 self._add_moving_joint(j, link, child, at * within)
                 link, at = child, within.inverse()
             if not joints:
-                self._add_joint(f"{name}_fixed", "fixed", link, name, at)
+                self._add_joint(self._new_name(f"{name}_fixed"), "fixed", link, name, at)
         self._add_link(body, name, within)
+
+    def _new_name(self, wanted: str) -> str:
+        while wanted in self._names:
+            wanted += "_"
+        self._names.add(wanted)
+        return wanted
 
     def _name(self, j: int) -> str:
         return self._model.joint(j).name or f"joint_{j}"
@@ -114,21 +133,33 @@ class _Writer:
         dof = model.jnt_dofadr[j]
         damping, friction = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
         ET.SubElement(joint, "dynamics", damping=repr(damping), friction=repr(friction))
-        if model.dof_armature[dof] > 0.0:
-            ET.SubElement(joint, "rotor", inertia=repr(float(model.dof_armature[dof])), gear="1")
+        armature = float(model.dof_armature[dof])
+        if hasattr(model, "actuator_armature"):  # since MuJoCo 4
+            for a in self._actuators(j):
+                armature += float(model.actuator_gear[a, 0] ** 2 * model.actuator_armature[a])
+        if armature > 0.0:
+            ET.SubElement(joint, "rotor", inertia=repr(armature), gear="1")
+
+    def _actuators(self, j: int) -> list[int]:
+        model = self._model
+        return [
+            a
+            for a in np.flatnonzero(model.actuator_trnid[:, 0] == j).tolist()
+            if model.actuator_trntype[a] in _ON_JOINTS
+        ]
 
     def _effort(self, j: int) -> float:
-        """The least that the file limits the joint's force to [N, Nm]; 0 where nothing does."""
+        """The least, in either direction, that the file limits the joint's force to [N, Nm]; 0 where nothing does."""
         model, found = self._model, []
         if model.jnt_actfrclimited[j]:
-            found.append(np.abs(model.jnt_actfrcrange[j]).max())
-        for a in range(model.nu):
-            if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[a, 0] == j:
-                gear = abs(model.actuator_gear[a, 0])
-                if model.actuator_forcelimited[a]:
-                    found.append(gear * np.abs(model.actuator_forcerange[a]).max())
-                elif model.actuator_ctrllimited[a] and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
-                    found.append(gear * model.actuator_gainprm[a, 0] * np.abs(model.actuator_ctrlrange[a]).max())
+            found.append(np.abs(model.jnt_actfrcrange[j]).min())
+        for a in self._actuators(j):
+            gear = abs(model.actuator_gear[a, 0])
+            if model.actuator_forcelimited[a]:
+                found.append(gear * np.abs(model.actuator_forcerange[a]).min())
+            if model.actuator_ctrllimited[a] and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
+                gain = abs(model.actuator_gainprm[a, 0])
+                found.append(gear * gain * np.abs(model.actuator_ctrlrange[a]).min())
         return float(min(found, default=0.0))
 
     def _add_link(self, body: int, name: str, within: pin.SE3) -> None:
@@ -138,14 +169,12 @@ class _Writer:
         if body == 0:  # its shapes are the scene's
             return
         if model.body_mass[body] > 0.0:
-            inertial = ET.SubElement(link, "inertial")
-            _add_origin(inertial, within.inverse() * _pose(model.body_ipos[body], model.body_iquat[body]))
-            ET.SubElement(inertial, "mass", value=repr(float(model.body_mass[body])))
-            ixx, iyy, izz = map(repr, model.body_inertia[body].tolist())
-            ET.SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy="0", ixz="0", iyz="0")
+            at = within.inverse() * _pose(model.body_ipos[body], model.body_iquat[body])
+            self._add_inertial(link, at, float(model.body_mass[body]), model.body_inertia[body])
         first = model.body_geomadr[body]
         geoms = range(first, first + model.body_geomnum[body])
-        touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+        paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
+        touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g] or g in paired]
         for g in geoms:
             at = within.inverse() * _pose(model.geom_pos[g], model.geom_quat[g])
             # A body of which nothing may touch would be one that nobody watches: then all that is drawn counts.
@@ -153,6 +182,13 @@ class _Writer:
                 self._add_shape(link, "collision", g, at)
             if g not in touching:
                 self._add_shape(link, "visual", g, at)
+
+    def _add_inertial(self, link: ET.Element, at: pin.SE3, mass: float, principal: Array) -> None:
+        inertial = ET.SubElement(link, "inertial")
+        _add_origin(inertial, at)
+        ET.SubElement(inertial, "mass", value=repr(mass))
+        ixx, iyy, izz = map(repr, principal.tolist())
+        ET.SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy="0", ixz="0", iyz="0")
 
     def _add_shape(self, link: ET.Element, kind: str, g: int, at: pin.SE3) -> None:
         model, size = self._model, self._model.geom_size[g].tolist()

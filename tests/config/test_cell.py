@@ -125,7 +125,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
 def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, value: object, allowed: str) -> None:
     message = fault(tmp_path, changed(path, value, external if path.startswith("external") else shipped))
     # A fault of two keys together is told of the mapping that has both.
-    assert message.startswith((path, path.rpartition(".")[0] + " = "))
+    assert message.startswith((path, path.rpartition(".")[0] + ": "))
     assert allowed in message
 
 

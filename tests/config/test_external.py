@@ -49,6 +49,9 @@ def test_limits_of_targets_are_for_presets_that_take_targets(tmp_path: Path) -> 
     cell = external()
     cell["external"] |= {"preset": "jtc", "mode": "filtered"}
     assert loaded(tmp_path, yaml.safe_dump(cell)).external is not None
+    cell["external"]["mode"] = "raw"
+    assert fault(tmp_path, yaml.safe_dump(cell)).startswith("external: preset = 'jtc' with mode = 'raw'")
+    cell["external"]["mode"] = "filtered"
     cell["external"]["limits"]["max_velocity"] = 0.2
     assert "preset jtc gets joint positions within the limits of the block control" in fault(
         tmp_path, yaml.safe_dump(cell)

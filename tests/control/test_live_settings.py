@@ -139,6 +139,21 @@ def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(co
     assert run.contract.uncertified == 0
 
 
+def test_a_distance_that_has_grown_falls_back_to_what_a_reset_leaves_it(controller: CartesianController) -> None:
+    run = Driven(controller)
+    run.drive(4.0, SCENARIOS["crossing"])
+    near = run.q
+    controller.reset(run.robot.home)
+    assert controller.change({"min_distance": FAR}) is None
+    for _ in range(500):
+        controller.step({}, DT)
+    assert controller.narrow_pair is None
+    again = Driven(controller, near)
+    again.drive(0.5)
+    np.testing.assert_allclose(again.q, near, atol=1e-6)
+    assert again.contract.uncertified == 0
+
+
 def test_arms_that_were_left_within_their_buffer_rest_after_a_reset_and_it_grows_as_they_part(
     controller: CartesianController,
 ) -> None:

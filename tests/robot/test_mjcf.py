@@ -43,8 +43,10 @@ ARM = """<mujoco>
   </body>
 </body></worldbody>
 <equality><joint joint1="b" joint2="a" polycoef="0 -1 0 0 0"/></equality>
-<actuator><motor joint="turn" gear="50" ctrlrange="-2 2"/><position joint="spin" kp="100" forcerange="-9 9"/></actuator>
+<actuator><motor joint="turn" gear="50" ctrlrange="-2 2"/><position joint="spin" kp="100" forcerange="-9 12"/>
+<motor joint="lift" gear="-100" ctrlrange="-1 1" forcerange="-150 150"/></actuator>
 </mujoco>"""
+ONE_LINK = '<robot name="r"><link name="l"/></robot>'
 JOINTS = ("turn", "lift", "out", "spin", "a", "b")
 
 
@@ -115,7 +117,7 @@ def test_limits_are_the_files_and_speed_is_the_callers(arm: Path) -> None:
 
     efforts = [float(written(name, "limit")["effort"]) for name in JOINTS]
     speeds = [float(written(name, "limit")["velocity"]) for name in JOINTS]
-    assert (efforts, speeds) == ([100, 80, 0, 9, 0, 0], [2, 2, 0, 2, 0, 0])
+    assert (efforts, speeds) == ([100, 60, 0, 9, 0, 0], [2, 2, 0, 2, 0, 0])
     assert float(written("turn", "limit")["upper"]) == pytest.approx(np.deg2rad(150))
     assert float(written("out", "limit")["upper"]) == 0.3
     assert written("b", "mimic") == {"joint": "a", "multiplier": "-1.0", "offset": "0.0"}
@@ -126,8 +128,13 @@ def test_a_capsule_stays_one_and_what_only_is_drawn_counts_where_nothing_else_do
     urdf, _, geometry = read(arm)
     shapes = {item.name.rpartition("_")[0]: item.geometry for item in geometry.geometryObjects}
     assert isinstance(shapes["shoulder"], coal.Capsule)
+    assert float(urdf.findall("link[@name='shoulder_before_turn']/inertial/mass")[0].get("value", "")) > 0.0
     assert isinstance(shapes["spinner"], coal.BVHModelBase)
     assert len(urdf.findall("link[@name='shoulder']/visual/geometry/mesh")) == 1
+    contact = '<contact><pair geom1="table" geom2="drawn"/></contact></mujoco>'
+    text = ARM.replace('<geom type="plane"', '<geom name="table" type="plane"').replace("</mujoco>", contact)
+    arm.write_text(text.replace('type="mesh" mesh="wedge" contype', 'name="drawn" type="mesh" mesh="wedge" contype', 1))
+    assert read(arm)[0].findall("link[@name='shoulder']/visual") == [], "a pair names it"
     assert 2.0 * shapes["slide"].halfSide == pytest.approx([0.06, 0.1, 0.14])  # around the ellipsoid
 
 
@@ -143,18 +150,26 @@ def test_arms_that_turn_against_the_world_and_two_in_one_file_get_a_root(arm: Pa
         assert data.oMf[model.getFrameId(name)].translation == pytest.approx(theirs)
 
 
+def test_names_that_the_urdf_needs_besides_give_way_to_the_files(arm: Path) -> None:
+    text = ARM.replace('name="slide"', 'name="shoulder_before_turn"').replace('name="spinner"', 'name="mjcf_world"')
+    arm.write_text(text.replace('name="base"', 'name="base"><joint name="j"/><geom size="1"/></body><body name="b"'))
+    assert LinkTree(read(arm)[0], "arm").root == "mjcf_world_"
+
+
 @pytest.mark.parametrize(
     ("change", "to", "says"),
     [
         ("<worldbody>", "<worldbod>", "arm.xml: MuJoCo cannot read it"),
         ('name="spin" axis="1 0 0"', 'name="spin" type="ball"', "arm.xml: joint spin is a ball joint"),
         ('type="cylinder" size="0.1 0.05"', 'type="plane" size="1 1 1"', "body base has a shape of kind mjGEOM_PLANE"),
+        ("scale=", 'refpos="0 0 1" scale=', "arm.xml: mesh wedge has refpos or refquat"),
+        (".*", ONE_LINK, "arm.xml: the root element is <robot>; an MJCF starts with <mujoco>"),
         ('file="wedge.stl" scale="0.5 1 2"', 'vertex="0 0 0 1 0 0 0 1 0 0 0 1"', "mesh wedge: .*allowed: a file that"),
         ('<body name="base".*?</worldbody>.*</actuator>', "</worldbody>", "arm.xml: no joint that turns or slides"),
     ],
 )
 def test_a_file_that_makes_no_urdf_gets_one_line(arm: Path, change: str, to: str, says: str) -> None:
-    text = re.sub(change, to, ARM, flags=re.DOTALL)
+    text = re.sub(change, to, ARM, count=1, flags=re.DOTALL)
     assert text != ARM
     arm.write_text(text)
     with pytest.raises(RobotError, match=says) as raised:
