@@ -19,7 +19,7 @@ from q2r2_control.cli.commission import commission
 from q2r2_control.cli.doctor import doctor
 from q2r2_control.cli.fri import fri_cabinet
 from q2r2_control.cli.fri_check import fri_check
-from q2r2_control.cli.fri_mounts import fri_mounts
+from q2r2_control.cli.mounts import mounts
 from q2r2_control.cli.new_cell import new_cell
 from q2r2_control.cli.recordings import export, judge, replay, report
 from q2r2_control.cli.ros import app as ros_app
@@ -69,7 +69,7 @@ app.command(epilog="Example: q2r2 doctor my_cell.yaml")(doctor)
 app.command(epilog="Example: q2r2 commission my_cell.yaml --duration 60")(commission)
 app.command("fri-cabinet", epilog="Example: q2r2 fri-cabinet config/dual_iiwa7_fri.yaml --period 2")(fri_cabinet)
 app.command("fri-check", epilog="Example: q2r2 fri-check config/dual_iiwa7_fri.yaml --duration 60")(fri_check)
-app.command("fri-mounts", epilog="Example: q2r2 fri-mounts my_cell.yaml --tip 0 0 0.1")(fri_mounts)
+app.command("mounts", epilog="Example: q2r2 mounts my_cell.yaml --tip 0 0 0.1")(mounts)
 app.command("headset-check", epilog="Example: q2r2 headset-check --host 0.0.0.0")(headset_check)
 app.command(epilog="Example: q2r2 bench --ticks 20000, or --work --motion meet")(bench)
 app.command(epilog="Example: q2r2 soak --ticks 100000 --contact")(soak)

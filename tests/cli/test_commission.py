@@ -231,7 +231,7 @@ def test_a_measured_mount_is_written_into_the_cell_after_a_question(
     def rests(plant: FriPlant, arm: str, robot: Robot, console: object) -> pin.SE3:
         return pin.SE3(np.eye(3), next(touched[arm]))
 
-    monkeypatch.setattr("q2r2_control.cli.fri_mounts._resting", rests)
+    monkeypatch.setattr("q2r2_control.cli.mounts._resting", rests)
     monkeypatch.setattr(Robot, "tool_pose", lambda robot, q, arm: q if isinstance(q, pin.SE3) else pin.SE3.Identity())
     refused(cell, [*GUIDED, "measure", "y"])
     assert load_config(cell).arms["right"].mount.position == pytest.approx((0.0, -0.41, 0.0))

@@ -1,10 +1,11 @@
-"""``q2r2 fri-mounts``: where the right arm's base is, from points that both tips touch."""
+"""``q2r2 mounts``: where the right arm's base is, from points that both tips touch."""
 
 from __future__ import annotations
 
 import sys
 import time
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -24,6 +25,7 @@ from q2r2_control.viewer.tables import figure_table
 from q2r2_control.wording import sentence
 
 Tip = Annotated[tuple[float, float, float], Option(help="Of either tool, where both touch, in its frame [m].")]
+_FEWEST = 3  # points
 _STILL, _LISTENS = 2e-3, 0.5  # joints at rest move less than this [rad] for so long [s]
 
 
@@ -46,7 +48,9 @@ class MountReport:
             f"  position: {self.position}",
             f"  rpy: {self.rpy}",
         ]
-        return figure_table("tips, after the fit", ("", "apart [mm]"), rows, notes)
+        table = figure_table("tips, after the fit", ("", "apart [mm]"), rows, notes)
+        table.min_width = max(map(len, notes))  # lines to paste stay lines
+        return table
 
 
 def mount_report(config: Config, points: Array, touched: Array) -> MountReport:
@@ -64,20 +68,31 @@ def mount_report(config: Config, points: Array, touched: Array) -> MountReport:
     )
 
 
-def fri_mounts(
+def mounts(
     config: ConfigFile,
-    points: Annotated[int, Option(min=3, max=20, help="That both tips touch, far apart and not on a line.")] = 3,
+    postures: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="Instead of KUKA's cabinets: a line a point, joints left, right [rad]."),
+    ] = None,
+    points: Annotated[int, Option(min=_FEWEST, max=20, help="That both tips touch, far apart and not on a line.")] = 3,
     tip: Tip = (0.0, 0.0, 0.0),
     json: Json = False,
 ) -> None:
     """Find where the right arm's base is: guide both tips by hand to the same points, one after the other.
 
-    The left arm's mount is taken as it is in the cell. Lines for the YAML are printed; nothing is written.
+    KUKA's cabinets tell where the arms are. For others write down the joints of both arms at each point. The left arm's
+    mount is taken as it is in the cell. Lines for the YAML are printed; nothing is written.
     """
     cell, console = load_config(config), Console(stderr=True)
     robot = Robot.from_config(cell)
     if set(robot.arms) != set(SIDES):
         raise ConfigError(f"{config}: arms: {', '.join(robot.arms)}; allowed: left and right")
+    if postures is not None:
+        touched = _written(postures, robot)
+        tips = [np.array([robot.tool_pose(q, arm).act(np.array(tip)) for q in touched]) for arm in SIDES]
+        report = mount_report(cell, *tips)
+        print_report(asdict(report), (report.table(),), json)
+        return
     plant = FriPlant(robot, cell)
     plant.begin(CommandMode.POSITION)
     say("waits for the cabinets", console)
@@ -99,6 +114,24 @@ def measure_mount(
             say(f"point {number} of {points}: guide the {arm} tip there, hold it still, and press Enter", console)
             tips[arm].append(robot.tool_pose(_resting(plant, arm, robot, console), arm).act(tip))
     return mount_report(config, *(np.array(tips[arm]) for arm in SIDES))
+
+
+def _written(file: Path, robot: Robot) -> Array:
+    """The postures (n, nv) [rad] in a text file. Raises :class:`ConfigError`."""
+    joints = np.concatenate([robot.arms[arm].joints for arm in SIDES])
+    allowed = f"lines of {len(joints)} numbers in radians: {', '.join(robot.joint_names[joint] for joint in joints)}"
+    try:
+        lines = [line.replace(",", " ").split() for line in file.read_text(encoding="utf-8").splitlines()]
+        values = np.array([[float(word) for word in words] for words in lines if words and words[0][0] != "#"])
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--postures {file}: {error}; allowed: {allowed}") from error
+    if values.ndim != 2 or values.shape[1] != len(joints) or not np.isfinite(values).all():
+        raise ConfigError(f"--postures {file}: allowed: {allowed}")
+    if len(values) < _FEWEST:
+        raise ConfigError(f"--postures {file}: {len(values)} points; allowed: {_FEWEST} or more")
+    postures = np.zeros((len(values), robot.model.nv))
+    postures[:, joints] = values
+    return postures
 
 
 def _resting(plant: FriPlant, arm: str, robot: Robot, console: Console) -> Array:
