@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
-import trimesh
 
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.description import LinkTree, parse_urdf
@@ -19,7 +18,7 @@ from q2r2_control.robot.mjcf import urdf_of_mjcf
 
 ARM = """<mujoco>
 <compiler meshdir="parts"/>
-<asset><mesh name="wedge" file="wedge.stl" scale="0.5 1 2"/></asset>
+<asset><mesh name="wedge" file="wedge.obj" scale="0.5 1 2"/></asset>
 <worldbody>
 <geom type="plane" size="2 2 0.1"/>
 <body name="cup" pos="1 0 0.1"><freejoint/><geom type="box" size="0.03 0.03 0.05"/></body>
@@ -54,8 +53,8 @@ JOINTS = ("turn", "lift", "out", "spin", "a", "b")
 def arm(tmp_path: Path) -> Path:
     """The file, with its mesh, which is not centred where it is drawn."""
     (tmp_path / "parts").mkdir()
-    corners = np.array([[0.1, 0, 0], [0.3, 0, 0], [0.1, 0.1, 0], [0.1, 0, 0.05]])
-    trimesh.Trimesh(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]).export(tmp_path / "parts" / "wedge.stl")
+    corners = "v 0.1 0 0\nv 0.3 0 0\nv 0.1 0.1 0\nv 0.1 0 0.05\n"
+    (tmp_path / "parts" / "wedge.obj").write_text(corners + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
     file = tmp_path / "arm.xml"
     file.write_text(ARM)
     return file
@@ -164,7 +163,7 @@ def test_names_that_the_urdf_needs_besides_give_way_to_the_files(arm: Path) -> N
         ('type="cylinder" size="0.1 0.05"', 'type="plane" size="1 1 1"', "body base has a shape of kind mjGEOM_PLANE"),
         ("scale=", 'refpos="0 0 1" scale=', "arm.xml: mesh wedge has refpos or refquat"),
         (".*", ONE_LINK, "arm.xml: the root element is <robot>; an MJCF starts with <mujoco>"),
-        ('file="wedge.stl" scale="0.5 1 2"', 'vertex="0 0 0 1 0 0 0 1 0 0 0 1"', "mesh wedge: .*allowed: a file that"),
+        ('file="wedge.obj" scale="0.5 1 2"', 'vertex="0 0 0 1 0 0 0 1 0 0 0 1"', "mesh wedge: .*allowed: a file that"),
         ('<body name="base".*?</worldbody>.*</actuator>', "</worldbody>", "arm.xml: no joint that turns or slides"),
     ],
 )
