@@ -25,6 +25,7 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.process.machine_notes import machine_notes
 from q2r2_control.process.scheduling import real_time
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
@@ -179,6 +180,7 @@ def main(
         f"it did so for {max(data['stand_stills_ms'], default=0.0):.1f} ms at most",
         f"the tools are {data['delay_ms']:.0f} ms behind the reference, and apart from that"
         f" {data['error_after_delay_mm_rms']:.2f} mm from it; without cabinets {data['direct_error_mm_rms']:.2f} mm",
+        *(machine_notes() if rt else ()),
     ]
     print_report(data, (figure_table("two cabinets", columns, rows, notes),), json)
 

@@ -74,7 +74,10 @@ def mounts(
         Path | None,
         Option(metavar="FILE", help="Instead of KUKA's cabinets: a line a point, joints left, right [rad]."),
     ] = None,
-    points: Annotated[int, Option(min=_FEWEST, max=20, help="That both tips touch, far apart and not on a line.")] = 3,
+    points: Annotated[
+        int | None,
+        Option(min=_FEWEST, max=20, help="That both tips touch, far apart and not on a line.  [default: 3]"),
+    ] = None,
     tip: Tip = (0.0, 0.0, 0.0),
     json: Json = False,
 ) -> None:
@@ -88,6 +91,8 @@ def mounts(
     if set(robot.arms) != set(SIDES):
         raise ConfigError(f"{config}: arms: {', '.join(robot.arms)}; allowed: left and right")
     if postures is not None:
+        if points is not None:
+            raise ConfigError("--points: allowed without --postures, whose file has a line a point")
         touched = _written(postures, robot)
         tips = [np.array([robot.tool_pose(q, arm).act(np.array(tip)) for q in touched]) for arm in SIDES]
         report = mount_report(cell, *tips)
@@ -98,7 +103,7 @@ def mounts(
     say("waits for the cabinets", console)
     try:
         plant.reset()
-        report = measure_mount(plant, cell, robot, points, np.array(tip), console)
+        report = measure_mount(plant, cell, robot, points or _FEWEST, np.array(tip), console)
     finally:
         plant.close()
     print_report(asdict(report), (report.table(),), json)

@@ -77,6 +77,14 @@ def test_postures_that_tell_nothing_are_refused(tmp_path: Path, text: str, says:
     assert done.stderr.count("\n") == 1
 
 
+def test_a_count_of_points_beside_a_file_of_them_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "touched.txt"
+    file.write_text(3 * (12 * "0 " + "\n"))
+    done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", str(file), "--points", "3")
+    assert done.exit_code == 2
+    assert "--points: allowed without --postures, whose file has a line a point" in done.stderr
+
+
 @pytest.mark.usefixtures("cabinets")
 def test_arms_that_were_not_moved_between_the_points_tell_nothing(fri_cell: str) -> None:
     done = q2r2("mounts", fri_cell, typed="\n" * 6)
