@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 from q2r2_control.process.scheduling import real_time
 
 _LEAST_MTU = 1500  # that takes every message of a cabinet in one piece [bytes]
+_FAIR_SERVER = "/sys/kernel/debug/sched/fair_server"
 _GATHERS = re.compile(r"^(Adaptive RX: on|rx-usecs: *[1-9]\d*)", re.MULTILINE)
 _RING = re.compile(r"^RX:\s*(\d+)", re.MULTILINE)
 
@@ -29,10 +31,27 @@ def machine_notes() -> list[str]:
             "Linux halts real-time threads for 50 ms once they took 95 % of a processor for a second;"
             " sysctl -w kernel.sched_rt_runtime_us=-1"
         )
+    notes += fair_server_notes(os.uname().release, Path(_FAIR_SERVER)) if sys.platform == "linux" else []
     governor = _text("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
     if governor not in ("", "performance"):
         notes.append(f"the processors' governor is {governor}; cpupower frequency-set -g performance")
     return notes
+
+
+def fair_server_notes(release: str, folder: Path) -> list[str]:
+    """Of the share of a processor that Linux, from 6.12 on, keeps for other programs by halting real-time threads.
+
+    ``release`` of the kernel; ``folder`` with the share of each processor, which only root may read.
+    """
+    major, minor, *_ = *map(int, re.findall(r"\d+", release)[:2]), 0, 0
+    shares = [_text(file) for file in folder.glob("cpu*/runtime")]
+    if (major, minor) < (6, 12) or (shares and set(shares) == {"0"}):
+        return []
+    command = f"for share in {folder}/cpu*/runtime; do echo 0 > $share; done"
+    return [
+        "Linux halts real-time threads for up to 50 ms where other programs got less than 5 % of a processor in a"
+        f" second; leave a processor free, or, as root and without Secure Boot: {command}"
+    ]
 
 
 def network_notes(addresses: Iterable[str]) -> list[str]:
@@ -61,8 +80,12 @@ def card_notes(card: str) -> list[str]:
     return notes
 
 
-def _text(file: str) -> str:
-    return Path(file).read_text().strip() if Path(file).exists() else ""
+def _text(file: str | Path) -> str:
+    """Of a file; empty where it is not there or may not be read."""
+    try:
+        return Path(file).read_text().strip()
+    except OSError:
+        return ""
 
 
 def _output(*words: str) -> str:

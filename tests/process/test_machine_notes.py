@@ -1,4 +1,4 @@
-"""Hints about a network card, of what ``ip`` and ``ethtool`` print."""
+"""Hints about the kernel, and about a network card of what ``ip`` and ``ethtool`` print."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.process.machine_notes import card_notes, network_notes
+from q2r2_control.process.machine_notes import card_notes, fair_server_notes, network_notes
 
 QUIET = "Adaptive RX: off  TX: off\nrx-usecs: 0\nrx-frames: 1\n"
 RING = "Pre-set maximums:\nRX:\t\t4096\nTX:\t\t4096\nCurrent hardware settings:\nRX:\t\t{}\nTX:\t\t256\n"
@@ -51,3 +51,22 @@ def test_a_card_that_tells_nothing_gives_no_note(prints: Callable[..., None]) ->
 
 def test_this_computers_own_addresses_need_no_card() -> None:
     assert network_notes(["127.0.0.1", "::1"]) == []
+
+
+@pytest.mark.parametrize(
+    ("release", "shares", "is_noted"),
+    [
+        ("6.12.0-rt5", "50000000", True),
+        ("6.12.0", None, True),  # may not be read
+        ("6.18.44", "0", False),
+        ("6.8.0-48-generic", None, False),
+    ],
+)
+def test_a_kernel_that_halts_real_time_threads_for_other_programs_is_named(
+    tmp_path: Path, release: str, shares: str | None, is_noted: bool
+) -> None:
+    for cpu in ("cpu0", "cpu1") if shares is not None else ():
+        (tmp_path / cpu).mkdir()
+        (tmp_path / cpu / "runtime").write_text(f"{shares}\n")
+    notes = fair_server_notes(release, tmp_path)
+    assert [f"{tmp_path}/cpu*/runtime; do echo 0" in note for note in notes] == [True] * is_noted
