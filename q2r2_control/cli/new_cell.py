@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,16 +17,15 @@ from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_report import check_cell
 from q2r2_control.cli.cell_yaml import commented_yaml
+from q2r2_control.cli.model_arguments import SPEEDS, asked, named_values, without_mjcf
 from q2r2_control.cli.output import Json, as_json_text, counting, say
 from q2r2_control.config.cell import Config, load_config, parse_config
-from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.compose import compose
-from q2r2_control.robot.description import MJCF_ENDS, LinkTree, joint_limits, load_description
+from q2r2_control.robot.description import LinkTree, joint_limits, load_description
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.home_search import find_home, mirrored_home
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.robot.mjcf import urdf_of_mjcf
 from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, lacks_of, tip_of, tips_by_side
 from q2r2_control.robot.near_pairs import spreads_of
 from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_names
@@ -40,7 +38,6 @@ from q2r2_control.viewer.tables import figure_table, print_table
 _FITS = 8  # capsules in the table
 _LEAST_JOINTS = 3  # of an arm
 _OFF_FLOOR = 0.03  # that each link can get at least [m]
-_SPEEDS = 0.01, 10.0  # that a joint's limit may be [rad/s]
 _BARELY = 0.003  # a pair that parts by no more than this beyond what it keeps hardly does [m]
 
 Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, MJCF, package:// or example-robot-data:NAME.")]
@@ -82,7 +79,7 @@ def new_cell(
     height: Annotated[float | None, Option(min=-3, max=5, help="Of the bases above the floor [m].")] = None,
     velocity: Annotated[
         float | None,
-        Option(min=_SPEEDS[0], max=_SPEEDS[1], help="Of an MJCF's joints, at most: it has no limits of speed [rad/s]."),
+        Option(min=SPEEDS[0], max=SPEEDS[1], help="Of an MJCF's joints, at most: it has no limits of speed [rad/s]."),
     ] = None,
     samples: Annotated[int, Option(min=100, help="Random postures that pairs of links are looked at in.")] = 2000,
     yes: Annotated[bool, Option("--yes", help="Ask nothing: take what was found.")] = False,
@@ -100,12 +97,12 @@ def new_cell(
             raise ConfigError(f"{one}: exists; give another name")
     if (robot is None) == (left is None and right is None):
         raise ConfigError("--left, --right or --robot: allowed: a model for each arm, or one that holds both")
-    draft = _Draft(file, {"name": name}, xacro_args=_xacro_args(xacro_arg or []))
+    draft = _Draft(file, {"name": name}, xacro_args=named_values(xacro_arg or []))
     if xacro_arg and not any(model.endswith(".xacro") for model in (left, right, robot) if model is not None):
         raise ConfigError("--xacro-arg: allowed with a model that ends in .xacro")
     tips = {"left": left_tip, "right": right_tip}
     given = {side: model for side, model in (("left", left), ("right", right), ("robot", robot)) if model is not None}
-    models = _without_mjcf(given, name, velocity, yes)
+    models = without_mjcf(given, name, velocity, yes)
     robot = models.get("robot")
     _survey(draft, dict.fromkeys(tips, robot) if robot else models, tips, shared=robot)
     _mount(draft, distance, height, yes)
@@ -136,39 +133,6 @@ def new_cell(
     else:
         _print(draft, result.notes, faults)
     raise Exit(1 if faults else 0)
-
-
-def _xacro_args(given: list[str]) -> dict[str, str]:
-    """Values by name. Raises :class:`ConfigError`."""
-    for text in given:
-        if not text.partition("=")[0].strip() or "=" not in text:
-            raise ConfigError(f"--xacro-arg {text!r:.80}: allowed: NAME=VALUE")
-    return {name: value for name, _, value in (text.partition("=") for text in given)}
-
-
-def _without_mjcf(models: dict[str, str], name: str, velocity: float | None, yes: bool) -> dict[str, str]:
-    """The models, with a URDF that is written here in place of each MJCF file. Raises :class:`Q2R2Error`."""
-    sides = {model: side for side, model in reversed(models.items()) if model.endswith(MJCF_ENDS)}
-    files = {model: Path(f"{name}_{side}.urdf") for model, side in sides.items()}
-    for model, file in files.items():
-        if file.exists():
-            raise ConfigError(f"{file}: exists; give it as --{sides[model]}, without --velocity, or another NAME")
-    if not files:
-        if velocity is not None:
-            raise ConfigError(f"--velocity: allowed with a model that ends in {' or '.join(MJCF_ENDS)}")
-        return models
-    if velocity is None and yes:
-        raise ConfigError("--velocity: an MJCF has no limits of speed; allowed: what each joint bears [rad/s]")
-    if velocity is None:
-        question = "limit of the joints' speed, which an MJCF does not have, in rad/s"
-        velocity = _asked(question, 1.0, yes)
-        if not _SPEEDS[0] <= velocity <= _SPEEDS[1]:
-            raise ConfigError(f"{question} = {velocity:g}: allowed: {_SPEEDS[0]:g} .. {_SPEEDS[1]:g}")
-    urdfs = {model: urdf_of_mjcf(find_resource(model), file.parent, velocity) for model, file in files.items()}
-    for model, urdf in urdfs.items():
-        ET.indent(urdf)
-        files[model].write_text(ET.tostring(urdf, encoding="unicode"), encoding="utf-8")
-    return {side: str(files.get(model, model)) for side, model in models.items()}
 
 
 def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], shared: str | None) -> None:
@@ -236,10 +200,10 @@ def _mount(draft: _Draft, distance: float | None, height: float | None, yes: boo
     usual = round(min(max(length, 0.3), 1.0), 1)
     if distance is None:
         apart = len(arms) == 2 and shared is None
-        distance = _asked("metres between the bases of both arms", usual, yes) if apart else 0.0
+        distance = asked("metres between the bases of both arms", usual, yes) if apart else 0.0
     if height is None:
         stand = _stand(Robot.from_config(draft.config()), has_feet=shared is not None)
-        height = _asked("height of the base above the floor in metres", stand, yes)
+        height = asked("height of the base above the floor in metres", stand, yes)
     for side, part in {"robot": shared}.items() if shared is not None else arms.items():
         y = 0.0 if side == "robot" or len(arms) == 1 else distance / 2 if side == "left" else -distance / 2
         part["mount"]["position"] = [0.0, round(y, 4), height]
@@ -310,10 +274,6 @@ def _limit_acceleration(draft: _Draft, robot: Robot, config: Config) -> None:
     share = min(stop.bearable for stop in stop_torques(robot, robot.capped_acceleration(cap)))
     if 0.05 < share < 1.0:
         draft.data.setdefault("control", {})["acceleration_limit"] = math.floor(10.0 * cap * share) / 10.0
-
-
-def _asked(question: str, usual: float, yes: bool) -> float:
-    return usual if yes else float(typer.prompt(question, default=usual, type=float))
 
 
 def _print(draft: _Draft, notes: list[str], faults: list[str]) -> None:

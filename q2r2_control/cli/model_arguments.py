@@ -1,0 +1,52 @@
+"""Models as the command line of ``q2r2 new-cell`` names them: arguments of xacro, and MJCF that is written as URDF."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import typer
+
+from q2r2_control.config.resources import find_resource
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.description import MJCF_ENDS
+from q2r2_control.robot.mjcf import urdf_of_mjcf
+
+SPEEDS = 0.01, 10.0  # that a joint's limit may be [rad/s]
+
+
+def named_values(given: list[str]) -> dict[str, str]:
+    """Values by name. Raises :class:`ConfigError`."""
+    for text in given:
+        if not text.partition("=")[0].strip() or "=" not in text:
+            raise ConfigError(f"--xacro-arg {text!r:.80}: allowed: NAME=VALUE")
+    return {name: value for name, _, value in (text.partition("=") for text in given)}
+
+
+def without_mjcf(models: dict[str, str], name: str, velocity: float | None, yes: bool) -> dict[str, str]:
+    """The models, with a URDF that is written here in place of each MJCF file. Raises :class:`Q2R2Error`."""
+    sides = {model: side for side, model in reversed(models.items()) if model.endswith(MJCF_ENDS)}
+    files = {model: Path(f"{name}_{side}.urdf") for model, side in sides.items()}
+    for model, file in files.items():
+        if file.exists():
+            raise ConfigError(f"{file}: exists; give it as --{sides[model]}, without --velocity, or another NAME")
+    if not files:
+        if velocity is not None:
+            raise ConfigError(f"--velocity: allowed with a model that ends in {' or '.join(MJCF_ENDS)}")
+        return models
+    if velocity is None and yes:
+        raise ConfigError("--velocity: an MJCF has no limits of speed; allowed: what each joint bears [rad/s]")
+    if velocity is None:
+        question = "limit of the joints' speed, which an MJCF does not have, in rad/s"
+        velocity = asked(question, 1.0, yes)
+        if not SPEEDS[0] <= velocity <= SPEEDS[1]:
+            raise ConfigError(f"{question} = {velocity:g}: allowed: {SPEEDS[0]:g} .. {SPEEDS[1]:g}")
+    urdfs = {model: urdf_of_mjcf(find_resource(model), file.parent, velocity) for model, file in files.items()}
+    for model, urdf in urdfs.items():
+        ET.indent(urdf)
+        files[model].write_text(ET.tostring(urdf, encoding="unicode"), encoding="utf-8")
+    return {side: str(files.get(model, model)) for side, model in models.items()}
+
+
+def asked(question: str, usual: float, yes: bool) -> float:
+    return usual if yes else float(typer.prompt(question, default=usual, type=float))
