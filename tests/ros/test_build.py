@@ -103,24 +103,6 @@ def test_a_build_that_fails_names_its_log(tmp_path: Path) -> None:
     assert "broken" in log.read_text()
 
 
-@pytest.mark.slow
-def test_importing_the_package_imports_no_rclpy() -> None:
-    code = "import sys, q2r2_control.ros.launch.processes; print('rclpy' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert (run.stdout, run.stderr) == ("False\n", "")
-
-
-@pytest.mark.slow
-def test_the_names_that_subclasses_need_come_from_the_package() -> None:
-    pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-    from q2r2_control.ros import BaseArmController, BaseNode, run_node
-
-    assert issubclass(BaseArmController, BaseNode)
-    assert callable(run_node)
-    with pytest.raises(ImportError):
-        from q2r2_control.ros import no_such_name  # noqa: F401
-
-
 # The list of docs.ros.org/en/jazzy/p/control_msgs, in its order; a type hash depends on names and types of fields
 # alone.
 GRIPPER_STATE = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal"
