@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config.cell import Config
 from q2r2_control.events import Event, ReasonKind
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.webxr.exchange import Display
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import ActiveLimit, Array
+from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.live import next_press, why
+from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.state_colours import state_colour
 
 _PERIOD = 1.0 / 30.0  # between messages [s]
@@ -53,21 +52,10 @@ class ShownTick(NamedTuple):
     recording: str
 
 
-@dataclass(frozen=True)
-class ShownRun:
-    """The cell and the robot of a run."""
-
-    config: Config
-    urdf: str
-    joint_names: tuple[str, ...]
-    joints: Mapping[str, Array]  # of each arm, indices of ``joint_names``
-    fingers: Mapping[str, tuple[str, ...]]  # of each arm, joints of its gripper
-
-
 class RunDisplay:
     """Makes messages, in the process that sends them, where the robot is read from its URDF."""
 
-    def __init__(self, run: ShownRun) -> None:
+    def __init__(self, run: ShownRobot) -> None:
         self._run = run
         self._names = {arm: [run.joint_names[index] for index in its] for arm, its in run.joints.items()}
 
@@ -119,18 +107,7 @@ class HeadsetView:
         self._binding: dict[ActiveLimit, None] = {}
         self._last: dict[str, Event] = {}
         self._episodes, self._open = 0, False
-        robot = pipeline.robot
-        source.show_on(
-            RunDisplay(
-                ShownRun(
-                    config=pipeline.config,
-                    urdf=robot.urdf,
-                    joint_names=robot.joint_names,
-                    joints={arm: its.joints for arm, its in robot.arms.items()},
-                    fingers={arm: its.finger_joints for arm, its in robot.arms.items()},
-                )
-            )
-        )
+        source.show_on(RunDisplay(ShownRobot.of(pipeline.robot, pipeline.config)))
         pipeline.listeners.append(self)
 
     def __call__(self, tick: Tick) -> None:

@@ -4,37 +4,19 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
-from typing import Protocol
 
 import coal
 import numpy as np
 import pinocchio as pin
 import trimesh
 
-from q2r2_control.config.cell import Config
 from q2r2_control.robot.pairs import ENVELOPE, link_of
 from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
+from q2r2_control.viewer.shown_robot import ShownRobot
 
 Colour = tuple[int, int, int]
 _SHARP = 0.6  # an edge, which is not shaded as round [rad]
-
-
-class ShownRobot(Protocol):
-    """The source of a tree."""
-
-    @property
-    def config(self) -> Config: ...
-
-    @property
-    def urdf(self) -> str: ...
-
-    @property
-    def joint_names(self) -> tuple[str, ...]: ...
-
-    @property
-    def fingers(self) -> Mapping[str, tuple[str, ...]]:
-        """Of each arm, joints of its gripper."""
 
 
 class JointTree:

@@ -3,51 +3,42 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from dataclasses import replace
 
 import pytest
 
 from q2r2_control import Robot
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.viewer.joint_tree import JointTree
+from q2r2_control.viewer.shown_robot import ShownRobot
 from tests.config.cell_files import CELL
 
 BLACK, STEEL = (31, 31, 33), (158, 163, 168)  # of the hand's URDF
 
 
-@dataclass
-class Shown:
-    config: Config
-    urdf: str
-    joint_names: tuple[str, ...]
-    fingers: dict[str, tuple[str, ...]]
-
-
 @pytest.fixture
-def shown() -> Shown:
+def shown() -> ShownRobot:
     config = load_config(CELL)
-    robot = Robot.from_config(config)
-    fingers = {arm: its.finger_joints for arm, its in robot.arms.items()}
-    return Shown(config, robot.urdf, robot.joint_names, fingers)
+    return ShownRobot.of(Robot.from_config(config), config)
 
 
-def colours(shown: Shown, joint: str) -> set[tuple[int, int, int]]:
+def colours(shown: ShownRobot, joint: str) -> set[tuple[int, int, int]]:
     tree = JointTree(shown)
     return {colour for index, colour, _ in tree.meshes() if tree.model.names[index] == joint}
 
 
-def test_a_hand_is_drawn_and_not_the_envelope_around_it(shown: Shown) -> None:
+def test_a_hand_is_drawn_and_not_the_envelope_around_it(shown: ShownRobot) -> None:
     assert colours(shown, shown.fingers["left"][0]) == {BLACK, STEEL}
     assert {BLACK, STEEL} < colours(shown, "left_A7")
     assert colours(shown, "left_A7") == colours(shown, "right_A7")
     assert len(colours(shown, "left_A7")) == 4  # its ring and its flange too
 
 
-def test_a_link_that_is_drawn_as_nothing_is_drawn_as_what_may_not_be_touched(shown: Shown) -> None:
+def test_a_link_that_is_drawn_as_nothing_is_drawn_as_what_may_not_be_touched(shown: ShownRobot) -> None:
     urdf = ET.fromstring(shown.urdf)
     for link in urdf.iterfind("link"):
         if link.get("name") == "left_hand_e_base":
             for visual in link.findall("visual"):
                 link.remove(visual)
-    shown.urdf = ET.tostring(urdf, encoding="unicode")
+    shown = replace(shown, urdf=ET.tostring(urdf, encoding="unicode"))
     assert len(colours(shown, "left_A7")) == 3  # one for its body of contact

@@ -9,24 +9,19 @@ from typing import NamedTuple
 
 import pinocchio as pin
 
-from q2r2_control.config.cell import Config
 from q2r2_control.events import Event
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit, Array
+from q2r2_control.viewer.shown_robot import ShownRobot
 
 
 @dataclass(frozen=True)
-class PageSetup:
+class PageSetup(ShownRobot):
     """The first message to the server: the cell, and where to listen."""
 
     host: str
     port: int  # 0: any free one
     title: str
-    config: Config
-    urdf: str
-    joint_names: tuple[str, ...]
-    joints: Mapping[str, Array]  # of each arm, indices of ``joint_names``
-    fingers: Mapping[str, tuple[str, ...]]  # of each arm, joints of its gripper
     tools: Mapping[str, int]  # of each arm, the frame of its tool in ``model``
     home: Array  # (nv,) [rad]
     lower: Array  # (nv,) position limits [rad]

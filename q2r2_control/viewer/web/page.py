@@ -13,6 +13,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.robot.robot import Robot
+from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.web.exchange import Frame, PageRequest, PageSetting, PageSetup, PageWatched, Ready
 
 _READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
@@ -59,14 +60,10 @@ class Page:
     ) -> str:
         """Serve the page of a cell, see :class:`PageSetup`; returns its URL. Raises :class:`ConfigError`."""
         setup = PageSetup(
+            **vars(ShownRobot.of(robot, config)),
             host=self._host,
             port=self._port,
             title=title,
-            config=config,
-            urdf=robot.urdf,
-            joint_names=robot.joint_names,
-            joints={arm: its.joints for arm, its in robot.arms.items()},
-            fingers={arm: its.finger_joints for arm, its in robot.arms.items()},
             tools={arm: its.frame_id for arm, its in robot.arms.items()},
             home=robot.home,
             lower=robot.position_lower,

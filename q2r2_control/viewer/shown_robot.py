@@ -1,0 +1,32 @@
+"""The robot of a cell, as a process that draws it gets it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+from q2r2_control.config.cell import Config
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+
+@dataclass(frozen=True)
+class ShownRobot:
+    """All that a tree of joints with meshes is made of."""
+
+    config: Config
+    urdf: str
+    joint_names: tuple[str, ...]
+    joints: Mapping[str, Array]  # of each arm, indices of ``joint_names``
+    fingers: Mapping[str, tuple[str, ...]]  # of each arm, joints of its gripper
+
+    @classmethod
+    def of(cls, robot: Robot, config: Config) -> Self:
+        return cls(
+            config=config,
+            urdf=robot.urdf,
+            joint_names=robot.joint_names,
+            joints={arm: its.joints for arm, its in robot.arms.items()},
+            fingers={arm: its.finger_joints for arm, its in robot.arms.items()},
+        )
