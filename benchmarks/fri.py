@@ -68,22 +68,26 @@ class ToolWay:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        # Plain numbers: the garbage collector would go through a list of arrays, for more than 100 ms in mid-run.
-        self._ticks = array("d")
+        # Plain numbers: the garbage collector would go through a list of arrays, for more than 100 ms in mid-run. Where
+        # postures lead the tools is calculated after the run, of which it would be a twentieth.
+        self._postures, self._tools = array("d"), array("d")
 
     def __call__(self, tick: Tick) -> None:
         if all(tick.engaged.values()):
-            for arm in tick.tools:
-                self._ticks.extend(self._robot.tool_pose(tick.reference.q, arm).translation)
-            for pose in tick.tools.values():
-                self._ticks.extend(pose.translation)
+            self._postures.extend(tick.reference.q)
+            for arm in self._robot.arms:
+                self._tools.extend(tick.tools[arm].translation)
 
-    def error(self, delay: int) -> float:
-        """Of tools that are ``delay`` ticks behind, in the ticks in which a measurement was new [mm RMS]."""
-        led, measured = np.array(self._ticks).reshape(-1, 2, len(self._robot.arms), 3).swapaxes(0, 1)
-        is_new = (np.diff(measured, axis=0, prepend=np.inf) != 0.0).any(axis=2)[delay:]
-        apart = measured[delay:] - led[: len(led) - delay]
-        return float(1e3 * np.sqrt(np.square(apart[is_new]).sum(axis=1).mean()))
+    def errors(self, delays: range) -> list[float]:
+        """Of tools that are so many ticks behind, in the ticks in which a measurement was new [mm RMS]."""
+        postures = np.array(self._postures).reshape(-1, self._robot.model.nv)
+        led = np.array([[self._robot.tool_pose(q, arm).translation for arm in self._robot.arms] for q in postures])
+        measured = np.array(self._tools).reshape(led.shape)
+        is_new = (np.diff(measured, axis=0, prepend=np.inf) != 0.0).any(axis=2)
+        squares = (
+            np.square(measured[delay:] - led[: len(led) - delay]).sum(axis=2)[is_new[delay:]].mean() for delay in delays
+        )
+        return [float(1e3 * np.sqrt(square)) for square in squares]
 
 
 def measure_directly(mode: CommandMode, duration: float) -> tuple[float, dict[str, float | None]]:
@@ -93,7 +97,7 @@ def measure_directly(mode: CommandMode, duration: float) -> tuple[float, dict[st
     pipeline = Pipeline(config, robot, ScriptedInput("circle"), MujocoPlant(robot, config), mode)
     pipeline.listeners.append(way := ToolWay(robot))
     summary = pipeline.run(duration, realtime=False)
-    return way.error(0), {arm: figures.position_error_mm_rms for arm, figures in summary.arms.items()}
+    return way.errors(range(1))[0], {arm: figures.position_error_mm_rms for arm, figures in summary.arms.items()}
 
 
 def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) -> dict[str, Any]:
@@ -136,7 +140,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     arrived, took = np.array(plant.answers).T
     period = max(state.period for state in plant.states().values())
     late = [(came, came + its) for came, its in zip(arrived, took, strict=True) if its > period]
-    errors = [way.error(delay) for delay in range(round(_LONGEST_DELAY * config.loop_rate_hz))]
+    errors = way.errors(range(round(_LONGEST_DELAY * config.loop_rate_hz)))
     direct_error, direct_errors = measure_directly(mode, min(duration, 30.0))  # the circles repeat
     return {
         "delay_ms": 1e3 * int(np.argmin(errors)) / config.loop_rate_hz,
