@@ -46,11 +46,6 @@ NO_NUMBER = pin.SE3(np.eye(3), np.array([0.0, math.nan, 0.0]))
 
 
 @pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(CONFIG)
-
-
-@pytest.fixture(scope="module")
 def controller(robot: Robot) -> CartesianController:
     return CartesianController(robot)
 

@@ -59,11 +59,6 @@ class Standing:
         return self._q.copy(), np.zeros(len(self._q))
 
 
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(CONFIG)
-
-
 def test_figures_of_a_controller_that_stands_still_are_those_of_the_targets(robot: Robot) -> None:
     ends = round(SHORT.ends / DT)
     figures = run_motion(Standing(jerked=ends - 100, failing=ends - 50), robot, SHORT)

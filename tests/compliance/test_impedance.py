@@ -9,7 +9,6 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.compliance.impedance import ImpedanceController
-from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
@@ -19,11 +18,6 @@ from tests.support.torque_loop import reference
 DT = 0.001
 SETTINGS = ImpedanceSettings(torque_rate_limit=1000.0)  # 1 Nm a tick
 STRETCHED = np.zeros(14)
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
 
 
 def at(q: Array, v: Array | None = None) -> RobotState:

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-import pytest
 
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Reference
-from tests.support.processes import cell
 
 DT = 0.002
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(cell())
 
 
 def crossing(controller: CartesianController) -> dict[str, pin.SE3 | None]:

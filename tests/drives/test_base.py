@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.drives.base import FEEDBACK_GAIN, TorqueDrive, VelocityDrive
@@ -55,11 +54,6 @@ def test_the_feedback_is_bounded_and_left_out_where_the_state_is_not_trusted() -
 
 
 DT = 0.004
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(cell())
 
 
 def pulled(robot: Robot, has_servos: bool) -> tuple[TorqueDrive, Reference, RobotState]:

@@ -20,11 +20,6 @@ def config() -> Config:
 
 
 @pytest.fixture(scope="session")
-def robot(config: Config) -> Robot:
-    return Robot.from_config(config)
-
-
-@pytest.fixture(scope="session")
 def shared_plant(robot: Robot, config: Config) -> MujocoPlant:
     return MujocoPlant(robot, config)
 

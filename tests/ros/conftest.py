@@ -56,11 +56,6 @@ def precedence() -> None:
         Path("/proc/self/autogroup").write_text(str(_NICE))  # on Linux nice levels count within a session only
 
 
-@pytest.fixture(scope="session")
-def robot() -> Robot:
-    return Robot.from_config(load_config(CONFIG))
-
-
 @pytest.fixture(scope="session", autouse=True)
 def kernels(robot: Robot) -> None:
     """Compiled before any process is waited for: the first time that takes a minute or two."""

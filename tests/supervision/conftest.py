@@ -20,10 +20,5 @@ def unhurried(config: Config) -> ControllerSettings:
 
 
 @pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config(CONFIG))
-
-
-@pytest.fixture(scope="module")
 def controller(robot: Robot) -> CartesianController:
     return CartesianController(robot, unhurried(load_config(CONFIG)))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
@@ -22,11 +21,6 @@ SETTINGS = ControllerSettings()
 DT = 0.001
 JOINT = 2
 FASTEST = 5.69 * DT  # change of velocity of A3 of an iiwa 7 in a tick [rad/s]; others may do more
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
 
 
 @pytest.fixture(scope="module")

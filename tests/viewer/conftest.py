@@ -4,18 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-import pytest
 
-from q2r2_control.config.cell import load_config
 from q2r2_control.drives.base import position_command
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import RunStart, Tick
 from q2r2_control.types import ArmTarget, Reference, RobotState, StepReport, StepStatus
-
-
-@pytest.fixture(scope="session")
-def robot() -> Robot:
-    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
 
 
 def tick_at(robot: Robot, t: float, distance: float = 0.1, engaged: bool = True) -> Tick:
