@@ -14,17 +14,17 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.quaternions import Quaternion, Vector, normalized, product, rotation_of, turn_between, turned_by
+from q2r2_control.quaternions import Vector, floats_of, normalized, rotation_of, se3_of, turn_between, turned_by
 from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.types import ActionChunk, Array, Pose
 
 SILENT = 0.5  # without an action that counts, after which an arm rests [s]
 _FADING = 0.5, 2.0  # how fast the difference of two chunks fades, at most [m/s], [rad/s]
 _AHEAD = 10.0  # a chunk whose time is farther off is on another clock [s]
-_NONE: Vector = (0.0, 0.0, 0.0)
 
 
 class _Plan(NamedTuple):
@@ -195,35 +195,18 @@ def _pose(numbers: list[float]) -> Pose:
 
 def _added_up(motions: list[list[float]]) -> list[Pose]:
     """Poses that motions lead to, one after the other, in the frame of where they begin."""
-    position, rotation = _NONE, (0.0, 0.0, 0.0, 1.0)
-    poses = [(position, rotation)]
+    at = pin.SE3.Identity()
+    poses = [floats_of(at)]
     for x, y, z, a, b, c in motions:
-        position = _added(position, _turned(rotation, (x, y, z)))
-        rotation = normalized(product(rotation, rotation_of((a, b, c))))
-        poses.append((position, rotation))
+        at = at * se3_of(((x, y, z), rotation_of((a, b, c))))
+        poses.append(floats_of(at))
     return poses
 
 
 def _moved_to(place: Pose, origin: Pose, poses: list[Pose]) -> list[Pose]:
     """The same motion as that of ``poses``, with ``origin`` at ``place``."""
-    turn = product(place[1], _inverse(origin[1]))
-    x, y, z = _turned(turn, origin[0])
-    shift = place[0][0] - x, place[0][1] - y, place[0][2] - z
-    return [(_added(shift, _turned(turn, position)), product(turn, rotation)) for position, rotation in poses]
-
-
-def _inverse(rotation: Quaternion) -> Quaternion:
-    x, y, z, w = rotation
-    return -x, -y, -z, w
-
-
-def _turned(rotation: Quaternion, vector: Vector) -> Vector:
-    x, y, z, _ = product(product(rotation, (*vector, 0.0)), _inverse(rotation))
-    return x, y, z
-
-
-def _added(one: Vector, other: Vector) -> Vector:
-    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
+    move = se3_of(place) * se3_of(origin).inverse()
+    return [floats_of(move * se3_of(pose)) for pose in poses]
 
 
 def _place(times: list[float], t: float) -> tuple[int, float]:
