@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children
 
 from q2r2_control.config.cell import Config
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, held_to_promises, tasks_named, with_controls
@@ -16,6 +14,7 @@ from q2r2_control.errors import PlantError
 from q2r2_control.inputs.scripted import ScriptedInput, hurried, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.process.pools import pool_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 
@@ -51,9 +50,7 @@ def try_tasks(
     """Try each task by itself ``seeds`` times, in as many processes as there are processors."""
     jobs = [(task.name, seed) for task in tasks for seed in range(seeds)]
     failures: dict[str, dict[int, str]] = {task.name: {} for task in tasks}
-    ignored = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, and this one ends the others
-    workers = min(os.cpu_count() or 1, len(jobs))
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=signal.signal, initargs=ignored)
+    pool = pool_of(min(os.cpu_count() or 1, len(jobs)))
     try:
         for (task, seed), failure in zip(jobs, pool.map(partial(try_task, config, mode, shaky), jobs), strict=True):
             if failure:

@@ -6,13 +6,10 @@ import hashlib
 import json
 import os
 import shutil
-import signal
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +17,7 @@ import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.sampling import CameraFrames, Names, Vectors, features, sample
+from q2r2_control.process.pools import pool_of
 from q2r2_control.recording.reader import WHOLE, EpisodeSpan, read_spans
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
@@ -150,9 +148,7 @@ def _results(jobs: Sequence[_Job], workers: int) -> Generator[str | None]:
     if workers <= 1:
         yield from map(_keep, jobs)
         return
-    # Spawned, not forked: this process may have threads. Ctrl-C reaches all of them, and this process ends the others.
-    ignored = (signal.SIGINT, signal.SIG_IGN)
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=signal.signal, initargs=ignored)
+    pool = pool_of(workers)
     try:
         yield from pool.map(_keep, jobs)
     except (BrokenProcessPool, OSError) as error:  # OSError: of a pool that breaks while it is given its jobs

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -29,26 +30,42 @@ def test_every_seed_is_tried_and_those_that_fail_say_why() -> None:
     assert "flat_block: held 95 mm up for 0.0 s" in try_task(moved, CommandMode.POSITION, False, ("grasp", 0))
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_ctrl_c_does_not_wait_for_trials() -> None:
+@pytest.fixture
+def demo() -> Iterator[subprocess.Popen[str]]:
+    """A demo that tries a task twice."""
+    if sys.platform != "linux":
+        pytest.skip("looks into /proc")
     command = (sys.executable, "-m", "q2r2_control", "demo", "grasp", "--seeds", "2")
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-    def trying() -> list[int]:
-        its = {pid: Path(f"/proc/{pid}") for pid in children(demo.pid)}
-        workers = {pid: folder for pid, folder in its.items() if b"spawn_main" in (folder / "cmdline").read_bytes()}
-        return [pid for pid, folder in workers.items() if "libmujoco" in (folder / "maps").read_text()]
-
     try:
-        wait_until(trying)
-        trial = trying()[0]
-        os.kill(trial, signal.SIGSTOP)  # it never ends
-        demo.send_signal(signal.SIGINT)
-        wait_until(lambda: not alive(trial))
-        assert demo.wait() == 130
-        assert "Traceback" not in demo.communicate()[1]
+        yield demo
     finally:
         demo.kill()
+        demo.wait()
+
+
+def trials_of(demo: subprocess.Popen[str]) -> list[int]:
+    """Its processes that have begun a trial."""
+    its = {pid: Path(f"/proc/{pid}") for pid in children(demo.pid)}
+    workers = {pid: folder for pid, folder in its.items() if b"spawn_main" in (folder / "cmdline").read_bytes()}
+    return [pid for pid, folder in workers.items() if "libmujoco" in (folder / "maps").read_text()]
+
+
+def test_ctrl_c_does_not_wait_for_trials(demo: subprocess.Popen[str]) -> None:
+    wait_until(lambda: trials_of(demo))
+    trial = trials_of(demo)[0]
+    os.kill(trial, signal.SIGSTOP)  # it never ends
+    demo.send_signal(signal.SIGINT)
+    wait_until(lambda: not alive(trial))
+    assert demo.wait() == 130
+    assert "Traceback" not in demo.communicate()[1]
+
+
+def test_trials_end_with_a_demo_that_is_killed(demo: subprocess.Popen[str]) -> None:
+    wait_until(lambda: len(trials_of(demo)) == min(2, os.cpu_count() or 1))
+    trials = trials_of(demo)
+    demo.kill()
+    wait_until(lambda: not any(alive(trial) for trial in trials))
 
 
 @pytest.mark.parametrize(("failed", "reliable"), [(0, True), (1, True), (2, False)])
