@@ -26,6 +26,8 @@ from q2r2_control.wording import sentence
 
 Tip = Annotated[tuple[float, float, float], Option(help="Of either tool, where both touch, in its frame [m].")]
 _FEWEST = 3  # points
+_MOST_APART = 5.0  # tips that touch the same point, after the fit [mm]
+_BEYOND = 0.1  # a joint that is measured farther beyond its limits was not written in radians [rad]
 _STILL, _LISTENS = 2e-3, 0.5  # joints at rest move less than this [rad] for so long [s]
 
 
@@ -39,15 +41,22 @@ class MountReport:
     turned_deg: float
     off_mm: list[float]  # of each point
 
+    @property
+    def fault(self) -> str | None:
+        """Why this is no mount to use."""
+        if (worst := max(self.off_mm)) <= _MOST_APART:
+            return None
+        cure = "see to --tip, and touch points that do not move"
+        return f"the tips are {worst:.1f} mm apart; allowed: {_MOST_APART:g} mm; {cure}"
+
     def table(self) -> Table:
-        """How far the tips are apart, and the lines for the YAML."""
+        """How far the tips are apart, and the lines for the YAML where they fit."""
         rows = [(f"point {number}", off) for number, off in enumerate(self.off_mm, 1)]
         notes = [
-            f"the right arm's base is {self.moved_mm:.1f} mm and {self.turned_deg:.2f} deg from where the cell has it",
-            "arms.right.mount:",
-            f"  position: {self.position}",
-            f"  rpy: {self.rpy}",
+            f"the right arm's base is {self.moved_mm:.1f} mm and {self.turned_deg:.2f} deg from where the cell has it"
         ]
+        if self.fault is None:
+            notes += ["arms.right.mount:", f"  position: {self.position}", f"  rpy: {self.rpy}"]
         table = figure_table("tips, after the fit", ("", "apart [mm]"), rows, notes)
         table.min_width = max(map(len, notes))  # lines to paste stay lines
         return table
@@ -95,9 +104,12 @@ def mounts(
             raise ConfigError("--points: allowed without --postures, whose file has a line a point")
         touched = _written(postures, robot)
         tips = [np.array([robot.tool_pose(q, arm).act(np.array(tip)) for q in touched]) for arm in SIDES]
-        report = mount_report(cell, *tips)
-        print_report(asdict(report), (report.table(),), json)
+        _print(mount_report(cell, *tips), json)
         return
+    if not cell.fri:
+        raise ConfigError(
+            f"{config}: fri: missing; allowed: each arm's cabinet, as {{port: 30200}}, or --postures FILE"
+        )
     plant = FriPlant(robot, cell)
     plant.begin(CommandMode.POSITION)
     say("waits for the cabinets", console)
@@ -106,7 +118,14 @@ def mounts(
         report = measure_mount(plant, cell, robot, points or _FEWEST, np.array(tip), console)
     finally:
         plant.close()
+    _print(report, json)
+
+
+def _print(report: MountReport, json: bool) -> None:
+    """Raises :class:`PlantError` where the tips did not touch the same points."""
     print_report(asdict(report), (report.table(),), json)
+    if report.fault is not None:
+        raise PlantError(report.fault)
 
 
 def measure_mount(
@@ -134,6 +153,13 @@ def _written(file: Path, robot: Robot) -> Array:
         raise ConfigError(f"--postures {file}: allowed: {allowed}")
     if len(values) < _FEWEST:
         raise ConfigError(f"--postures {file}: {len(values)} points; allowed: {_FEWEST} or more")
+    beyond = np.maximum(robot.position_lower[joints] - values, values - robot.position_upper[joints])
+    point, worst = np.unravel_index(beyond.argmax(), beyond.shape)
+    if beyond[point, worst] > _BEYOND:
+        joint = joints[worst]
+        limits = f"{robot.position_lower[joint]:.2f} .. {robot.position_upper[joint]:.2f} rad"
+        value = f"{robot.joint_names[joint]} = {values[point, worst]:g}"
+        raise ConfigError(f"--postures {file}: point {point + 1}: {value}; allowed: {limits}")
     postures = np.zeros((len(values), robot.model.nv))
     postures[:, joints] = values
     return postures

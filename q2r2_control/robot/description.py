@@ -102,8 +102,9 @@ def _shipped_model(model: str) -> Path:
             raise
         if model.endswith(MJCF_ENDS):
             raise ConfigError("a cell has no MJCF; q2r2 new-cell writes a .urdf of it") from None
-        kinds = f"a name in robots/, a path that ends in .urdf or .xacro, or {EXAMPLE_ROBOT_DATA}NAME"
-        raise ConfigError(f"neither a name nor a model's file; allowed: {kinds}") from None
+        kinds = f"a name in robots/, a path or package:// that ends in .urdf or .xacro, or {EXAMPLE_ROBOT_DATA}NAME"
+        mjcf = f"q2r2 new-cell takes {' and '.join(MJCF_ENDS)} too"
+        raise ConfigError(f"neither a name nor a model's file; allowed: {kinds}; {mjcf}") from None
 
 
 def parse_urdf(

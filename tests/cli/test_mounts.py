@@ -66,6 +66,7 @@ def test_written_postures_give_the_mount_of_arms_without_cabinets(tmp_path: Path
         (2 * (12 * "0 " + "\n"), "2 points; allowed: 3 or more"),
         ("", "allowed: lines of 12 numbers"),
         (3 * (12 * "0 " + "\n"), "the points are 0 mm about a line"),
+        (2 * (12 * "0 " + "\n") + "45 " + 11 * "0 ", "point 3: left_shoulder_pan_joint = 45; allowed: -"),
     ],
 )
 def test_postures_that_tell_nothing_are_refused(tmp_path: Path, text: str, says: str) -> None:
@@ -75,6 +76,25 @@ def test_postures_that_tell_nothing_are_refused(tmp_path: Path, text: str, says:
     assert done.exit_code == 2
     assert says in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_tips_that_did_not_touch_the_same_points_give_no_mount(tmp_path: Path) -> None:
+    file = tmp_path / "touched.txt"
+    file.write_text(
+        "0.0 -1.2 1.5 0.0 0.3 0 0.0 -1.4 1.2 0.0 0.9 0\n"
+        "1.0 -0.4 1.0 0.0 0.3 0 0.6 -1.9 1.2 0.0 0.9 0\n"
+        "-0.8 -1.6 0.5 0.0 0.3 0 0.3 -0.7 0.4 0.0 0.9 0\n"
+    )
+    done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", str(file))
+    assert done.exit_code == 2
+    assert "mm apart; allowed: 5 mm; see to --tip" in done.stderr
+    assert "position:" not in done.stdout
+
+
+def test_arms_without_cabinets_are_told_of_the_file() -> None:
+    done = q2r2("mounts", "config/dual_ur5.yaml")
+    assert done.exit_code == 2
+    assert "fri: missing; allowed: each arm's cabinet, as {port: 30200}, or --postures FILE" in done.stderr
 
 
 def test_a_count_of_points_beside_a_file_of_them_is_refused(tmp_path: Path) -> None:
