@@ -82,7 +82,7 @@ class ToolWay:
         """Of tools that are so many ticks behind, in the ticks in which a measurement was new [mm RMS]."""
         postures = np.array(self._postures).reshape(-1, self._robot.model.nv)
         led = np.array([[self._robot.tool_pose(q, arm).translation for arm in self._robot.arms] for q in postures])
-        measured = np.array(self._tools).reshape(led.shape)
+        led, measured = (np.array(places).reshape(-1, len(self._robot.arms), 3) for places in (led, self._tools))
         is_new = (np.diff(measured, axis=0, prepend=np.inf) != 0.0).any(axis=2)
         squares = (
             np.square(measured[delay:] - led[: len(led) - delay]).sum(axis=2)[is_new[delay:]].mean() for delay in delays
