@@ -71,10 +71,14 @@ class ArmSession:
 
     def is_still(self, now: float) -> bool:
         """Whether nothing moves the arm at ``now`` [s] if no more commands come."""
-        if not self.state.following or self.state.is_silent(now):
+        if not self._begun or self.state.is_silent(now):
             return True
         if self.state.wanted is CommandKind.TORQUE:
-            return now - self._tau_came > _TORQUE_GONE
+            return not self.state.following or now - self._tau_came > _TORQUE_GONE
+        return self._rests()
+
+    def _rests(self) -> bool:
+        """Whether the newest answer is where the path ends."""
         return bool(np.abs(self.path.at(self.state.answered) - self.path.rest).max() <= _AT_REST)
 
     def has_passed(self, command: ArmCommand) -> bool:
@@ -100,6 +104,8 @@ class ArmSession:
         """Whether the reference was at rest a tick ago, where the arm is."""
         state, step = self.state, command.end - command.start
         torques = state.wanted is CommandKind.TORQUE and state.newest
+        if not torques and not self._rests():
+            return False
         there, allowed = (torques.q, _NEAR) if torques else (self.path.rest, _SAME)
         way, speed = np.abs(np.subtract(command.q, there)), np.abs(command.v)
         return bool((speed <= _FROM_REST * step).all() and (way <= speed * step + allowed).all())
@@ -141,7 +147,10 @@ class ArmSession:
         state.problem = None
         if before is None or state.is_silent(now):
             passed = 0
-            self._begin_anew()
+            if message.session is Session.COMMANDING_ACTIVE and self._begun:
+                self._cease()  # a session that lasts brakes on its path: to begin anew would stop the arm at once
+            else:
+                self._begin_anew()
         else:
             passed = _ahead(message, before)
             if -_RESTARTED < passed < 0:

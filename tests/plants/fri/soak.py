@@ -37,8 +37,9 @@ class Rest(NamedTuple):
 
 # Torques settle arms on their springs. The slowest has a time constant of 0.4 s; a held joint may creep.
 _RESTS = {CommandMode.POSITION: Rest(0.0, _STILL, 0.0, _STILL), CommandMode.TORQUE: Rest(0.35, 0.2, 1.95, 0.02)}
-_ENDS = ("pendant", "back at once", "safety stop", "loop freezes", "computer freezes", "garbage")
+_ENDS = ("pendant", "back at once", "safety stop", "loop freezes", "computer freezes", "cabinet freezes", "garbage")
 _ASKED = {Trip.STOPPED, Trip.SAFETY}
+_SILENT = 0.1  # until a cabinet that says nothing is missed [s]
 _MUTATED = 250  # datagrams with wrong bytes before a session ends so
 
 
@@ -177,7 +178,8 @@ class Soak:
         if self.ended >= self.sessions:
             self.pipeline.stop()
         self._end = str(self.random.choice(_ENDS))
-        cabinet = self.plant.cabinets[str(self.random.choice(SIDES))]
+        arm = str(self.random.choice(SIDES))
+        cabinet = self.plant.cabinets[arm]
         pause = float(self.random.uniform(0.02, 0.5))
         if self._end in ("pendant", "back at once"):
             cabinet.stop()
@@ -192,6 +194,9 @@ class Soak:
             self.pipeline.freeze(pause)
             self.plant.asleep_until = now + pause
             now += pause
+        elif self._end == "cabinet freezes":  # its session lasts; its arm goes on until where the silence was noticed
+            self.plant.stands_until[arm] = now + _SILENT + pause
+            now += pause + 3.0 * _SILENT  # and may become faster in that time
         else:
             self._send_garbage()
             cabinet.stop()

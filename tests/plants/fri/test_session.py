@@ -35,9 +35,11 @@ class Cabinet:
     def __init__(self, session: ArmSession | None = None) -> None:
         self.session, self.sent, self.heard = session or ArmSession("left", "cabinet"), 0, 0
 
+        self.silence = 0.0  # so far [s]
+
     @property
     def now(self) -> float:
-        return 0.005 * self.sent
+        return 0.005 * self.sent + self.silence
 
     def ask(self, message: Monitoring, lost: bool = False) -> FriCommand | None:
         """``lost``: the answer, which the cabinet does not hear."""
@@ -247,6 +249,36 @@ def test_an_arm_that_begins_to_move_while_no_answer_is_heard_begins_from_rest() 
     assert cabinet.session.state.answered > begun + 0.05
     accelerations = np.diff(followed, n=2, axis=0) / 0.005**2
     assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 * a + CATCH_UP_RAMP * a * 0.15
+
+
+def test_an_arm_whose_cabinet_was_silent_in_mid_motion_brakes_as_was_certified_and_follows_from_rest_only() -> None:
+    cabinet, ones, still = Cabinet(), (1.0,) * 7, (0.0,) * 7
+    cabinet.ask(WAITING)
+    cabinet.ask(ACTIVE)
+    followed = []
+    for tick in range(1, 121):  # a reference that leaves IPO at 1 rad/s^2 for 100 ms, of which nothing is heard then
+        t, start = 0.005 * tick, cabinet.now - 0.002
+        if tick <= 20:
+            there = tuple(q + 0.5 * t**2 for q in IPO)
+            cabinet.session.follow(ArmCommand(cabinet.now, start, start + 0.005, there, (t,) * 7, ones))
+        elif tick == 21:
+            assert cabinet.session.state.following
+            cabinet.silence = 0.15
+        else:  # another reference begins where this one is going to rest
+            rest = cabinet.session.state.rest
+            cabinet.session.follow(ArmCommand(cabinet.now, start, start + 0.005, rest, still, ones))
+        answer = cabinet.ask(ACTIVE)
+        assert answer is not None
+        assert answer.q is not None
+        followed.append(answer.q)
+        if tick == 21:
+            assert not cabinet.session.state.following
+            assert not cabinet.session.is_still(cabinet.now)
+    accelerations = np.diff(followed, n=2, axis=0) / 0.005**2
+    assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 + CATCH_UP_RAMP * 0.1
+    np.testing.assert_allclose(followed[-1], cabinet.session.state.rest, atol=1e-9)
+    assert cabinet.session.state.following
+    assert cabinet.session.state.ended == 1
 
 
 def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> None:

@@ -58,6 +58,7 @@ class VirtualCabinets:
         self._rates = dict(zip(settings, rates, strict=True))
         self.on_message: Callable[[str, float], None] = lambda arm, t: None
         self.asleep_until = -1.0  # nothing of this computer's is done before [s]
+        self.stands_until = dict.fromkeys(self.cabinets, -1.0)  # a cabinet does nothing before [s]
         self.thinking = 0.0  # time that passes between the beginning of a tick and its command [s]
         self._mode = CommandMode.POSITION
 
@@ -133,6 +134,9 @@ class VirtualCabinets:
 
     def _send(self, arm: str) -> None:
         cabinet = self.cabinets[arm]
+        if self.now < self.stands_until[arm]:
+            self._at(self.stands_until[arm], self._send, arm)
+            return
         if self._simulation is not None:
             self._simulation.advance(self.now - _BEGIN)
             if arm in self._grippers:
