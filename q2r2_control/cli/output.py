@@ -134,7 +134,8 @@ def _rows(summary: RunSummary) -> Iterator[tuple[str, str]]:
     uncertified = f"[red]{uncertified}[/]" if summary.uncertified_ticks else uncertified
     yield "certified stops executed", f"{summary.fallback_ticks} ticks; {uncertified}"
     yield "targets rejected", str(summary.rejected_targets)
-    yield "ticks missed", f"{summary.missed_ticks}, which made the motion {summary.stretched_s:.2f} s late in all"
+    if summary.missed_ticks:
+        yield "ticks missed", f"{summary.missed_ticks}, which made the motion {summary.stretched_s:.2f} s late in all"
     # The last event of each arm, if something else than its button paused it, or kept it from being engaged.
     between = (ArmState.PAUSING, ArmState.ALIGNING)
     last = {event.arm: event for event in summary.events if event.destination not in between}

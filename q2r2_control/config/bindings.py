@@ -52,7 +52,7 @@ class Gesture(StrEnum):
 # Texts of each action for the operator.
 MEANINGS: dict[str, str] = {
     Action.PAUSE_TOGGLE: "engages the arm where it is, or pauses it",
-    Action.GRIPPER_TOGGLE: "closes the gripper, or opens it",
+    Action.GRIPPER_TOGGLE: "closes the gripper, or opens it, where the arm has one",
     Action.HOME: "brings both arms home; any press on the way stops them",
     Action.STOP: "stops both arms until it is done once more",
     Action.CARRY: "lets this hand move both tools as one body, or ends that",
@@ -65,7 +65,7 @@ MEANINGS: dict[str, str] = {
     Action.PRECISION: "held: motion is scaled by precision_scale",
     Action.ROTATION_LOCK: "held: the tool keeps its orientation",
     Action.TRANSLATION_LOCK: "held: the tool keeps its position",
-    Action.GRIPPER_ANALOG: "closes the gripper as far as it is pressed",
+    Action.GRIPPER_ANALOG: "closes the gripper, where the arm has one, as far as it is pressed",
 }
 # Fields of the settings, which name the controls as an operator does.
 BUTTONS = ("lower", "upper")
