@@ -75,11 +75,11 @@ class ArmSession:
             return True
         if self.state.wanted is CommandKind.TORQUE:
             return not self.state.following or now - self._tau_came > _TORQUE_GONE
-        return self._rests()
+        return self._rests(self.state.answered)
 
-    def _rests(self) -> bool:
-        """Whether the newest answer is where the path ends."""
-        return bool(np.abs(self.path.at(self.state.answered) - self.path.rest).max() <= _AT_REST)
+    def _rests(self, t: float) -> bool:
+        """Whether the path has come to its end at ``t`` [s]."""
+        return bool(np.abs(self.path.at(t) - self.path.rest).max() <= _AT_REST)
 
     def has_passed(self, command: ArmCommand) -> bool:
         """Whether an answer was for a time of the command's already, and followed the stop before it."""
@@ -104,7 +104,7 @@ class ArmSession:
         """Whether the reference was at rest a tick ago, where the arm is."""
         state, step = self.state, command.end - command.start
         torques = state.wanted is CommandKind.TORQUE and state.newest
-        if not torques and not self._rests():
+        if not torques and not self._rests(state.answered):
             return False
         there, allowed = (torques.q, _NEAR) if torques else (self.path.rest, _SAME)
         way, speed = np.abs(np.subtract(command.q, there)), np.abs(command.v)
@@ -207,8 +207,7 @@ class ArmSession:
         question = message.counter, self._clock.expected, counter, message.reflected
         time, state = self._times.at(*question), self.state
         wanted = self._clock.expected - DELAY
-        there = self.path.at(min(time, wanted))
-        if abs(wanted - time) > message.period and np.abs(there - self.path.rest).max() <= _AT_REST:
+        if abs(wanted - time) > message.period and self._rests(min(time, wanted)):
             self._times.restart()  # where nothing moves, and nothing is known that will, an answer may be for any time
             time = self._times.at(*question)
         state.answered, state.lag = max(state.answered, time), now - DELAY - time
