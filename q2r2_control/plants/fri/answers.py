@@ -38,6 +38,7 @@ class _Move(NamedTuple):
     end: float
     q: tuple[Array, Array]  # [rad]
     v: tuple[Array, Array]  # [rad/s]
+    deceleration: Array  # of the certified stop from its end [rad/s^2]
 
     def at(self, t: float) -> tuple[Array, Array]:
         """Posture and velocity by the cubic through both ends: with a constant acceleration it is that parabola."""
@@ -92,14 +93,24 @@ class ReferencePath:
         stop, start = self._stop, max(start, self._stop.start)
         there, speed = stop.at(start)
         followed = (stop,) if start > stop.start else ()
-        self._pieces = (*self._pieces[-_PIECES:], *followed, _Move(start, t, (there, q), (speed, v)))
+        self._pieces = (*self._pieces[-_PIECES:], *followed, _Move(start, t, (there, q), (speed, v), deceleration))
         self._stop = _Stop(t, q, v, deceleration)
+
+    def brake(self, t: float) -> None:
+        """Let the certified stop begin at ``t`` [s] already."""
+        piece = self._piece(t)
+        if piece is not self._stop:
+            self._pieces = tuple(before for before in self._pieces if before.start < t)
+            self._stop = _Stop(t, *piece.at(t), piece.deceleration)
 
     def at(self, t: float) -> Array:
         """Posture (n,) [rad] at ``t`` [s]."""
+        return self._piece(t).at(t)[0]
+
+    def _piece(self, t: float) -> _Move | _Stop:
         if t >= self._stop.start or not self._pieces:
-            return self._stop.at(t)[0]
-        return self._pieces[max(bisect_right(self._pieces, t, key=_start) - 1, 0)].at(t)[0]
+            return self._stop
+        return self._pieces[max(bisect_right(self._pieces, t, key=_start) - 1, 0)]
 
 
 class _Answer(NamedTuple):

@@ -88,6 +88,8 @@ class ArmSession:
     def follow(self, command: ArmCommand) -> None:
         """Take a tick's command, which no answer has passed."""
         state = self.state
+        if state.is_silent(command.now):
+            self._brake()
         if not state.following and self._begins(command):
             state.following = state.fault(command.now) is None
             self.path = ReferencePath(command.start, self.path.rest)
@@ -120,8 +122,6 @@ class ArmSession:
             return None
         if not self._take(message, now) or message.counter % message.multiplier:
             return None
-        if message.session is Session.IDLE:
-            return None
         command = self._command(message, now)
         if command is None:
             return None
@@ -147,8 +147,8 @@ class ArmSession:
         state.problem = None
         if before is None or state.is_silent(now):
             passed = 0
-            if message.session is Session.COMMANDING_ACTIVE and self._begun:
-                self._cease()  # a session that lasts brakes on its path: to begin anew would stop the arm at once
+            if before is not None and self._lasts(message, before):
+                self._brake()  # to begin anew would stop the arm at once
             else:
                 self._begin_anew()
         else:
@@ -177,6 +177,20 @@ class ArmSession:
         state.newest, state.arrival = message, now
         return True
 
+    def _lasts(self, message: Monitoring, before: Monitoring) -> bool:
+        """Whether the session before a silence goes on after it."""
+        active = Session.COMMANDING_ACTIVE
+        same = message.version == before.version and message.session is before.session is active
+        return self._begun and same and _ahead(message, before) > 0
+
+    def _brake(self) -> None:
+        """The cabinet is silent: the arm follows no more, and brakes from where the newest answer led it."""
+        if self.state.following:
+            self._cease()
+            if self.state.wanted is CommandKind.POSITION:
+                self.path.brake(self.state.answered)
+                self.state.rest = joints_of(self.path.rest)
+
     def _begin_anew(self) -> None:
         """The arm is where its cabinet says next."""
         self._cease()
@@ -191,6 +205,8 @@ class ArmSession:
         counter, reflected = self._answers, message.counter
         if message.session < Session.COMMANDING_WAIT:
             self._begin_anew()
+            if message.session is Session.IDLE:
+                return None
             mirrored = message.commanded_q or message.q  # which FRI 1 expects, and FRI 2 does without
             return FriCommand(counter, reflected, mirrored if message.version == 1 else None, io=self._outputs)
         if self._times is None:

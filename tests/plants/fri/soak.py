@@ -194,9 +194,8 @@ class Soak:
             self.pipeline.freeze(pause)
             self.plant.asleep_until = now + pause
             now += pause
-        elif self._end == "cabinet freezes":  # its session lasts; its arm goes on until where the silence was noticed
-            self.plant.stands_until[arm] = now + _SILENT + pause
-            now += pause + 3.0 * _SILENT  # and may become faster in that time
+        elif self._end == "cabinet freezes":  # its session lasts, and its arm goes on to rest then
+            self.plant.stands_until[arm] = now = now + _SILENT + 4.0 * pause
         else:
             self._send_garbage()
             cabinet.stop()
