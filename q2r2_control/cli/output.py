@@ -26,7 +26,8 @@ from q2r2_control.teleop.arm_states import ArmState, is_fault
 from q2r2_control.viewer.tables import figure_table, print_table
 from q2r2_control.wording import sentence
 
-_LATE = 2e4  # a loop that was late by more may be why a task failed [us]
+# A loop that was late by more [us], or by over a period in a larger share of its ticks, may be why a task failed.
+_LATE, _OFTEN = 2e4, 0.2
 _COMPILING = "compiling the controller for this machine, once for each version of its code; 1-2 minutes"
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
@@ -171,10 +172,11 @@ def task_line(task: TaskResult) -> str:
 
 def late_line(summary: RunSummary, tasks: Iterable[TaskResult]) -> str | None:
     """One line of markup where a task failed in a run whose loop was late; else None."""
-    late = summary.lateness_us.max
-    if late is None or late < _LATE or all(task.succeeded for task in tasks):
+    late, often = summary.lateness_us.max, summary.overruns > _OFTEN * summary.ticks
+    if late is None or not (late >= _LATE or often) or all(task.succeeded for task in tasks):
         return None
-    return f"[yellow]the loop was late by up to {1e-3 * late:.0f} ms[/]: this computer is too busy or slow to judge by"
+    line = f"the loop was late by up to {1e-3 * late:.0f} ms, in {summary.overruns} ticks by more than a period"
+    return f"[yellow]{line}[/]: this computer is too busy or slow to judge by"
 
 
 def recording_line(recording: RecordingSummary) -> str:

@@ -101,6 +101,11 @@ def test_a_failed_task_is_told_with_how_late_the_loop_was(summary: RunSummary) -
     assert "late by up to 239 ms" in line
     assert late_line(late, [done]) is None
     assert late_line(replace(summary, lateness_us=Percentiles(60.0, 310.0, 900.0)), [failed]) is None
+    seldom = replace(late, lateness_us=Percentiles(2400.0, 8100.0, 12_000.0), ticks=1000, overruns=100)
+    assert late_line(seldom, [failed]) is None
+    often = late_line(replace(seldom, overruns=600), [failed])
+    assert often is not None
+    assert "late by up to 12 ms, in 600 ticks by more than a period" in often
     assert late_line(summary, [failed]) is None, "simulated time is never late"
 
 
