@@ -135,14 +135,15 @@ class Soak:
         speed = float(np.abs(tick.reference.v).max())
         self.moved = max(self.moved, speed)
         held = not any(tick.engaged.values())
+        # Springs, or one arm that stopped sooner, may have left them beyond a limit, from where the reference returns.
+        returns = tick.reference.report.status is StepStatus.RECOVERING
+        still = self.pipeline.controller.settings.recovery_velocity if returns else _STILL
         if now > self._braked_by:
             self._braked_by = math.inf
-            # Springs may have left a joint a little beyond its soft limit, from where the reference returns.
-            returns = tick.reference.report.status is StepStatus.RECOVERING
-            if held and speed > (self.pipeline.controller.settings.recovery_velocity if returns else _STILL):
+            if held and speed > still:
                 self.faults.append(f"{now:.3f} s, {self._end}: the reference moves at {speed:.4f} rad/s")
         if now > self._slow_by:
-            self._look_at_rest(now, held)
+            self._look_at_rest(now, held, still)
         if now >= self._start_at:
             self._start_at, self._moving_since = math.inf, None
             for cabinet in cabinets.values():
@@ -154,11 +155,11 @@ class Soak:
             self._moving_since = None
             self._end_session(now, tick)
 
-    def _look_at_rest(self, now: float, held: bool) -> None:
+    def _look_at_rest(self, now: float, held: bool, still: float) -> None:
         """Wait until the arms have settled, or move faster than they may by now."""
         rest, passed = self._rest, now - self._slow_by + self._rest.slow_after
         settled = passed >= rest.settled_after
-        allowed = rest.settled if settled else rest.slow
+        allowed = max(rest.settled if settled else rest.slow, still)
         speeds = {arm: self._fastest(arm) for arm in self.plant.cabinets} if held else {}
         for arm, fastest in speeds.items():
             if fastest > allowed:
