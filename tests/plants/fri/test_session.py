@@ -11,46 +11,9 @@ from q2r2_control.events import ReasonKind
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
 from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand
-from q2r2_control.plants.fri.wire import (
-    CommandKind,
-    FriCommand,
-    Monitoring,
-    Quality,
-    Session,
-    read_command,
-    write_monitoring,
-)
+from q2r2_control.plants.fri.wire import CommandKind, FriCommand, Monitoring, Session, write_monitoring
 from q2r2_control.wording import sentence
-
-Q = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
-IPO = (0.0, 0.501, 0.0, -1.2, 0.0, 1.0, 0.0)
-MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.005, 1, Q)
-WAITING = replace(MONITORING, session=Session.COMMANDING_WAIT, command=CommandKind.POSITION, ipo_q=IPO)
-ACTIVE = replace(WAITING, session=Session.COMMANDING_ACTIVE)
-
-
-class Cabinet:
-    """Sends messages 5 ms apart to a session, and reads the answers."""
-
-    def __init__(self, session: ArmSession | None = None) -> None:
-        self.session, self.sent, self.heard = session or ArmSession("left", "cabinet"), 0, 0
-
-        self.silence = 0.0  # so far [s]
-
-    @property
-    def now(self) -> float:
-        return 0.005 * self.sent + self.silence
-
-    def ask(self, message: Monitoring, lost: bool = False) -> FriCommand | None:
-        """``lost``: the answer, which the cabinet does not hear."""
-        self.sent += 1
-        message = replace(message, counter=self.sent, reflected=self.heard)
-        answer = self.session.answer(write_monitoring(message), self.now)
-        if answer is None:
-            return None
-        command = read_command(answer)[1]
-        self.heard = self.heard if lost else command.counter
-        return command
+from tests.plants.fri.asking_cabinet import ACTIVE, IPO, MONITORING, WAITING, Cabinet, Q
 
 
 def test_an_idle_cabinet_gets_no_answer_and_one_that_monitors_gets_no_position() -> None:
@@ -64,17 +27,6 @@ def test_fri_1_gets_the_commanded_position_mirrored() -> None:
     answer = cabinet.ask(replace(MONITORING, version=1, commanded_q=IPO))
     assert answer is not None
     assert answer.q == IPO
-
-
-def test_an_arm_whose_cabinet_becomes_idle_in_mid_motion_is_moved_by_nothing_any_more() -> None:
-    cabinet = Cabinet()
-    cabinet.ask(WAITING)
-    cabinet.ask(ACTIVE)
-    now, ones = cabinet.now, (1.0,) * 7
-    cabinet.session.follow(ArmCommand(now, now - 0.002, now + 0.003, IPO, (0.005,) * 7, ones))
-    assert not cabinet.session.is_still(now)
-    assert cabinet.ask(replace(MONITORING, session=Session.IDLE)) is None
-    assert cabinet.session.is_still(cabinet.now)
 
 
 @pytest.mark.parametrize("message", [WAITING, ACTIVE])
@@ -260,73 +212,6 @@ def test_an_arm_that_begins_to_move_while_no_answer_is_heard_begins_from_rest() 
     assert cabinet.session.state.answered > begun + 0.05
     accelerations = np.diff(followed, n=2, axis=0) / 0.005**2
     assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 * a + CATCH_UP_RAMP * a * 0.15
-
-
-@pytest.mark.parametrize("silence", [0.15, 6.0])
-@pytest.mark.parametrize("loop", ["goes on", "stands still"])
-def test_an_arm_whose_cabinet_was_silent_in_mid_motion_brakes_as_was_certified_and_follows_from_rest_only(
-    silence: float, loop: str
-) -> None:
-    cabinet, ones, still = Cabinet(), (1.0,) * 7, (0.0,) * 7
-    session, followed = cabinet.session, list[tuple[float, ...]]()
-
-    def command(way: float, speed: float) -> None:
-        there, end = tuple(q + way for q in IPO), cabinet.now + 0.003
-        session.follow(ArmCommand(cabinet.now, end - 0.005, end, there, (speed,) * 7, ones))
-
-    def follows() -> bool:
-        return session.state.following
-
-    def ask() -> None:
-        answer = cabinet.ask(ACTIVE)
-        assert answer is not None
-        assert answer.q is not None
-        followed.append(answer.q)
-
-    cabinet.ask(WAITING)
-    cabinet.ask(ACTIVE)
-    for t in np.linspace(0.005, 0.1, 20):  # a reference that leaves IPO at 1 rad/s^2
-        command(0.5 * t**2, t)
-        ask()
-    assert follows()
-    if loop == "stands still":
-        cabinet.silence = silence
-    while cabinet.silence < silence:  # on at that speed, of which nothing is heard
-        cabinet.silence += 0.005
-        command(0.005 + 0.1 * cabinet.silence, 0.1)
-    ask()
-    assert not follows()
-    assert not session.is_still(cabinet.now)
-    for _ in range(100):  # another reference begins where this one is going to rest
-        now, rest = cabinet.now, session.state.rest
-        session.follow(ArmCommand(now, now - 0.002, now + 0.003, rest, still, ones))
-        ask()
-    accelerations = np.diff(followed, n=2, axis=0) / 0.005**2
-    assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 + CATCH_UP_RAMP * 0.1
-    assert np.subtract(followed[-1], followed[19]).max() < 0.5 * 0.1**2 + 1e-3, "it brakes at once"
-    np.testing.assert_allclose(followed[-1], session.state.rest, atol=1e-9)
-    assert follows()
-    assert session.state.ended == 1
-
-
-@pytest.mark.parametrize(
-    "after",
-    [
-        pytest.param(replace(ACTIVE, version=1, ipo_q=Q), id="other version"),
-        pytest.param(replace(ACTIVE, ipo_q=Q), id="counter began anew"),
-    ],
-)
-def test_a_session_that_began_anew_in_a_silence_gets_the_cabinets_own_position(after: Monitoring) -> None:
-    cabinet = Cabinet()
-    cabinet.sent = 10
-    cabinet.ask(WAITING)
-    cabinet.ask(ACTIVE)
-    cabinet.silence = 0.2
-    if after.version == 2:
-        cabinet.sent, cabinet.silence = 0, 0.3
-    answer = cabinet.ask(after)
-    assert answer is not None
-    assert answer.q == pytest.approx(Q, abs=1e-15)
 
 
 def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> None:
