@@ -110,9 +110,12 @@ class Soak:
     def __post_init__(self) -> None:
         assert isinstance(self.pipeline.plant, VirtualCabinets)
         self.plant, self.random = self.pipeline.plant, np.random.default_rng(self.seed)
-        self._late = {"computer freezes"}
-        if self.pipeline.drive.mode is CommandMode.TORQUE:  # torques end the session by themselves then
-            self._late.add("loop freezes")
+        self._late, self._ends = {"computer freezes"}, list(_ENDS)
+        if self.pipeline.drive.mode is CommandMode.TORQUE:
+            self._late.add("loop freezes")  # torques end the session by themselves then
+            # The stand-in's arm gets its last torque for as long as its cabinet stands still.
+            self._ends.remove("cabinet freezes")
+        self._returns = False
         self._moving_since: float | None = None
         self._lasts = 0.3
         self._rest = _RESTS[self.pipeline.drive.mode]
@@ -135,9 +138,10 @@ class Soak:
         speed = float(np.abs(tick.reference.v).max())
         self.moved = max(self.moved, speed)
         held = not any(tick.engaged.values())
-        # Springs, or one arm that stopped sooner, may have left them beyond a limit, from where the reference returns.
+        # Springs, or one arm that stopped sooner, may leave them beyond a limit. The reference returns, to rest then.
         returns = tick.reference.report.status is StepStatus.RECOVERING
-        still = self.pipeline.controller.settings.recovery_velocity if returns else _STILL
+        self._returns = held and (returns or (self._returns and speed > _STILL))
+        still = self.pipeline.controller.settings.recovery_velocity if self._returns else _STILL
         if now > self._braked_by:
             self._braked_by = math.inf
             if held and speed > still:
@@ -178,7 +182,7 @@ class Soak:
         self.ended += 1
         if self.ended >= self.sessions:
             self.pipeline.stop()
-        self._end = str(self.random.choice(_ENDS))
+        self._end = str(self.random.choice(self._ends))
         arm = str(self.random.choice(SIDES))
         cabinet = self.plant.cabinets[arm]
         pause = float(self.random.uniform(0.02, 0.5))
