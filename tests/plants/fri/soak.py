@@ -247,7 +247,7 @@ def main() -> None:
     given = parser.parse_args()
     network = {"jitter": 1e-3 * given.jitter, "drift": given.drift, "loss": given.loss, "seed": given.seed}
     periods = (0.005, 0.002) if given.steady is None else (0.005, 0.005)
-    pipeline = make_loop(load_config("config/dual_iiwa7.yaml"), periods, mode=given.mode, **network)
+    pipeline = make_loop(load_config("config/dual_iiwa7_fri.yaml"), periods, mode=given.mode, **network)
     if given.steady is not None:
         raise SystemExit(not steady(pipeline, given.steady))
     soak = Soak(pipeline, given.sessions, given.seed)
