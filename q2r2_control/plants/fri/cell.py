@@ -1,9 +1,10 @@
 """The arms of a cell as their cabinets see them: from ticks of the loop to commands for all sessions.
 
-**The loop's time and the cabinets'.** Each tick of the loop moves the reference to one period after the tick. The
-cabinets are answered from it a little later (``DELAY``). Where the loop is so late that an answer may pass its end, the
-certified stop is what the cabinets get. :meth:`FriCell.due` then lets the reference follow the same stop first. Where
-an answer has passed it in the middle of a tick, the sessions refuse the command of that tick, and it is withdrawn.
+**The loop's time and the cabinets'.** Each tick of the loop moves the reference to one period after the tick, or as far
+ahead as the longest tick lately took. The cabinets are answered from it a little later (``DELAY``). Where the loop is so
+late that an answer may pass its end, the certified stop is what the cabinets get. :meth:`FriCell.due` then lets the
+reference follow the same stop first. Where an answer has passed it in the middle of a tick, the sessions refuse the
+command of that tick, and it is withdrawn.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from q2r2_control.types import Command, CommandMode, RobotState
 
 # From the decision how far the reference goes until the sessions have it, and after commands that came too late [s].
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
+_FORGETTING = 0.01  # share of the longest tick lately that each tick forgets
 _PASSING = 0.0015  # from a measurement until it has passed cabinet, network and processes, about [s]
 _NO_COMMANDS = 0.1  # so long without one that came in time is told [s]
 # In which an arm loses most of its speed where no overlay comes: several periods of a cabinet [s].
@@ -38,16 +40,21 @@ class FriCell:
         robot: Robot,
         states: Iterable[SessionState],
         period: float,
+        longest: float,
         grippers: Mapping[str, GripperIoConfig] | None = None,
     ) -> None:
-        """``period`` of the loop [s]; the state of each arm's session, and the grippers that some arms have."""
+        """``period`` of the loop, and the ``longest`` step of its reference [s], which has one acceleration.
+
+        The state of each arm's session, and the grippers that some arms have.
+        """
         self.states = {state.arm: state for state in states}
-        self._robot, self._period, self._grippers = robot, period, dict(grippers or {})
+        self._robot, self._period, self._longest, self._grippers = robot, period, longest, dict(grippers or {})
         self._joints = {arm: robot.arms[arm].joints for arm in self.states}
         self._data = robot.model.createData()
         self._now = self._start = self._end = -math.inf  # of the newest tick, and of its piece of the path [s]
         self._withdraws, self._in_time = False, -math.inf  # the newest command, and when one was not [s]
         self._margin = _MARGIN  # for the next command [s]
+        self._ahead = period  # from a tick to the end of its piece of the path [s]
         self._told = self._ends()
 
     def update(self, state: SessionState) -> None:
@@ -59,13 +66,15 @@ class FriCell:
         following = [state for state in self.states.values() if state.following]
         sent = now + self._margin
         latest = max([sent - DELAY, *(state.latest(sent) for state in following)])
-        self._now, before = now, self._end
+        late, self._now, before = now - self._now if following else 0.0, now, self._end
+        ahead = max(late, (1.0 - _FORGETTING) * self._ahead)
+        self._ahead = max(self._period, min(ahead, self._longest))
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
         else:
             braked, self._start = latest - before, latest
         # A step of one acceleration is a parabola, for the path too; of a late tick what is left comes in the next.
-        step = min(max(now, self._start) + self._period - self._start, 2.0 * self._period)
+        step = min(max(now + self._ahead - self._start, 0.5 * self._period), self._longest)
         self._end = self._start + step
         return braked, step
 
@@ -125,7 +134,8 @@ class FriCell:
         """
         states = self.states.values()
         is_torque = any(state.wanted is CommandKind.TORQUE for state in states)
-        return 0.0 if is_torque else DELAY + _PASSING + 2.5 * max(state.period for state in states)
+        farther = self._ahead - self._period
+        return 0.0 if is_torque else farther + DELAY + _PASSING + 2.5 * max(state.period for state in states)
 
     def openings(self) -> dict[str, float]:
         """Measured opening of each gripper that has an input, 0 closed .. 1 open."""

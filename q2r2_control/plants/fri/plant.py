@@ -33,14 +33,20 @@ class FriPlant:
     realtime_only = True
 
     def __init__(self, robot: Robot, config: Config) -> None:
-        """Raises :class:`ConfigError` unless every arm has a cabinet and seven joints, and a gripper its package."""
+        """Raises :class:`ConfigError` unless every arm has a cabinet and seven joints, and a gripper its package.
+
+        And where late ticks would have several accelerations: between two ticks the cabinets get a parabola.
+        """
         for arm, its in robot.arms.items():
             if arm not in set(config.fri):
                 raise ConfigError(f"fri.{arm}: missing; allowed: the cabinet of each arm, as {{port: 30200}}")
             if len(its.joints) != JOINTS:
                 raise ConfigError(f"fri.{arm}: the arm has {len(its.joints)} joints; allowed: {JOINTS}")
         self._robot, self._cabinets = robot, {str(arm): cabinet for arm, cabinet in config.fri.items()}
-        self._period = 1.0 / config.loop_rate_hz
+        self._period, self._longest = 1.0 / config.loop_rate_hz, config.control.max_substep
+        if self._longest < 2.0 * self._period:
+            allowed = f"allowed with cabinets: {2.0 * self._period:g}, two ticks of loop_rate_hz, or more; better 0.01"
+            raise ConfigError(f"control.max_substep = {self._longest:g}: {allowed}")
         self._mode = CommandMode.POSITION
         self.grippers = self._modbus_grippers()
         self._answering: AnsweringProcess | None = None
@@ -67,7 +73,7 @@ class FriPlant:
         self.close()
         lines = self._lines()
         grippers = {arm: its.gripper for arm, its in self._cabinets.items() if isinstance(its.gripper, GripperIoConfig)}
-        self.cell = FriCell(self._robot, [line.session.state for line in lines], self._period, grippers)
+        self.cell = FriCell(self._robot, [line.session.state for line in lines], self._period, self._longest, grippers)
         self._answering = AnsweringProcess(lines)
         for line in lines:
             socket.close(line.file)  # the process has it

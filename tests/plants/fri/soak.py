@@ -72,7 +72,7 @@ def make_loop(
 
     For torques they are simulated.
     """
-    changes = {"velocity_scale": 1.0 / (1.0 + CATCH_UP), "acceleration_limit": ACCELERATION}
+    changes = {"velocity_scale": 1.0 / (1.0 + CATCH_UP), "acceleration_limit": ACCELERATION, "max_substep": 0.01}
     config = config.model_copy(update={"control": config.control.model_copy(update=changes)})
     robot = Robot.from_config(config)
     settings = {}
@@ -91,7 +91,7 @@ def make_loop(
     start = robot.home if start is None else start
     if mode is CommandMode.TORQUE:
         network.setdefault("arms", SimulatedArms(robot, config))
-    plant = VirtualCabinets(robot, settings, start, 1.0 / config.loop_rate_hz, **network)
+    plant = VirtualCabinets(robot, settings, start, 1.0 / config.loop_rate_hz, config.control.max_substep, **network)
     hands.pipeline = made = FreezingLoop(config, robot, hands, plant, mode)
     return made
 

@@ -35,6 +35,7 @@ class VirtualCabinets:
         settings: dict[str, CabinetSettings],
         start: Array,
         period: float,
+        longest: float,
         *,
         drift: float = 0.0,
         jitter: float = 0.0,
@@ -43,11 +44,11 @@ class VirtualCabinets:
         arms: SimulatedArms | None = None,
         grippers: dict[str, GripperIoConfig] | None = None,
     ) -> None:
-        """``period`` of the loop, cabinets' clocks ``drift`` apart, up to ``jitter`` late [s].
+        """``period`` of the loop, its ``longest`` step, cabinets' clocks ``drift`` apart, up to ``jitter`` late [s].
 
         Without ``arms`` they are where they are commanded to be, and torques do not move them.
         """
-        self._robot, self._period, self._random = robot, period, np.random.default_rng(seed)
+        self._robot, self._period, self._longest, self._random = robot, period, longest, np.random.default_rng(seed)
         self._jitter, self._loss = jitter, loss
         self._simulation, self._grippers = arms, grippers or {}
         self.cabinets = {
@@ -71,9 +72,8 @@ class VirtualCabinets:
             joints = self._robot.arms[arm].joints
             limits = self._robot.torque_limit[joints], self._robot.velocity_limit[joints]
             self.lines[arm] = ArmSession(arm, "cabinet", None, _KINDS[self._mode], *limits)
-        self.cell = FriCell(
-            self._robot, [copy(session.state) for session in self.lines.values()], self._period, self._grippers
-        )
+        states = [copy(session.state) for session in self.lines.values()]
+        self.cell = FriCell(self._robot, states, self._period, self._longest, self._grippers)
         self.now, self._serial = _BEGIN, 0  # the loop begins at 0
         self._events: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
         self.heard: dict[str, list[Array]] = {
