@@ -1,9 +1,9 @@
 """The arms of a cell as their cabinets see them: from ticks of the loop to commands for all sessions.
 
-**The loop's time and the cabinets'.** Each tick of the loop moves the reference to one period after the tick, or as far
-ahead as the longest tick lately took. The cabinets are answered from it a little later (``DELAY``). Where the loop is so
-late that an answer may pass its end, the certified stop is what the cabinets get. :meth:`FriCell.due` then lets the
-reference follow the same stop first. Where an answer has passed it in the middle of a tick, the sessions refuse the
+**The loop's time and the cabinets'.** Each tick of the loop moves the reference to one period after the tick, or as
+far ahead as the longest tick lately took. The cabinets are answered from it a little later (``DELAY``). Where the loop
+is so late that an answer may pass its end, the certified stop is what the cabinets get. :meth:`FriCell.due` then lets
+the reference follow the same stop first. Where an answer has passed it in the middle of a tick, the sessions refuse the
 command of that tick, and it is withdrawn.
 """
 
