@@ -187,8 +187,9 @@ class ArmSession:
         """The cabinet is silent: the arm follows no more, and brakes from where the newest answer led it."""
         if self.state.following:
             self._cease()
-            self.path.brake(self.state.answered)
-            self.state.rest = joints_of(self.path.rest)
+            if self.state.wanted is CommandKind.POSITION:
+                self.path.brake(self.state.answered)
+                self.state.rest = joints_of(self.path.rest)
 
     def _begin_anew(self) -> None:
         """The arm is where its cabinet says next."""
