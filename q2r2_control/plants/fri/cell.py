@@ -25,6 +25,8 @@ from q2r2_control.types import Command, CommandMode, RobotState
 
 # From the decision how far the reference goes until the sessions have it, and after commands that came too late [s].
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
+# Of a period: answers pass a piece that is much shorter than a tick, and its command is withdrawn, again and again.
+_SHORTEST = 0.9
 _FORGETTING = 0.01  # share of the longest tick lately that each tick forgets
 _PASSING = 0.0015  # from a measurement until it has passed cabinet, network and processes, about [s]
 _NO_COMMANDS = 0.1  # so long without one that came in time is told [s]
@@ -74,7 +76,7 @@ class FriCell:
         else:
             braked, self._start = latest - before, latest
         # A step of one acceleration is a parabola, for the path too; of a late tick what is left comes in the next.
-        step = min(max(now + self._ahead - self._start, 0.5 * self._period), self._longest)
+        step = min(max(now + self._ahead - self._start, _SHORTEST * self._period), self._longest)
         self._end = self._start + step
         return braked, step
 

@@ -45,7 +45,7 @@ class FriPlant:
         self._robot, self._cabinets = robot, {str(arm): cabinet for arm, cabinet in config.fri.items()}
         self._period, self._longest = 1.0 / config.loop_rate_hz, config.control.max_substep
         if self._longest < 2.0 * self._period:
-            allowed = f"allowed with cabinets: {2.0 * self._period:g}, two ticks of loop_rate_hz, or more; better 0.01"
+            allowed = "allowed with cabinets: two ticks of loop_rate_hz or more, such as 0.01"
             raise ConfigError(f"control.max_substep = {self._longest:g}: {allowed}")
         self._mode = CommandMode.POSITION
         self.grippers = self._modbus_grippers()

@@ -82,7 +82,7 @@ def test_an_arm_without_a_cabinet_is_named(robot: Robot, config: Config) -> None
 
 def test_a_late_tick_of_several_accelerations_is_refused(robot: Robot, fri_config: Config) -> None:
     config = fri_config.model_copy(update={"loop_rate_hz": 500.0})
-    with pytest.raises(ConfigError, match=r"control\.max_substep = 0\.002: allowed with cabinets: 0\.004, two ticks"):
+    with pytest.raises(ConfigError, match=r"control\.max_substep = 0\.002: allowed with cabinets: two ticks"):
         FriPlant.from_config(robot, config)
 
 
