@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import ssl
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
+from http.client import HTTPConnection, HTTPSConnection
 from typing import Any
 from urllib.parse import urlsplit
 
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from q2r2_control.inputs.webxr.webxr import WebXrInput
@@ -19,23 +20,6 @@ from tests.support.processes import wait_until
 
 Listen = Callable[..., WebXrInput]
 AT_REST = (0.0, 0.0, 0.0, 1.0)
-
-
-def page_of(
-    source: WebXrInput, number: str = "1", origin: str | None = None, query: str | None = None
-) -> ClientConnection:
-    assert source.url is not None
-    scheme, host, _, token, _ = urlsplit(source.url)
-    context = None
-    if scheme == "https":
-        context = ssl.create_default_context()
-        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    asked = f"{token if query is None else query}&page={number}"
-    secure = "s" if context else ""
-    url = f"ws{secure}://{host.replace('0.0.0.0', '127.0.0.1')}/socket?{asked}"
-    return connect(
-        url, origin=Origin(f"{scheme}://{host}" if origin is None else origin), ssl=context, compression=None
-    )
 
 
 def hand(x: float, *buttons: bool, **more: Any) -> dict[str, Any]:
@@ -47,7 +31,9 @@ class Page:
     """A page that numbers its messages."""
 
     def __init__(self, source: WebXrInput, number: str = "1") -> None:
-        self.socket = page_of(source, number)
+        assert source.url is not None
+        host = urlsplit(source.url).netloc
+        self.socket = connect(f"ws://{host}/socket?page={number}", origin=Origin(f"http://{host}"), compression=None)
         self._seq = 0
 
     def send(self, **hands: Any) -> None:
@@ -76,9 +62,20 @@ def samples(source: WebXrInput, until: Callable[[list[HandSample]], object]) -> 
     return got
 
 
-def refused(source: WebXrInput, **asked: str) -> bool:
-    try:
-        page_of(source, **asked).close()
-    except InvalidStatus as error:
-        return error.response.status_code == 403
-    return False
+def refused(source: WebXrInput, origin: str | None = None, query: str | None = None) -> bool:
+    """Whether the server refuses the socket."""
+    # websockets' client reads and writes from two threads, which an SSL connection does not allow.
+    assert source.url is not None
+    scheme, host, _, token, _ = urlsplit(source.url)
+    connection = HTTPConnection(host, timeout=60.0)
+    if scheme == "https":
+        context = ssl.create_default_context()
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        connection = HTTPSConnection(host, timeout=60.0, context=context)
+    headers = {"Origin": origin or f"{scheme}://{host}", "Upgrade": "websocket", "Connection": "Upgrade"}
+    headers |= {"Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
+    with closing(connection):
+        connection.request("GET", f"/socket?{token if query is None else query}", headers=headers)
+        status = connection.getresponse().status
+    assert status in (101, 403)
+    return status == 403
