@@ -1,10 +1,10 @@
 """The arms of a cell as their cabinets see them: from ticks of the loop to commands for all sessions.
 
-**The loop's time and the cabinets'.** Each tick of the loop moves the reference to one period after the tick, or as
-far ahead as the longest tick lately took. The cabinets are answered from it a little later (``DELAY``). Where the loop
-is so late that an answer may pass its end, the certified stop is what the cabinets get. :meth:`FriCell.due` then lets
-the reference follow the same stop first. Where an answer has passed it in the middle of a tick, the sessions refuse the
-command of that tick, and it is withdrawn.
+**The loop's time and the cabinets'.** Each tick of the loop moves the reference to one period after the tick. Where
+ticks took longer lately, or their commands came too late, it goes farther ahead by as much. The cabinets are answered
+from it a little later (``DELAY``). Where the loop is so late that an answer may pass its end, the certified stop is
+what the cabinets get. :meth:`FriCell.due` then lets the reference follow the same stop first. Where an answer has
+passed it in the middle of a tick, the sessions refuse the command of that tick, and it is withdrawn.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from q2r2_control.types import Command, CommandMode, RobotState
 
 # From the decision how far the reference goes until the sessions have it, and after commands that came too late [s].
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
-# Of a period: answers pass a piece that is much shorter than a tick, and its command is withdrawn, again and again.
-_SHORTEST = 0.9
-_FORGETTING = 0.01  # share of the longest tick lately that each tick forgets
+# Of a period, the shortest step of the reference.
+_SHORTEST = 0.5
+_FORGETTING = 0.01  # share of the longest tick and margin lately that each tick forgets
 _PASSING = 0.0015  # from a measurement until it has passed cabinet, network and processes, about [s]
 _NO_COMMANDS = 0.1  # so long without one that came in time is told [s]
 # In which an arm loses most of its speed where no overlay comes: several periods of a cabinet [s].
@@ -56,7 +56,7 @@ class FriCell:
         self._now = self._start = self._end = -math.inf  # of the newest tick, and of its piece of the path [s]
         self._withdraws, self._in_time = False, -math.inf  # the newest command, and when one was not [s]
         self._margin = _MARGIN  # for the next command [s]
-        self._ahead = period  # from a tick to the end of its piece of the path [s]
+        self._tick = period  # the longest one lately [s]
         self._told = self._ends()
 
     def update(self, state: SessionState) -> None:
@@ -69,8 +69,8 @@ class FriCell:
         sent = now + self._margin
         latest = max([sent - DELAY, *(state.latest(sent) for state in following)])
         late, self._now, before = now - self._now if following else 0.0, now, self._end
-        ahead = max(late, (1.0 - _FORGETTING) * self._ahead)
-        self._ahead = max(self._period, min(ahead, self._longest))
+        longest = max(late, (1.0 - _FORGETTING) * self._tick)
+        self._tick = max(self._period, min(longest, self._longest))
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
         else:
@@ -120,9 +120,14 @@ class FriCell:
         """The commands of a tick were ``taken`` by the sessions, or came too late for one of them."""
         self._withdraws = not taken
         if taken:
-            self._in_time, self._margin = self._now, _MARGIN
+            self._in_time, self._margin = self._now, max(_MARGIN, (1.0 - _FORGETTING) * self._margin)
         else:
             self._end, self._margin = self._start, min(2.0 * self._margin, _LONGEST_MARGIN)
+
+    @property
+    def _ahead(self) -> float:
+        """From a tick to the end of its piece of the path: no answer passes it until the next command has come [s]."""
+        return self._tick + self._margin - _MARGIN
 
     def withdraws(self) -> bool:
         """Whether the newest command came after an answer that it was for: the arms go on along the stop before it."""

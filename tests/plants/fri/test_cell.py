@@ -92,20 +92,27 @@ def test_a_loop_that_is_late_brakes_on_the_stop_that_the_cabinets_get(config: Co
     assert all(summary.arms[arm].engaged_s > 1.5 for arm in SIDES), "and the arms go on"
 
 
-def test_a_loop_whose_ticks_are_all_late_follows_as_one_in_time(config: Config) -> None:
-    errors = []
-    for latest in (0.0, 0.007):  # of ticks that are 2 ms apart [s]
+@pytest.mark.parametrize(("latest", "thinks", "bound"), [(0.007, False, 1.3), (0.01, True, 2.0)])
+def test_a_loop_whose_ticks_are_all_late_follows_as_one_in_time(
+    config: Config, latest: float, thinks: bool, bound: float
+) -> None:
+    """``thinks``: commands are as late as the ticks, which are 2 ms apart."""
+
+    def run(most: float) -> float:
         pipeline = make_loop(config, (0.002, 0.002), jitter=0.0004)
         plant, random = started(pipeline), np.random.default_rng(0)
 
-        def freeze(_: Tick, pipeline: FreezingLoop = pipeline, most: float = latest, random: Any = random) -> None:
-            pipeline.freeze(float(random.uniform(0.0, most)))
+        def freeze(_: Tick) -> None:
+            late = float(random.uniform(0.0, most))
+            plant.thinking = thinks * late
+            pipeline.freeze(late)
 
         pipeline.listeners.append(freeze)
         summary = pipeline.run(3.0, realtime=False)
         assert trips(plant) == []
-        errors.append(error(summary, "left"))
-    assert errors[1] < 1.3 * errors[0]
+        return error(summary, "left")
+
+    assert run(latest) < bound * run(0.0)
 
 
 def test_a_command_that_answers_have_passed_is_withdrawn_and_the_arms_go_on(config: Config) -> None:
