@@ -78,15 +78,20 @@ class AnsweringProcess:
             raise self._end(word)
         return word == _TAKEN
 
-    def receive(self) -> list[SessionState]:
-        """The states that have come since the last call. Raises :class:`PlantError` where the process has ended."""
-        states = []
+    def receive(self) -> tuple[list[SessionState], list[tuple[float, float]]]:
+        """Each arm's newest state since the last call; when messages came, and how long their answers took [s].
+
+        Raises :class:`PlantError` where the process has ended.
+        """
+        newest, answers = {}, []
         with suppress(BlockingIOError):
             while said := self._states.recv(_LARGEST):
-                values, newest = pickle.loads(said)
-                states.append(SessionState(**values | {"newest": newest and read_monitoring(newest)}))
+                values, datagram = pickle.loads(said)
+                newest[values["arm"]] = values, datagram  # of many messages after a late tick, one is read
+                if values["took"] is not None:
+                    answers.append((values["arrival"], values["took"]))
             raise self._end()
-        return states
+        return [SessionState(**its | {"newest": raw and read_monitoring(raw)}) for its, raw in newest.values()], answers
 
     def _end(self, last_word: bytes = b"") -> PlantError:
         """The way in which the process has ended."""

@@ -123,10 +123,10 @@ class FriPlant:
     def states(self) -> dict[str, SessionState]:
         """Of each arm's session, as the newest message of its cabinet has left it."""
         if self._answering is not None:
-            for state in self._answering.receive():
+            states, answers = self._answering.receive()
+            self.answers.extend(answers)
+            for state in states:
                 self.cell.update(state)
-                if state.took is not None:
-                    self.answers.append((state.arrival, state.took))
         return self.cell.states
 
     def due(self, now: float) -> tuple[float, float]:

@@ -67,7 +67,7 @@ class Between:
             return False
 
     def hear(self) -> bool:
-        self.states += self.process.receive()
+        self.states += self.process.receive()[0]
         return bool(self.states) and self.states[-1].newest == replace(MONITORING, counter=self.sent)
 
 
