@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -120,6 +121,8 @@ class Soak:
         self._lasts = 0.3
         self._rest = _RESTS[self.pipeline.drive.mode]
         self._braked_by, self._slow_by, self._start_at = math.inf, math.inf, 0.0
+        # Of the last 50 ms [s]: an arm is behind the reference, and brakes from there where its cabinet is silent.
+        self._braking: deque[float] = deque(maxlen=25)
         self._seen, self._end = dict.fromkeys(SIDES, 0), "start"
         self.pipeline.listeners.append(self.look)
 
@@ -136,6 +139,7 @@ class Soak:
                     self.faults.append(f"{now:.3f} s, {self._end}: {arm}: {trip}")
             self._seen[arm] = len(cabinet.trips)
         speed = float(np.abs(tick.reference.v).max())
+        self._braking.append(float((np.abs(tick.reference.v) / self.pipeline.controller.stop_deceleration).max()))
         self.moved = max(self.moved, speed)
         held = not any(tick.engaged.values())
         # Springs, or one arm that stopped sooner, may leave them beyond a limit. The reference returns, to rest then.
@@ -157,7 +161,7 @@ class Soak:
             self._moving_since, self._lasts = now, float(self.random.uniform(0.2, 1.2))
         if self._moving_since is not None and now - self._moving_since >= self._lasts:
             self._moving_since = None
-            self._end_session(now, tick)
+            self._end_session(now)
 
     def _look_at_rest(self, now: float, held: bool, still: float) -> None:
         """Wait until the arms have settled, or move faster than they may by now."""
@@ -178,7 +182,7 @@ class Soak:
         way = np.diff(self.plant.heard[arm][-2:], axis=0)
         return float(np.abs(way[np.isfinite(way)]).max(initial=0.0)) / self.plant.cabinets[arm].settings.period
 
-    def _end_session(self, now: float, tick: Tick) -> None:
+    def _end_session(self, now: float) -> None:
         self.ended += 1
         if self.ended >= self.sessions:
             self.pipeline.stop()
@@ -204,8 +208,8 @@ class Soak:
         else:
             self._send_garbage()
             cabinet.stop()
-        braking = np.abs(tick.reference.v) / self.pipeline.controller.stop_deceleration
-        self._braked_by = now + float(braking.max()) + _ALLOWANCE
+        braking = max(self._braking) if self._end == "cabinet freezes" else self._braking[-1]
+        self._braked_by = now + braking + _ALLOWANCE
         self._slow_by = self._braked_by + self._rest.slow_after
 
     def _send_garbage(self) -> None:
