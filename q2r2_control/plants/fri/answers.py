@@ -49,6 +49,10 @@ class _Move(NamedTuple):
         speed = 6.0 * x * (1.0 - x) / h * way + (1.0 - x) * (1.0 - 3.0 * x) * v + x * (3.0 * x - 2.0) * end_v
         return there, speed
 
+    @property
+    def stop(self) -> _Stop:
+        return _Stop(self.end, self.q[1], self.v[1], self.deceleration)
+
 
 class _Stop(NamedTuple):
     """The certified stop from a posture and a velocity."""
@@ -97,11 +101,14 @@ class ReferencePath:
         self._stop = _Stop(t, q, v, deceleration)
 
     def brake(self, t: float) -> None:
-        """Let the certified stop begin at ``t`` [s] already."""
+        """Let nothing but its certified stop follow the move at ``t`` [s].
+
+        The stop is that from the move's end. From its middle, a joint that nearly stands at the end would hardly brake.
+        """
         piece = self._piece(t)
         if piece is not self._stop:
-            self._pieces = tuple(before for before in self._pieces if before.start < t)
-            self._stop = _Stop(t, *piece.at(t), piece.deceleration)
+            self._pieces = tuple(before for before in self._pieces if before.start <= piece.start)
+            self._stop = piece if isinstance(piece, _Stop) else piece.stop
 
     def at(self, t: float) -> Array:
         """Posture (n,) [rad] at ``t`` [s]."""

@@ -97,6 +97,21 @@ def test_a_loop_that_stands_still_leads_into_the_certified_stop_and_to_rest() ->
     assert np.abs(a).max() <= 10.0 + 1e-6
 
 
+def test_a_path_that_brakes_amid_a_move_rests_where_and_when_was_certified_from_the_moves_end() -> None:
+    path, certified = ReferencePath(0.0, np.zeros(2)), ReferencePath(0.0, np.zeros(2))
+    for each in (path, certified):
+        each.extend(0.01, np.array([0.0, 0.0]), np.array([1.0, 0.02]), np.array([5.0, 0.1]))
+        # All joints stop together, so the one that nearly stands brakes hardly.
+        each.extend(0.02, np.array([0.01, 1e-4]), np.array([1.0, 1e-4]), np.array([5.0, 5e-4]))
+    path.extend(0.03, np.array([0.02, 0.0]), np.array([1.0, -0.02]), np.array([5.0, 0.1]))
+    path.brake(0.015)
+    for t in np.linspace(0.0, 0.3, 61):
+        np.testing.assert_array_equal(path.at(t), certified.at(t))
+    np.testing.assert_allclose(path.at(0.02 + 0.2), path.rest, atol=1e-9)
+    path.brake(0.1)
+    np.testing.assert_array_equal(path.rest, certified.rest)
+
+
 def test_between_two_ticks_the_posture_is_on_the_parabola_of_the_reference() -> None:
     path = ReferencePath(1.0, np.zeros(1))
     path.extend(1.1, np.array([0.05]), np.array([1.0]), np.ones(1))
