@@ -23,7 +23,8 @@ from q2r2_control.plants.fri.wire import JOINTS, CommandKind, joints_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Command, CommandMode, RobotState
 
-# From the decision how far the reference goes until the sessions have it, and after commands that came too late [s].
+# From the decision how far the reference goes until the sessions have it, and after commands that came too late [s]. By
+# as much as it is longer the reference goes farther ahead.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 # Of a period, the shortest step of the reference.
 _SHORTEST = 0.5
@@ -56,7 +57,7 @@ class FriCell:
         self._now = self._start = self._end = -math.inf  # of the newest tick, and of its piece of the path [s]
         self._withdraws, self._in_time = False, -math.inf  # the newest command, and when one was not [s]
         self._margin = _MARGIN  # for the next command [s]
-        self._tick = period  # the longest one lately [s]
+        self._longest_tick = period  # lately [s]
         self._told = self._ends()
 
     def update(self, state: SessionState) -> None:
@@ -69,14 +70,16 @@ class FriCell:
         sent = now + self._margin
         latest = max([sent - DELAY, *(state.latest(sent) for state in following)])
         late, self._now, before = now - self._now if following else 0.0, now, self._end
-        longest = max(late, (1.0 - _FORGETTING) * self._tick)
-        self._tick = max(self._period, min(longest, self._longest))
+        longest = max(late, (1.0 - _FORGETTING) * self._longest_tick)
+        self._longest_tick = max(self._period, min(longest, self._longest))
+        # A session that has just begun may not be known yet: the path gets a step for each period then.
+        ahead = self._ahead if following else self._period
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
         else:
             braked, self._start = latest - before, latest
         # A step of one acceleration is a parabola, for the path too; of a late tick what is left comes in the next.
-        step = min(max(now + self._ahead - self._start, _SHORTEST * self._period), self._longest)
+        step = min(max(now + ahead - self._start, _SHORTEST * self._period), self._longest)
         self._end = self._start + step
         return braked, step
 
@@ -126,8 +129,11 @@ class FriCell:
 
     @property
     def _ahead(self) -> float:
-        """From a tick to the end of its piece of the path: no answer passes it until the next command has come [s]."""
-        return self._tick + self._margin - _MARGIN
+        """From a tick to the end of its piece of the path [s].
+
+        No answer passes it before the next command has come, if neither is later than one was lately.
+        """
+        return self._longest_tick + self._margin - _MARGIN
 
     def withdraws(self) -> bool:
         """Whether the newest command came after an answer that it was for: the arms go on along the stop before it."""

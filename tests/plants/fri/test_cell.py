@@ -96,7 +96,7 @@ def test_a_loop_that_is_late_brakes_on_the_stop_that_the_cabinets_get(config: Co
 def test_a_loop_whose_ticks_are_all_late_follows_as_one_in_time(
     config: Config, latest: float, thinks: bool, bound: float
 ) -> None:
-    """``thinks``: commands are as late as the ticks, which are 2 ms apart."""
+    """Of ticks each 2 ms; ``thinks``: commands are as late as the ticks."""
 
     def run(most: float) -> float:
         pipeline = make_loop(config, (0.002, 0.002), jitter=0.0004)
@@ -113,6 +113,14 @@ def test_a_loop_whose_ticks_are_all_late_follows_as_one_in_time(
         return error(summary, "left")
 
     assert run(latest) < bound * run(0.0)
+
+
+def test_before_a_session_is_known_to_follow_each_tick_moves_the_reference_by_its_period(config: Config) -> None:
+    plant = started(make_loop(config))
+    plant.reset()
+    for tick in range(100):  # of a loop whose commands came too late in the session before
+        plant.cell.sent(taken=False)
+        assert plant.due(0.002 * tick) == pytest.approx((0.0, 0.002))
 
 
 def test_a_command_that_answers_have_passed_is_withdrawn_and_the_arms_go_on(config: Config) -> None:

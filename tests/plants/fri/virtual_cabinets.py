@@ -103,8 +103,6 @@ class VirtualCabinets:
         check_command(command, self._robot, self.modes)
         self._pass(self.now + self.thinking)
         self.cell.sent(follow(self.lines, self.cell.apply(command)))
-        for session in self.lines.values():
-            self.cell.update(copy(session.state))
 
     def advance(self, dt: float) -> None:
         """Time passes by itself, until the next tick."""
