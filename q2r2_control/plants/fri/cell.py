@@ -23,8 +23,8 @@ from q2r2_control.plants.fri.wire import JOINTS, CommandKind, joints_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Command, CommandMode, RobotState
 
-# From the decision how far the reference goes until the sessions have it, and after commands that came too late [s]. By
-# as much as it is longer the reference goes farther ahead.
+# From the decision how far the reference goes until the sessions have it, and after commands that came too late [s].
+# The reference then goes farther ahead by the difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 # Of a period, the shortest step of the reference.
 _SHORTEST = 0.5
