@@ -12,7 +12,7 @@ from typing import Any
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
-from q2r2_control.pipeline.commissioning import LED, StopReport, stop_report
+from q2r2_control.pipeline.commissioning import LEAST_SPEED, LED, StopReport, stop_report, tool_speed
 from q2r2_control.pipeline.slow_run import Moment, SlowRun
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.process.helper_process import HelperProcess
@@ -42,7 +42,8 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
     process = HelperProcess("leads the arms", __name__, moments.append)
     process.send(config)
     try:
-        while _led(moments) < led:
+        # A loop that was late lately goes up slower than a stop can be measured from.
+        while _led(moments) < led or min(tool_speed(robot, arm, moments[-1]) for arm in robot.arms) < LEAST_SPEED:
             if not process.alive:
                 raise PlantError(process.fault or "the arms did not follow the hands")
             time.sleep(_LOOKS)

@@ -27,7 +27,7 @@ def test_arms_of_a_killed_run_come_to_rest_within_their_certified_stop(config: C
     with waiting_cabinets(Robot.from_config(config), config) as cabinets:
         reports = measure_kill(config, lambda: np.concatenate([cabinets[arm].arm.q for arm in SIDES]), led=0.3)
     for report in reports:
-        assert 15.0 < report.tool_speed_mm_s < 40.0
+        assert not cabinets[report.arm].trips
         assert 0.0 < report.stopped_mm < report.allowed_mm
 
 
