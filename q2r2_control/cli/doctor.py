@@ -45,6 +45,8 @@ def doctor(
         "compiler": "not needed, but by q2r2 ros build-interfaces",
         "headset": "; ".join(access_lines(cell.headset.host, cell.headset.port, cell.headset.networks)),
     }
+    if cell.fri:
+        facts["cabinets"] = f"q2r2 fri-check {config} says how evenly they send"
     findings = [*_packages(requires(_PACKAGE) or ()), *_ros(), *_ports(cell), *_display(os.environ)]
     notes = machine_notes() + network_notes(cabinet.address for cabinet in cell.fri.values())
     findings += [Finding(False, *_what_and_cure(note)) for note in notes]
@@ -102,5 +104,6 @@ def _display(environment: Mapping[str, str]) -> Iterator[Finding]:
 
 
 def _what_and_cure(note: str) -> tuple[str, str]:
+    """Of a note whose last part, after "; ", is the cure; a command in it has no "; "."""
     what, _, cure = note.rpartition("; " if "; " in note else ": ")
     return what, cure

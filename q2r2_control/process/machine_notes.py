@@ -47,10 +47,9 @@ def fair_server_notes(release: str, folder: Path) -> list[str]:
     shares = [_text(file) for file in folder.glob("cpu*/runtime")]
     if (major, minor) < (6, 12) or (shares and set(shares) == {"0"}):
         return []
-    command = f"for share in {folder}/cpu*/runtime; do echo 0 > $share; done"
     return [
         "Linux halts real-time threads for up to 50 ms where other programs got less than 5 % of a processor in a"
-        f" second; leave a processor free, or, as root and without Secure Boot: {command}"
+        f" second; leave a processor free, or, as root and without Secure Boot: echo 0 | tee {folder}/cpu*/runtime"
     ]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.cli import doctor
+from q2r2_control.process.machine_notes import fair_server_notes
 from tests.cli.command import changed_cell, one_object, q2r2
 
 
@@ -52,9 +53,16 @@ def test_without_a_display_only_the_window_is_missing() -> None:
 
 
 def test_what_the_kernel_refuses_stands_with_the_last_part_of_the_note_as_its_cure(
-    free_cell: str, monkeypatch: pytest.MonkeyPatch
+    free_cell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(doctor, "machine_notes", lambda: ["real time: no SCHED_FIFO; the run goes on; give rtprio 40"])
+    notes = ["real time: no SCHED_FIFO; the run goes on; give rtprio 40", *fair_server_notes("6.12.0", tmp_path)]
+    monkeypatch.setattr(doctor, "machine_notes", lambda: notes)
     lines = q2r2("doctor", free_cell).stdout.splitlines()
     at = lines.index("warning     real time: no SCHED_FIFO; the run goes on")
     assert lines[at + 1].strip() == "cure: give rtprio 40"
+    assert lines[at + 2].endswith("less than 5 % of a processor in a second")
+    assert lines[at + 3].strip().startswith("cure: leave a processor free, or, as root")
+
+
+def test_a_cell_of_cabinets_is_sent_to_the_command_that_measures_their_jitter(fri_cell: str) -> None:
+    assert f"cabinets    q2r2 fri-check {fri_cell} says how evenly they send" in q2r2("doctor", fri_cell).stdout
