@@ -50,7 +50,7 @@ class ElbowSwivel:
         for key, value in (("gain", gain), ("weight", weight)):
             if not isinstance(value, float | int) or not 0.0 < value < math.inf:
                 raise ValueError(f"{key} = {value!r:.40}: allowed: a number above 0")
-        if isinstance(joints, str) or len(joints) != 3:
+        if not isinstance(joints, list | tuple) or len(joints) != 3:
             raise ValueError(f"joints = {joints!r:.60}: allowed: three, at shoulder, elbow and wrist")
         if not isinstance(angles, Mapping) or not angles:
             raise ValueError(f"angles = {angles!r:.60}: allowed: an angle or null by arm, such as {{left: 0.3}}")
@@ -113,6 +113,6 @@ def _joint(robot: Robot, arm: str, name: str) -> int:
     if arm not in robot.arms:
         raise ValueError(f"angles: no arm {arm!r:.40}; allowed: {', '.join(robot.arms)}")
     own = {robot.joint_names[j].removeprefix(f"{arm}_"): int(j) + 1 for j in robot.arms[arm].joints}
-    if name not in own:
+    if name not in [*own]:
         raise ValueError(f"joints: {arm} has no joint {name!r:.40}; allowed: {', '.join(own)}")
     return own[name]

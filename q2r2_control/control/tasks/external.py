@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import ConfigError, shown
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -46,9 +46,22 @@ def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> tuple[T
         try:
             tasks.append(made(robot, **settings))
         except (TypeError, ValueError) as error:
-            allowed = ", ".join(list(inspect.signature(made).parameters)[1:])
-            raise ConfigError(f"control.tasks.{name}: {error}; its settings: {allowed or 'none'}") from error
+            raise ConfigError(f"control.tasks.{name}{_fault(made, settings, error)}") from error
     return tuple(tasks)
+
+
+def _fault(made: Any, settings: Mapping[str, Any], error: Exception) -> str:
+    """The first setting that is unknown or missing; else what the task itself says."""
+    parameters = list(inspect.signature(made).parameters.values())[1:]
+    known = [one.name for one in parameters if one.kind is not one.VAR_KEYWORD]
+    allowed = f"; its settings: {', '.join(known) or 'none'}"
+    for key, value in settings.items():
+        if key not in known and len(known) == len(parameters):
+            return f".{key} = {shown(value)}: no such setting{allowed}"
+    for one in parameters:
+        if one.name in known and one.default is one.empty and one.name not in settings:
+            return f".{one.name} is missing{allowed}"
+    return f": {error}{allowed}"
 
 
 def add_costs(tasks: Sequence[Task], H: Array, g: Array, q: Array, v: Array) -> None:

@@ -8,12 +8,15 @@ meet in between, as their weights say; a tool's own are 1 for a metre and 0.09 f
 from __future__ import annotations
 
 import math
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
+from q2r2_control.errors import shown
+from q2r2_control.robot.cell_parts import check_position
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -39,9 +42,9 @@ class _Tools:
 
     def __init__(self, robot: Robot, arms: Sequence[str] | None) -> None:
         """Of all arms without ``arms``. Raises :class:`ValueError` for one that is not there."""
-        names = tuple(robot.arms) if arms is None else tuple(arms)
-        if not names or any(name not in robot.arms for name in names):
-            raise ValueError(f"arms = {list(names)!s:.60}: allowed: some of {', '.join(robot.arms)}")
+        names = list(robot.arms) if arms is None else arms
+        if not isinstance(names, list | tuple) or not names or any(name not in [*robot.arms] for name in names):
+            raise ValueError(f"arms = {shown(arms)}: allowed: a list of some of {', '.join(robot.arms)}")
         self._model, self._data = robot.model, robot.model.createData()
         self._frames = [robot.arms[name].frame_id for name in names]
 
@@ -58,13 +61,19 @@ class _Tools:
 
 
 class JointTarget:
-    """Joints go to positions of their own, such as ``{left_A3: 0.3}`` [rad]."""
+    """Joints go to positions of their own within their limits, such as ``{left_A3: 0.3}`` [rad]."""
 
     def __init__(self, robot: Robot, positions: Mapping[str, float], gain: float = 2.0, weight: float = 0.1) -> None:
         self._gain, self._weight = _positive("gain", gain), _positive("weight", weight)
-        for name in positions:
+        if not isinstance(positions, Mapping) or not positions:
+            raise ValueError(f"positions = {shown(positions)}: allowed: positions by joint, such as {{left_A3: 0.3}}")
+        joints = {joint.get("name", ""): joint for joint in ET.fromstring(robot.urdf).findall("joint")}
+        for name, value in positions.items():
             if name not in robot.joint_names:
                 raise ValueError(f"positions.{name!s:.40}: no such joint; allowed: {', '.join(robot.joint_names)}")
+            if isinstance(value, bool) or not isinstance(value, float | int):
+                raise ValueError(f"positions.{name} = {shown(value)}: allowed: a number [rad or m]")
+            check_position(joints[name], value, f"control.tasks.joints: positions.{name}")
         self._joints = [robot.joint_names.index(name) for name in positions]
         self._wanted = np.array([float(value) for value in positions.values()])
 
@@ -118,7 +127,7 @@ class Upright:
         weight: float = 10.0,
     ) -> None:
         self._tools, self._axis, self._up = _Tools(robot, arms), _direction("axis", axis), _direction("up", up)
-        self._angle, self._gain, self._weight = _positive("angle", angle), _positive("gain", gain), weight
+        self._angle, self._gain, self._weight = _positive("angle", angle, math.pi), _positive("gain", gain), weight
         _positive("weight", weight)
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
@@ -176,14 +185,18 @@ def _turn(of: Array, to: Array) -> Array:
     return math.atan2(sine, float(of @ to)) / sine * across
 
 
-def _positive(key: str, value: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, float | int) or not 0.0 < value < math.inf:
-        raise ValueError(f"{key} = {value!r:.40}: allowed: a number above 0")
+def _positive(key: str, value: float, most: float = math.inf) -> float:
+    if isinstance(value, bool) or not isinstance(value, float | int) or not (0.0 < value <= most and value < math.inf):
+        up_to = "" if most == math.inf else f", at most {most:.2f} rad"
+        raise ValueError(f"{key} = {value!r:.40}: allowed: a number above 0{up_to}")
     return float(value)
 
 
 def _vector(key: str, value: Sequence[float]) -> Array:
-    vector = np.array(value, dtype=np.float64)
+    try:
+        vector = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"{key} = {value!s:.60}: allowed: three numbers")
     return vector

@@ -78,7 +78,11 @@ def test_a_stretched_arm_has_no_elbow_to_turn_and_rests() -> None:
         ({"angles": {"left": 17.0}}, "angles.left = 17.0: allowed: -6.28 .. 6.28 rad, or null"),
         ({"angles": {"left": 0.1}, "joints": ["A2", "A6", "A4"]}, "allowed: three of left from base to tip"),
         ({"angles": {"left": 0.1}, "gain": 0.0}, "gain = 0.0: allowed: a number above 0"),
-        ({"angles": {"left": 0.1}, "elbow": "B4"}, "argument 'elbow'; its settings: angles, joints, gain, weight"),
+        (
+            {"angles": {"left": 0.1}, "elbow": "B4"},
+            "swivel.elbow = 'B4': no such setting; its settings: angles, joints",
+        ),
+        ({"angles": {"left": 0.1}, "joints": 5}, "joints = 5: allowed: three, at shoulder, elbow and wrist"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused_by_name(settings: dict[str, object], told: str) -> None:
@@ -126,7 +130,7 @@ def test_a_cost_that_is_no_number_is_not_used() -> None:
     ("tasks", "message"),
     [
         ({"wrist": {}}, "control.tasks.wrist: installed tasks: .*broken, elbow"),
-        ({"elbow": {"gain": 1.0}}, "control.tasks.elbow: .*unexpected keyword argument 'gain'"),
+        ({"elbow": {"gain": 1.0}}, "control.tasks.elbow.gain = 1.0: no such setting; its settings: angle"),
     ],
 )
 def test_an_unknown_task_and_a_bad_setting_are_refused_by_name(tasks: dict, message: str) -> None:

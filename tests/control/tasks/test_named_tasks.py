@@ -97,11 +97,22 @@ def test_the_velocity_that_a_tool_looks_with_reduces_its_error_also_while_it_pas
     ("tasks", "told"),
     [
         ({"joints": {"positions": {"left_A9": 0.1}}}, "positions.left_A9: no such joint; allowed: left_A1, left_A2"),
+        (
+            {"joints": {"positions": {"left_A3": 90}}},
+            r"positions.left_A3 = 90: joint left_A3 allows -2.96706 .. 2.96706 rad; 90 degrees are 1.571 rad",
+        ),
+        ({"joints": {"positions": {"left_A3": math.nan}}}, "left_A3 = nan: joint left_A3 allows -2.96706 .. 2.96706"),
+        ({"joints": {"positions": {"left_A3": "up"}}}, r"left_A3 = 'up': allowed: a number \[rad or m\]"),
+        ({"joints": {"positions": 3}}, "positions = 3: allowed: positions by joint"),
+        ({"joints": {}}, "control.tasks.joints.positions is missing; its settings: positions, gain, weight"),
         ({"look_at": {"point": [0.1, 0.2]}}, r"point = \[0.1, 0.2\]: allowed: three numbers"),
-        ({"look_at": {"point": [0.1, 0.2, 0.3], "arms": ["middle"]}}, "allowed: some of left, right"),
+        ({"look_at": {"point": "abc"}}, "point = abc: allowed: three numbers"),
+        ({"look_at": {"point": [0.1, 0.2, 0.3], "arms": 3}}, "arms = 3: allowed: a list of some of left, right"),
+        ({"look_at": {"point": [0.1, 0.2, 0.3], "arms": ["middle"]}}, "allowed: a list of some of left, right"),
         ({"upright": {"angle": -0.2}}, "angle = -0.2: allowed: a number above 0"),
+        ({"upright": {"angle": 20}}, "angle = 20: allowed: a number above 0, at most 3.14 rad"),
         ({"upright": {"angle": 0.2, "axis": [0, 0, 0]}}, "three numbers, not all 0"),
-        ({"relative": {"wieght": 1.0}}, "its settings: position, rpy, gain, weight"),
+        ({"relative": {"wieght": 1.0}}, "relative.wieght = 1.0: no such setting; its settings: position, rpy, gain"),
     ],
 )
 def test_a_wrong_setting_is_refused_with_what_is_allowed(tasks: dict[str, Any], told: str) -> None:
