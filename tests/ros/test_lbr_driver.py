@@ -12,6 +12,8 @@ import pytest
 from q2r2_control import Robot
 from q2r2_control.config.cell import load_config, parse_config
 from q2r2_control.config.resources import find_resource
+from q2r2_control.drives.base import make_drive
+from q2r2_control.errors import ConfigError
 from q2r2_control.ros.bridge.messages import called_otherwise
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.types import SIDES, Array, CommandMode
@@ -20,10 +22,12 @@ from tests.ros.processes import CONFIG
 
 need_ros()
 
-from lbr_fri_idl.msg import LBRState
+from lbr_fri_idl.msg import LBRJointPositionCommand, LBRState
 
 from q2r2_control.ros.base_node import BaseNode
+from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, LbrPosition
 from q2r2_control.ros.bridge.lbr_driver import LbrDrivers
+from q2r2_control.ros.monitoring import WatchedPublisher
 from tests.ros.fake_lbr import TOPICS
 from tests.ros.lbr_soak import LbrSoak
 from tests.ros.test_intakes import Arrivals
@@ -69,6 +73,58 @@ def test_external_torques_are_told_once_both_drivers_have_and_none_that_are_no_n
     assert len(told) == 2
     for arm, torque in (("left", 3.0), ("right", 2.0)):
         np.testing.assert_array_equal(told[-1][robot.arms[arm].joints], torque)
+    node.destroy_node()
+
+
+def test_an_arm_is_ready_only_once_its_driver_tells_of_commanding_active(domain: int) -> None:
+    with virtual_lbrs("for Jazzy", domain) as virtual:
+        Operator(virtual)
+        supervisor, left, right = virtual.node._supervisor, virtual.drivers["left"], virtual.drivers["right"]
+        virtual.change = lambda topic, message: None if topic == "/left/lbr_state" else message  # no broadcaster
+        for driver in virtual.drivers.values():
+            driver.begin()
+        virtual.run(lambda: supervisor.phase is Phase.ACTIVE or virtual.now > 5.0)
+        _, line, values = virtual.node.health()
+        assert (values["kind"], supervisor.phase) == ("fri_silent", Phase.INACTIVE)
+        assert "left: no FRI message from its driver on /left/lbr_state or /left/state; " in line
+        assert "load_controller --set-state active lbr_state_broadcaster -c /left/controller_manager" in line
+        assert (left.target, right.target) == (None, None)
+        left.drop()
+        virtual.change = lambda topic, message: message
+        virtual.run(lambda: supervisor.phase is Phase.ACTIVE or virtual.now > 10.0)
+        assert (virtual.node.health()[2]["kind"], supervisor.phase) == ("fri_session", Phase.INACTIVE)
+        left.begin()
+        virtual.run(lambda: left.target is not None or virtual.now > 15.0)
+        assert (supervisor.phase, left.trips) == (Phase.ACTIVE, [])
+
+
+@pytest.mark.parametrize("topics", [("/left/joints", "/right/command/joints"), ("/lbr/command/a", "/lbr/command/b")])
+def test_commands_go_where_each_driver_tells_of_its_session(
+    topics: tuple[str, str], context: Any, robot: Robot
+) -> None:
+    node = BaseNode("controller", context=context)
+    channels = [
+        Channel([], np.sort(robot.arms[arm].joints), WatchedPublisher(node, LBRJointPositionCommand, topic, 0.5))
+        for arm, topic in zip(SIDES, topics, strict=True)
+    ]
+    output = JointOutput(
+        make_drive(CommandMode.POSITION, robot, load_config(CONFIG)), LbrPosition(0.005, robot), channels
+    )
+    with pytest.raises(ConfigError, match=r"allowed: <namespace>/command/<name>, with a namespace for each arm"):
+        output.driver_namespaces(robot)
+    node.destroy_node()
+
+
+@pytest.mark.parametrize("release", TOPICS)
+def test_the_releases_whose_topics_a_driver_has_are_told_once(
+    release: str, context: Any, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node, told, (_, name) = BaseNode("controller", context=context), list[str](), TOPICS[release]
+    monkeypatch.setattr(node.get_logger(), "info", told.append)
+    LbrDrivers(node, robot, {"left": "/left"}, CommandMode.POSITION, lambda torques: None)
+    for _ in range(2):
+        Arrivals(node, f"/left/{name}").arrive(LBRState())
+    assert told == [f"/left/{name}: the driver of the left arm, with the topics of releases {release}"]
     node.destroy_node()
 
 

@@ -151,9 +151,10 @@ class Channel(NamedTuple):
     optional: bool = False  # nothing is sent as long as nobody listens
 
     @property
-    def namespace(self) -> str:
-        """Of a driver whose topic is <namespace>/command/<topic>; "" where it is none."""
-        return self.publisher.topic_name.rpartition("/command/")[0]
+    def namespace(self) -> str | None:
+        """Of a driver whose topic is <namespace>/command/<topic>; None where it is none."""
+        namespace, command, _ = self.publisher.topic_name.rpartition("/command/")
+        return namespace if command else None
 
 
 class JointOutput:
@@ -187,13 +188,19 @@ class JointOutput:
             self.send(command, state, t, time.monotonic())
 
     def driver_namespaces(self, robot: Robot) -> dict[str, str]:
-        """Where the driver of each arm is in ROS, of drivers that a topic's name tells: <namespace>/command/<topic>."""
-        found = {}
-        for channel in self._channels:
-            for arm, its in robot.arms.items():
-                same = np.array_equal(channel.joints, np.sort(its.joints))
-                if self._kind.older is not None and channel.namespace and same:
-                    found[arm] = channel.namespace
+        """Where each arm's driver is in ROS, for outputs ``lbr_*``: it tells of its session beside its command topic.
+
+        Raises :class:`ConfigError` for a topic by which that place is not known.
+        """
+        found: dict[str, str] = {}
+        for arm, its in robot.arms.items() if self._kind.older is not None else ():
+            channel = next(one for one in self._channels if np.isin(its.joints, one.joints).all())
+            if (namespace := channel.namespace) is None or namespace in found.values():
+                raise ConfigError(
+                    f"{arm}.output_topic = {channel.publisher.topic_name!r:.80}: allowed: <namespace>/command/<name>, "
+                    "with a namespace for each arm, where its driver publishes LBRState"
+                )
+            found[arm] = namespace
         return found
 
     def waits(self) -> bool:

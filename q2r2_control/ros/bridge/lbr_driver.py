@@ -16,7 +16,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.types import Array, CommandMode
 
-STATE_TOPICS = "lbr_state", "state"  # of a driver, in releases for Jazzy and in those of 2024
+STATE_TOPICS = {"lbr_state": "for Jazzy", "state": "of 2024"}  # of a driver, and the releases that name it so
 _SILENT = 0.5  # a driver that has been heard and says nothing for longer is gone [s]
 _RESTART = 1.0  # a driver's process takes longer to be started anew [s]
 _SAG = 0.01  # of measured joints below what is commanded; beyond it somebody else has moved the arm [rad]
@@ -28,6 +28,7 @@ class LbrDrivers:
 
     Commands overlay a motion of the cabinet's own, whose position (``ipo_joint_position``) stays where the session
     began. The first command of a session equals it. Within a session the arm is held at the last command instead.
+    An arm whose driver never told of commanding active is not ready: joint states come without a session too.
     """
 
     def __init__(
@@ -52,11 +53,16 @@ class LbrDrivers:
                 node.create_subscription(kind, topic, partial(self._on_state, arm, topic), STREAM_QOS)
 
     def fault(self) -> Reason | None:
-        """Why an arm cannot be commanded, or None; nothing is said of a driver that was never heard."""
+        """Why an arm cannot be commanded, or None."""
         now = self._node.now
-        for arm, (state, heard) in self._newest.items():
+        for arm, namespace in self._namespaces.items():
+            if arm not in self._newest:
+                topics = " or ".join(f"{namespace}/{name}" for name in STATE_TOPICS)
+                source = f"its driver on {topics}; to start it: {load_controller('lbr_state_broadcaster', namespace)}"
+                return Reason.of(ReasonKind.FRI_SILENT, arm=arm, source=source)
+            state, heard = self._newest[arm]
             if not -_SILENT <= now - heard <= _SILENT:
-                return Reason.of(ReasonKind.FRI_SILENT, arm=arm, source=f"the driver in {self._namespaces[arm]}")
+                return Reason.of(ReasonKind.FRI_SILENT, arm=arm, source=f"the driver in {namespace}")
             if (fault := session_fault(arm, state, self._mode)) is not None:
                 return fault
         return None
@@ -96,7 +102,10 @@ class LbrDrivers:
             self._node.drop(topic, f"session_state {state.session_state}, ipo_joint_position {ipo}")
             return
         now = self._node.now
-        if arm in self._newest and now - self._newest[arm][1] > _RESTART:
+        if arm not in self._newest:
+            release = STATE_TOPICS[topic.rpartition("/")[2]]
+            self._node.get_logger().info(f"{topic}: the driver of the {arm} arm, with the topics of releases {release}")
+        elif now - self._newest[arm][1] > _RESTART:
             self._held[joints] = np.nan  # the driver may have been started anew, and does not tell
         if not active:
             self._held[joints] = np.nan
@@ -109,6 +118,11 @@ class LbrDrivers:
             self._torques[joints] = torques
             if len(self._newest) == len(self._namespaces):
                 self._on_torques(self._torques.copy())
+
+
+def load_controller(name: str, namespace: str) -> str:
+    """The command that starts a controller or broadcaster of the driver in this namespace."""
+    return f"ros2 control load_controller --set-state active {name} -c {namespace}/controller_manager"
 
 
 def session_fault(arm: str, state: Any, mode: CommandMode) -> Reason | None:

@@ -16,7 +16,7 @@ from q2r2_control.robot.description import parse_urdf
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.joint_outputs import KINDS
-from q2r2_control.ros.bridge.lbr_driver import STATE_TOPICS, session_fault
+from q2r2_control.ros.bridge.lbr_driver import STATE_TOPICS, load_controller, session_fault
 from q2r2_control.ros.bridge.messages import called_otherwise
 from q2r2_control.ros.watching.findings import FRI_CURE, Finding, error
 from q2r2_control.ros.watching.set_view import DriverView, SetView
@@ -84,8 +84,7 @@ def _examine(view: DriverView, cell: Config, robot: Robot, with_session: bool) -
     if message not in view.takers:
         others = f"takers of {', '.join(sorted(view.takers))}" if view.takers else "no taker"
         what = f"the {arm} arm: {view.command} has {others}; needed: {message}"
-        manager = f"-c {view.namespace}/controller_manager"
-        yield error(what, f"ros2 control load_controller --set-state active {controller} {manager}")
+        yield error(what, load_controller(controller, view.namespace))
     if view.state is None:
         yield error(f"the {arm} arm: no message came on {topics}", FRI_CURE)
     elif with_session and (fault := session_fault(arm, view.state, KINDS[cell.external.preset].mode)) is not None:
