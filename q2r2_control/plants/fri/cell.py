@@ -9,6 +9,7 @@ passed it in the middle of a tick, the sessions refuse the command of that tick,
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable, Mapping
 
@@ -33,6 +34,8 @@ _PASSING = 0.0015  # from a measurement until it has passed cabinet, network and
 _NO_COMMANDS = 0.1  # so long without one that came in time is told [s]
 # In which an arm loses most of its speed where no overlay comes: several periods of a cabinet [s].
 _BRAKING_TIME = 0.03
+_MISSING = 10  # messages of a cabinet in a run; fewer are chance, and more are said
+_logger = logging.getLogger(__name__)
 
 
 class FriCell:
@@ -59,10 +62,17 @@ class FriCell:
         self._margin = _MARGIN  # for the next command [s]
         self._longest_tick = period  # lately [s]
         self._told = self._ends()
+        self._heard_since: dict[str, float] = {}  # arms' first messages [s]; not of those whose losses were said
 
     def update(self, state: SessionState) -> None:
-        """A newer state of an arm's session."""
+        """A newer state of an arm's session. One warning a run says that messages of its cabinet are missing."""
+        if state.newest is not None and self.states[state.arm].newest is None:
+            self._heard_since[state.arm] = state.arrival
         self.states[state.arm] = state
+        if state.arm in self._heard_since and state.lost + state.unreadable >= _MISSING:
+            time = state.arrival - self._heard_since.pop(state.arm)
+            missing = f"{state.lost} messages lost and {state.unreadable} unreadable in {time:.1f} s"
+            _logger.warning("%s: %s: %s; q2r2 fri-check measures the network", state.arm, state.source, missing)
 
     def due(self, now: float) -> tuple[float, float]:
         """In a tick at ``now`` [s]: how long the reference has to brake first, and to go on then [s]."""

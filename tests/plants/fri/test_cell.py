@@ -64,6 +64,19 @@ def test_a_run_waits_for_the_cabinets_and_refuses_presses_until_then(config: Con
     assert {event.kind for event in events} == {ReasonKind.NOT_ENGAGED}
 
 
+def test_missing_messages_are_said_once_a_run_for_each_cabinet(
+    config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
+    pipeline = make_loop(config)
+    plant = started(pipeline)
+    for loss, said in ((0.0, []), (0.1, sorted(SIDES)), (0.1, sorted(SIDES))):
+        caplog.clear()
+        plant._loss = loss
+        pipeline.run(1.0, realtime=False)
+        lines = [entry.getMessage() for entry in caplog.records]
+        assert sorted(line.partition(":")[0] for line in lines if "10 messages lost and 0 unreadable" in line) == said
+
+
 @pytest.mark.parametrize(
     "network",
     [
