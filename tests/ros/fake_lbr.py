@@ -37,8 +37,9 @@ class FakeLbr:
         self.begun, self.trips = 0, list[str]()
         self.target: Array | None = None  # the newest command of this session
         self.ipo = self.q  # of the cabinet's own motion, which stays where the session began: commands overlay it
-        self._lower, self._upper = robot.position_lower[joints] + NARROWER, robot.position_upper[joints] - NARROWER
         self._fastest = robot.velocity_limit[joints] * (1.0 + _ROUNDING)
+        away = NARROWER + self._fastest * PERIOD  # of its guard safe_stop, the narrower one
+        self._lower, self._upper = robot.position_lower[joints] + away, robot.position_upper[joints] - away
 
     def begin(self) -> None:
         """Commanding active, as after a press on the pendant; the driver was started anew."""

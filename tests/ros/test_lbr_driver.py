@@ -28,7 +28,7 @@ from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, LbrPosition
 from q2r2_control.ros.bridge.lbr_driver import LbrDrivers
 from q2r2_control.ros.monitoring import WatchedPublisher
-from tests.ros.fake_lbr import TOPICS
+from tests.ros.fake_lbr import NARROWER, TOPICS
 from tests.ros.lbr_soak import LbrSoak
 from tests.ros.test_intakes import Arrivals
 from tests.ros.virtual_lbrs import Operator, lbr_cell, virtual_lbrs
@@ -162,3 +162,11 @@ def test_a_cell_of_their_driver_keeps_its_limits_unless_told_otherwise(tmp_path:
     assert (control.position_margin, control.velocity_scale) == (0.105, 0.85)
     changed = Path(file).read_text().replace("limits: driver", "limits: model")
     assert parse_config(changed, "cell.yaml").control.velocity_scale == 1.0
+
+
+def test_the_margin_holds_the_soft_limits_of_their_driver_and_the_step_of_its_safe_stop(
+    robot: Robot, tmp_path: Path
+) -> None:
+    margin, longest_period = load_config(lbr_cell(tmp_path)).control.position_margin, 0.01
+    assert margin >= NARROWER + math.radians(5.0)
+    assert margin >= NARROWER + float(robot.velocity_limit.max()) * longest_period

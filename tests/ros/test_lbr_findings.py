@@ -66,6 +66,7 @@ def test_nothing_is_found_of_drivers_as_lbr_fri_ros2_stack_starts_them(cell: Con
 
 
 WAITS = LBRState(session_state=int(Session.COMMANDING_WAIT), connection_quality=3, drive_state=2)
+EVERY_5_MS = LBRState(session_state=int(Session.COMMANDING_ACTIVE), client_command_mode=1, sample_time=0.005)
 TORQUE = LBRState(session_state=int(Session.COMMANDING_ACTIVE), client_command_mode=int(CommandKind.TORQUE))
 LAUNCH = "ros2 launch lbr_bringup hardware.launch.py robot_name:=left ctrl:=lbr_joint_position_command_controller"
 CASES = {
@@ -87,6 +88,11 @@ CASES = {
         {"description": urdf(0.94)},
         "left_A7 is commanded -169.0 to 169.0 deg; its driver shuts the connection beyond -164.5 to 164.5 deg",
         "control.position_margin: 0.184",
+    ),
+    "narrower positions, less a step of safe_stop": (
+        {"description": urdf(0.96), "state": EVERY_5_MS},
+        "left_A7 is commanded -169.0 to 169.0 deg; its driver shuts the connection beyond -167.1 to 167.1 deg",
+        "control.position_margin: 0.138",
     ),
     "narrower velocities": (
         {"description": urdf(speed_of_a1=0.8)},
