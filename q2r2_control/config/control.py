@@ -81,8 +81,8 @@ class ControllerSettings(StrictModel):
     position_margin: float = Field(0.01, ge=0, le=0.5, description="distance kept from position limits [rad]")
     limits: Literal["driver", "model"] = Field(
         "driver",
-        description="driver: with plant fri or a preset lbr_*, position_margin is 0.105 rad at least; with a preset "
-        "lbr_*, velocity_scale is 0.85 at most",
+        description="driver: with plant fri or a preset lbr_*, position_margin is 0.105 rad at least, and "
+        "velocity_scale 0.95 at most, with a preset lbr_* 0.85",
     )
     recovery_velocity: float = Field(0.2, gt=0, le=1, description="inward speed when outside a limit [rad/s]")
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from q2r2_control.config.fri import ModbusGripperConfig
+from q2r2_control.plants.fri.answers import CATCH_UP
 from tests.config.cell_files import CELL, changed, fault, loaded, shipped
 from tests.support.external_cell import external
 
@@ -51,6 +52,15 @@ def test_an_unknown_key_is_named_with_those_allowed_there(tmp_path: Path, path: 
 def test_the_keys_of_a_gripper_are_those_of_its_kind(tmp_path: Path, gripper: dict[str, Any], allowed: str) -> None:
     message = fault(tmp_path, changed("fri.left.gripper", gripper))
     assert message.startswith(f"fri.left.gripper.units = 9: unknown key; allowed here: {allowed}")
+
+
+def test_what_a_cabinet_sees_of_a_cell_while_answers_catch_up_is_within_the_velocity_limits(tmp_path: Path) -> None:
+    def scale(given: float) -> float:
+        text = changed("control.velocity_scale", given, lambda: shipped() | {"fri": {"left": {}, "right": {}}})
+        return loaded(tmp_path, text).control.velocity_scale
+
+    assert (1.0 + CATCH_UP) * scale(1.0) <= 1.0
+    assert scale(0.5) == 0.5
 
 
 def test_a_gripper_by_modbus_is_at_a_host_or_on_a_serial_device(tmp_path: Path) -> None:
