@@ -14,8 +14,7 @@ from q2r2_control.plants.fri.wire import CommandKind, Drives, Operation, Quality
 from q2r2_control.types import Array
 
 PERIOD = 0.005  # of the driver [s]
-TAU = 0.04  # of its filter of positions [s]
-_SHARE = 1.0 - math.exp(-PERIOD / TAU)  # of the way that the filter goes in one period
+TAU = 0.04  # of its filter of positions, by default [s]
 NARROWER = math.radians(1.0)  # than the model's limits are the driver's [rad]
 SAME = 3e-4  # of a first command and the cabinet's own position: a step from rest, where it is outside a limit [rad]
 SAG = 2e-3  # of the measured joints below what is commanded [rad]
@@ -28,8 +27,10 @@ _ORDER = [2, 0, 1, 3, 4, 6, 5]  # of the joints in its joint states
 class FakeLbr:
     """Follows commands in commanding active only. Everything that would shut the connection is in ``trips``."""
 
-    def __init__(self, robot: Robot, arm: str) -> None:
+    def __init__(self, robot: Robot, arm: str, tau: float = TAU) -> None:
+        """``tau``: of the filter of positions [s]."""
         joints = robot.arms[arm].joints
+        self._share = 1.0 if tau == 0.0 else 1.0 - math.exp(-PERIOD / tau)  # of the way, in one period
         self.q, self.v = robot.home[joints].copy(), np.zeros(len(joints))  # as commanded to the cabinet [rad], [rad/s]
         self.session, self.quality, self.safety = Session.MONITORING_READY, Quality.EXCELLENT, Safety.NORMAL
         self.drives, self.operation = Drives.ACTIVE, Operation.AUTOMATIC
@@ -65,7 +66,7 @@ class FakeLbr:
         if self.session is not Session.COMMANDING_ACTIVE:
             self.v = np.sign(self.v) * np.maximum(np.abs(self.v) - BRAKES * PERIOD, 0.0)
         elif self.target is not None:
-            q = self.q + _SHARE * (self.target - self.q)
+            q = self.q + self._share * (self.target - self.q)
             self.v = (q - self.q) / PERIOD
             if not ((self._lower <= q) & (q <= self._upper)).all():
                 self._trip(f"position {q}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,13 @@ from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, LbrPosition
 from q2r2_control.ros.bridge.lbr_driver import LbrDrivers
 from q2r2_control.ros.monitoring import WatchedPublisher
-from tests.ros.fake_lbr import NARROWER, TOPICS
+from tests.ros.fake_lbr import NARROWER, PERIOD, TOPICS, FakeLbr
 from tests.ros.lbr_soak import LbrSoak
 from tests.ros.test_intakes import Arrivals
 from tests.ros.virtual_lbrs import Operator, lbr_cell, virtual_lbrs
+
+PAGE = Path(__file__).parents[2] / "docs/kuka.md"
+FILTERS = re.findall(r"^\| (0[.\d]*) \| ([.\d]+) \| ([.\d]+) \|$", PAGE.read_text(), re.MULTILINE)  # rows of its table
 
 
 @pytest.mark.parametrize("sessions", [15, pytest.param(500, marks=pytest.mark.soak)])
@@ -61,6 +65,24 @@ def test_a_session_that_begins_while_the_arms_still_brake_gets_no_command_of_the
         assert left.target is None
         virtual.run(lambda: left.target is not None or virtual.now > 30.0)
         assert (supervisor.phase, left.trips) == (Phase.ACTIVE, [])
+
+
+@pytest.mark.parametrize(("tau", "delay", "speed"), [tuple(map(float, row)) for row in FILTERS])
+def test_the_drivers_filter_delays_a_ramp_and_is_faster_after_two_commands_as_the_page_says(
+    tau: float, delay: float, speed: float, robot: Robot
+) -> None:
+    driver, ramp = FakeLbr(robot, "left", tau), 0.2  # [rad/s]
+    driver.begin()
+    for tick in range(200):
+        driver.take(
+            LBRJointPositionCommand(joint_position=robot.home[robot.arms["left"].joints] + tick * PERIOD * ramp)
+        )
+        driver.advance()
+    assert driver.target is not None
+    assert 1e3 * (driver.target - driver.q) / ramp == pytest.approx(delay, abs=0.05)
+    driver.take(LBRJointPositionCommand(joint_position=driver.target + 2.0 * PERIOD * ramp))
+    driver.advance()
+    assert driver.v / ramp == pytest.approx(speed, abs=0.005)
 
 
 def test_external_torques_are_told_once_both_drivers_have_and_none_that_are_no_numbers(
