@@ -204,7 +204,9 @@ def verdict_markup(verdict: Verdict) -> str:
 def _torque_rows(torque: TorqueSummary) -> Iterator[tuple[str, str]]:
     if torque.min_measured_distance_mm is not None and torque.measured_closest_pair is not None:
         pair = " | ".join(torque.measured_closest_pair)
-        yield "nearest measured pair", f"{torque.min_measured_distance_mm:.1f} mm, {pair}"
+        found = f"{torque.min_measured_distance_mm:.1f} mm, {pair}"
+        met = f"[red]measured links met: {found}; what was measured broke what was promised[/]"
+        yield "nearest measured pair", met if torque.met else found
     pressed = ", ".join(" | ".join(pair) for pair in torque.pressed_pairs)
     force = f": {torque.max_wall_force_n:.0f} N at most" if pressed else ""
     yield "wall pressed by", f"{pressed or 'no pair'}{force}"

@@ -106,8 +106,8 @@ def run(
     A cell in which q2r2 check finds a fault is refused with the same line and exit code 2, unless --force is given.
     One with real cabinets that is not commissioned is refused too, unless --i-know is given. Its joints go at a tenth
     of their speed until --full-speed is given.
-    Exit 1 where a tool is more than 100 mm from its reference at the end, and where an arm refused every press that
-    engages it.
+    Exit 1 where a tool is more than 100 mm from its reference at the end, where an arm refused every press that
+    engages it, and where measured links met in torque mode.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
     cell = load_config(config)
@@ -148,7 +148,7 @@ def run(
     )
     done = run_cell(cell, options)
     print_summary(done, json)
-    if not done.summary.followed:
+    if not done.summary.followed or (done.summary.torque is not None and done.summary.torque.met):
         raise Exit(1)
 
 

@@ -134,8 +134,10 @@ def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tupl
         if at_least(model.collision, data.collision, p) >= max(least, model.shell[p] + _BAND):
             continue
         distance = measure(model.collision, data.collision, p)
-        if distance < least:
-            least, closest = distance, p
+        # Pairs that touch as they may hide none that meets.
+        apart = max(distance, 0.0) if model.shell[p] < 0.0 else distance
+        if apart < least:
+            least, closest = apart, p
         # The smooth distance is no smaller.
         if distance >= model.shell[p] + _BAND:
             continue
@@ -207,7 +209,7 @@ class WallReport:
     force: float  # the largest of them [N]
     energy: float  # stored in the wall [J]
     closest_pair: tuple[str, str]  # measured
-    closest_distance: float  # [m]; NaN if q or v is not finite
+    closest_distance: float  # [m]; 0 where pairs touch that may, NaN if q or v is not finite
 
 
 class MeasuredSeparation:

@@ -113,13 +113,18 @@ def with_controls(config: Config) -> Config:
 
 
 def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
-    """The same ``results``, all failed where measured links met or a stop was not certified in their run."""
+    """The same ``results``, all failed where links met, a stop was not certified or a tool did not follow."""
     faults, torque = [], summary.torque
-    if torque is not None and torque.measured_closest_pair and (torque.min_measured_distance_mm or 0.0) < 0.0:
+    if torque is not None and torque.met and torque.measured_closest_pair:
         met = " and ".join(torque.measured_closest_pair)
         faults.append(f"measured {met} met: {torque.min_measured_distance_mm:.1f} mm, {torque.max_wall_force_n:.0f} N")
     if summary.uncertified_ticks:
         faults.append(f"{summary.uncertified_ticks} ticks without a certified stop")
+    faults += [
+        f"{name} tool {arm.end_error_mm:.0f} mm from its reference at the end"
+        for name, arm in summary.arms.items()
+        if not arm.followed
+    ]
     results = tuple(results)
     if not faults:
         return results

@@ -75,6 +75,11 @@ class TorqueSummary:
     rate_limited_ticks: int = 0  # some joint's torque could not change as fast as it should
     held_ticks: int = 0  # without a usable measurement: the last gravity torque was held
 
+    @property
+    def met(self) -> bool:
+        """Whether measured links met that may not touch: what was measured broke what was promised."""
+        return (self.min_measured_distance_mm or 0.0) < 0.0
+
     def add(self, dt: float, impedance: ImpedanceReport, wall: WallReport) -> None:
         """Count one tick of ``dt`` [s]."""
         least = math.inf if self.min_measured_distance_mm is None else self.min_measured_distance_mm

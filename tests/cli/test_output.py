@@ -109,7 +109,9 @@ def test_a_failed_task_is_told_with_how_late_the_loop_was(summary: RunSummary) -
     assert late_line(summary, [failed]) is None, "simulated time is never late"
 
 
-def test_no_task_succeeds_while_measured_links_met_or_no_stop_was_certified(summary: RunSummary) -> None:
+def test_no_task_succeeds_while_measured_links_met_no_stop_was_certified_or_a_tool_did_not_follow(
+    summary: RunSummary,
+) -> None:
     done = TaskResult("stack", True, {}, "")
     pair = ("left_link_6_0", "right_link_6_0")
     torque = TorqueSummary({}, min_measured_distance_mm=0.4, measured_closest_pair=pair, max_wall_force_n=364.0)
@@ -117,6 +119,9 @@ def test_no_task_succeeds_while_measured_links_met_or_no_stop_was_certified(summ
     met = replace(summary, torque=replace(torque, min_measured_distance_mm=-6.9))
     (failed,) = held_to_promises([done], met)
     assert (failed.succeeded, failed.reason) == (False, f"measured {pair[0]} and {pair[1]} met: -6.9 mm, 364 N")
+    assert "measured links met: -6.9 mm, left_link_6_0 | right_link_6_0; what was measured broke" in text_of(met)
+    away = replace(summary, arms=summary.arms | {"left": replace(summary.arms["left"], end_error_mm=256.4)})
+    assert held_to_promises([done], away)[0].reason == "left tool 256 mm from its reference at the end"
     (failed,) = held_to_promises([TaskResult("stack", False, {}, "fell")], replace(summary, uncertified_ticks=3))
     assert failed.reason == "fell; 3 ticks without a certified stop"
 

@@ -7,11 +7,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from typer import Exit
 
+from q2r2_control.cli.cell_run import RunOptions
+from q2r2_control.config.cell import Config
 from q2r2_control.recording.reader import Recording
 from tests.cli.command import CELL, FAST, changed_cell, one_object, q2r2
 from tests.support.pictures import needs_opengl
 
+MODULE = "q2r2_control.cli.run"
 OPTIONS = (*FAST[2:], "--duration", "0.1")
 
 
@@ -32,6 +36,20 @@ def test_with_force_it_says_what_is_wrong_and_runs(tmp_path: Path) -> None:
     assert one_object(result.stdout)["ticks"] > 0
 
 
+@pytest.mark.parametrize(
+    ("mode", "home", "said"),
+    [
+        ("position", "1.0,", "mm from its reference: the tool did not follow"),
+        ("torque", "0.7,", "| table_0; what was measured broke what was promised"),
+    ],
+)
+def test_an_arm_that_begins_in_the_table_ends_with_exit_code_1(tmp_path: Path, mode: str, home: str, said: str) -> None:
+    file = changed_cell(tmp_path, "0.0204, 0.348,", f"0.0204, {home}")
+    result = q2r2("run", file, "--mode", mode, "--fast", "--headless", "--duration", "0.1", "--force")
+    assert result.exit_code == 1
+    assert said in " ".join(result.stdout.split())
+
+
 def test_rt_says_in_one_line_what_the_system_refuses_and_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     refusal = "real time: no SCHED_FIFO: Operation not permitted; the run goes on without"
 
@@ -49,6 +67,27 @@ def test_rt_says_in_one_line_what_the_system_refuses_and_runs(monkeypatch: pytes
 
 
 CAMERAS = ["above", "left_wrist", "right_wrist"]
+
+
+@pytest.mark.parametrize(
+    ("display", "viser", "shown"),
+    [(True, True, (True, None)), (False, True, (False, ("127.0.0.1", 0))), (False, False, (False, None))],
+    ids=["display", "no display", "neither"],
+)
+def test_a_demo_at_a_terminal_shows_the_arms_where_there_is_a_way_to(
+    monkeypatch: pytest.MonkeyPatch, display: bool, viser: bool, shown: tuple[bool, tuple[str, int] | None]
+) -> None:
+    def run_cell(config: Config, options: RunOptions) -> None:
+        assert (options.window, options.page) == shown
+        raise Exit(7)
+
+    monkeypatch.setattr(f"{MODULE}._shows_table", lambda headless, viewer: True)
+    monkeypatch.setattr(f"{MODULE}.has_display", lambda: display)
+    monkeypatch.setattr(f"{MODULE}.find_spec", lambda name: viser or None)
+    monkeypatch.setattr(f"{MODULE}.run_cell", run_cell)
+    result = q2r2("demo")
+    assert result.exit_code == 7
+    assert ("q2r2_control[web]" in result.stderr) is (not (display or viser))
 
 
 def test_an_episode_of_the_demo_has_the_pictures_of_which_an_export_makes_videos(tmp_path: Path) -> None:

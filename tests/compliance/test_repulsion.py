@@ -96,6 +96,20 @@ def test_the_report_names_what_presses_and_the_closest_pair() -> None:
         assert all(pair in pressing for pair, distance in distances.items() if distance < SHELL - 4e-4)
 
 
+def test_a_pair_that_touches_as_it_may_hides_no_pair_that_meets() -> None:
+    q = ROBOT.home.copy()
+    q[1] = 0.7  # the left fingers 10 mm in the table
+    contact = {"pair": ("*_finger_*", "table"), "depth": 0.015, "speed": 0.03}
+    settings = ControllerSettings.model_validate({"contact_allowed": [contact]})
+    assert wall().update(q, REST).closest_distance == pytest.approx(-0.01, abs=1e-3)
+    assert MeasuredSeparation(ROBOT, settings).update(q, REST).closest_distance == 0.0
+    q[9] = q[2] = 0.0
+    q[1] = q[8] = 0.85  # hands too
+    report = MeasuredSeparation(ROBOT, settings).update(q, REST)
+    assert report.closest_distance < 0.0
+    assert not any("finger" in name for name in report.closest_pair)
+
+
 def test_fingers_press_at_the_openings_that_were_set() -> None:
     random, separation = np.random.default_rng(4), MeasuredSeparation(ROBOT, ControllerSettings(), WallSettings())
     closed = collision_model_at(ROBOT.collision_model, ROBOT.finger_bodies, {"left": (0.0, 0.1)})
