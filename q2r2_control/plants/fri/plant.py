@@ -47,7 +47,7 @@ class FriPlant:
         if self._longest < 2.0 * self._period:
             allowed = "allowed with cabinets: two ticks of loop_rate_hz or more, such as 0.01"
             raise ConfigError(f"control.max_substep = {self._longest:g}: {allowed}")
-        self._mode = CommandMode.POSITION
+        self._mode, self._torque_rate_limit = CommandMode.POSITION, config.impedance.torque_rate_limit
         self.grippers = self._modbus_grippers()
         self._answering: AnsweringProcess | None = None
         # The newest: when each message arrived, by the monotonic clock, and how long until its answer was sent [s].
@@ -110,7 +110,7 @@ class FriPlant:
         for arm, its in self._cabinets.items():
             source = f"cabinet {its.address} on port {its.port}"
             joints = self._robot.arms[arm].joints
-            limits = self._robot.torque_limit[joints], self._robot.velocity_limit[joints]
+            limits = self._robot.torque_limit[joints], self._robot.velocity_limit[joints], self._torque_rate_limit
             session = ArmSession(arm, source, its.version, _KINDS[self._mode], *limits)
             try:
                 lines.append(Line(session, its.address, open_socket(its.address, its.port).detach()))

@@ -32,6 +32,7 @@ _MOST_AHEAD = 20  # messages that may come at once after a moment without any
 # A torque that nobody renews is a push without end: one that brakes follows it, and after a while no answer, so that
 # the cabinet ends the session [s].
 _TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
+_BRAKING_RATE = 5000.0  # of torques at least: a slower damping would come too late [Nm/s]
 # Of a reference that begins where its arm is held, or, with torques, where it is measured [rad].
 _SAME, _NEAR = 1e-6, 0.02
 _FROM_REST = 20.0  # more than a joint's acceleration in the first tick [rad/s^2]
@@ -48,11 +49,13 @@ class ArmSession:
         wanted: CommandKind = CommandKind.POSITION,
         torque_limit: Array | None = None,
         velocity_limit: Array | None = None,
+        torque_rate_limit: float = math.inf,
     ) -> None:
         """``source``: the cabinet in words; ``version`` of FRI, None: either.
 
         ``torque_limit`` (n,): of overlays; ``velocity_limit`` (n,): none is measured beyond. A position that jumps once
         lets the damping then push a joint back by the way of one period at that speed, and no further.
+        ``torque_rate_limit``: between two answers [Nm/s]. It holds for the damping too, down to 5000.
         """
         self.state, self._version = SessionState(arm, source, wanted), version
         self.path = ReferencePath(0.0, np.zeros(JOINTS))
@@ -62,6 +65,8 @@ class ArmSession:
         self._damping = np.zeros(JOINTS)  # that brakes where no overlay comes [Nm s/rad]
         none = np.full(JOINTS, math.inf)
         self._torque_limit = none if torque_limit is None else torque_limit
+        self._torque_rate_limit = max(torque_rate_limit, _BRAKING_RATE)
+        self._tau_sent = np.zeros(JOINTS)
         self._velocity_limit = joints_of(none if velocity_limit is None else velocity_limit)
         self._outputs: dict[str, IoValue] = {}
         self._answers = 0
@@ -196,6 +201,7 @@ class ArmSession:
         self._cease()
         self._begun = False
         self._times = None
+        self._tau_sent = np.zeros(JOINTS)
 
     def _cease(self) -> None:
         self.state.ended += self.state.following
@@ -238,8 +244,11 @@ class ArmSession:
         wanted = self._tau
         if wanted is None or not self.state.following or age > _TORQUE_LASTS:
             wanted = -self._damping * np.array(self.state.velocity)
-        tau = joints_of(np.clip(wanted, -self._torque_limit, self._torque_limit))
-        return FriCommand(self._answers, message.counter, message.ipo_q or message.q, tau, self._outputs)
+        change = self._torque_rate_limit * self.state.period
+        tau = np.clip(wanted, -self._torque_limit, self._torque_limit)
+        self._tau_sent = np.clip(tau, self._tau_sent - change, self._tau_sent + change)
+        q = message.ipo_q or message.q
+        return FriCommand(self._answers, message.counter, q, joints_of(self._tau_sent), self._outputs)
 
 
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -44,8 +45,9 @@ def test_every_multiplier_th_message_is_answered() -> None:
     assert [answer is None for answer in answers] == [True, True, False, True, True, False]
 
 
-def torque_cabinet(limit: float = 100.0) -> Cabinet:
-    return Cabinet(ArmSession("left", "cabinet", None, CommandKind.TORQUE, np.full(7, limit)))
+def torque_cabinet(limit: float = 100.0, rate: float = math.inf) -> Cabinet:
+    limits = np.full(7, limit)
+    return Cabinet(ArmSession("left", "cabinet", None, CommandKind.TORQUE, limits, torque_rate_limit=rate))
 
 
 def begin_torques(cabinet: Cabinet) -> Monitoring:
@@ -73,6 +75,18 @@ def test_a_torque_without_a_newer_one_becomes_one_that_brakes_and_ends_with_the_
     answers = [cabinet.ask(replace(active, q=tuple(next(q).tolist()))) for _ in range(25)]
     torques = [answer and answer.tau and round(answer.tau[0], 3) for answer in answers]
     assert torques == [1.0] * 4 + [-4.0] * 16 + [None] * 5
+
+
+def test_a_torque_that_brakes_keeps_the_rate_limit_down_to_one_at_which_it_still_brakes() -> None:
+    for rate, change in ((6000.0, 30.0), (100.0, 25.0)):
+        cabinet = torque_cabinet(rate=rate)
+        active, still, ones = begin_torques(cabinet), (0.0,) * 7, (1.0,) * 7
+        now = cabinet.now
+        cabinet.session.follow(ArmCommand(now, now, now + 0.005, Q, still, ones, {}, None, (400.0,) * 7))
+        answers = [cabinet.ask(replace(active, q=tuple(np.add(Q, 0.001 * tick).tolist()))) for tick in range(1, 7)]
+        torques = [answer.tau[0] for answer in answers if answer and answer.tau]
+        assert np.diff([0.0, *torques]).min() == pytest.approx(-change)
+        assert torques[-1] == pytest.approx(-80.0)
 
 
 def test_commands_without_an_overlay_brake_as_long_as_they_come() -> None:

@@ -70,7 +70,7 @@ class VirtualCabinets:
         self.lines = {}
         for arm in self.cabinets:
             joints = self._robot.arms[arm].joints
-            limits = self._robot.torque_limit[joints], self._robot.velocity_limit[joints]
+            limits = self._robot.torque_limit[joints], self._robot.velocity_limit[joints], 5000.0
             self.lines[arm] = ArmSession(arm, "cabinet", None, _KINDS[self._mode], *limits)
         states = [copy(session.state) for session in self.lines.values()]
         self.cell = FriCell(self._robot, states, self._period, self._longest, self._grippers)
