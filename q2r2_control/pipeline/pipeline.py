@@ -15,7 +15,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive, permitted
 from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import ROUTINE, Reason, ReasonKind
 from q2r2_control.inputs.base import Input, PolicySource, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
 from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock
@@ -332,6 +332,6 @@ class Pipeline(RequestedRun):
         for refusal in step.refusals.values():
             self.teleop.pause(now, refusal)  # or the operator would think that the arm follows
         for reason in self.supervisor.events:
-            _logger.warning(sentence(reason))
+            _logger.log(logging.INFO if reason.root.kind in ROUTINE else logging.WARNING, sentence(reason))
         self.supervisor.events.clear()
         return step

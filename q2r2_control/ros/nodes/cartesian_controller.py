@@ -18,7 +18,7 @@ from std_srvs.srv import SetBool, Trigger
 from q2r2_control.config.cell import load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import TorqueDrive, permitted
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import ROUTINE, Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, OK, WARN, ManagedNode
@@ -45,7 +45,6 @@ _LONGEST_STOP = 3.0  # [s]
 _QUIET = 0.3  # nobody else commands the arms for so long before this node does [s]
 _LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
 _SAFE_TARGET_PERIOD = 0.012  # [s]
-_ROUTINE = ReasonKind.ACTIVATED, ReasonKind.HOMING_ARRIVED, ReasonKind.NODE_ENDS  # nothing is wrong
 
 
 class CartesianControllerNode(ManagedNode):
@@ -162,7 +161,7 @@ class CartesianControllerNode(ManagedNode):
         if events := self._supervisor.events:
             log = self.get_logger()
             for event in events:
-                if event.root.kind in _ROUTINE:
+                if event.root.kind in ROUTINE:
                     log.info(sentence(event))
                 else:
                     log.warning(sentence(event))

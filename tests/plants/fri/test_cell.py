@@ -64,6 +64,15 @@ def test_a_run_waits_for_the_cabinets_and_refuses_presses_until_then(config: Con
     assert {event.kind for event in events} == {ReasonKind.NOT_ENGAGED}
 
 
+def test_an_activation_is_told_and_is_no_warning(config: Config, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    pipeline = make_loop(config)
+    started(pipeline)
+    pipeline.run(1.0, realtime=False)
+    told = [entry.levelname for entry in caplog.records if entry.getMessage() == ReasonKind.ACTIVATED.template]
+    assert told == ["INFO"]
+
+
 def test_missing_messages_are_said_once_a_run_for_each_cabinet(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
