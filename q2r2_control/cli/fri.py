@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import select
 import signal
 import subprocess
 import sys
@@ -49,6 +51,14 @@ class Pendant:
         self._said: dict[str, str] = {}
         self._ready_since: dict[str, float | None] = dict.fromkeys(cabinets)
         self._active_since, self._stopped_at = math.inf, 0.0
+        self._held = False
+
+    def toggle(self) -> None:
+        """End the sessions of all arms, or let them begin again."""
+        self._held = not self._held
+        say("overlays are stopped, Enter starts them" if self._held else "overlays start", self._console)
+        for cabinet in self._cabinets.values() if self._held else ():
+            cabinet.stop()
 
     def look(self, now: float) -> None:
         for arm, cabinet in self._cabinets.items():
@@ -57,7 +67,7 @@ class Pendant:
                 self._ready_since[arm] = None
             elif since is None:
                 self._ready_since[arm] = now
-            elif now - since >= self._start_after:
+            elif now - since >= self._start_after and not self._held:
                 cabinet.start_overlay()
             line = in_words(cabinet.session)
             if cabinet.trips and cabinet.session < Session.COMMANDING_WAIT:
@@ -77,11 +87,21 @@ class Pendant:
             first.stop()
 
 
+def _enter_pressed() -> bool:
+    """Whether a line was entered; not for a process in the background, which reading from a terminal would stop."""
+    try:
+        is_ours = os.tcgetpgrp(0) == os.getpgrp()
+    except OSError:  # no terminal
+        return False
+    return is_ours and bool(select.select([0], (), (), 0)[0]) and bool(os.read(0, 1024))
+
+
 def fri_cabinet(
     config: ConfigFile,
     mode: Annotated[CommandMode, Option(help="What the application lets a client command.")] = CommandMode.POSITION,
     period: Annotated[float, Option(min=1, max=10, help="Between two messages [ms].")] = 10.0,
     right_period: Annotated[float | None, Option(min=1, max=10, help="Of the right arm's cabinet [ms].")] = None,
+    multiplier: Annotated[int, Option(min=1, max=10, help="Messages to one answer: FRI's receiveMultiplier.")] = 1,
     fri: Annotated[int, Option(min=1, max=2, help="Version of FRI.")] = 2,
     start_after: Annotated[float, Option(min=0, help="An overlay is started after so long with a client [s].")] = 0.5,
     drop_every: Annotated[float | None, Option(help="The pendant ends a session as often as this [s].")] = None,
@@ -109,7 +129,8 @@ def fri_cabinet(
     """Stand in for the Sunrise cabinets of a cell: q2r2 run CONFIG --plant fri, in another terminal, drives its arms.
 
     Each cabinet goes through the states of a session, guards its arm's limits, and ends the session of a client that
-    breaks one, as a real one does. It is a rehearsal: KUKA's own controller and its safety are not in it.
+    breaks one, as a real one does. Enter at the terminal is the pendant's key: it stops and starts the overlays.
+    It is a rehearsal: KUKA's own controller and its safety are not in it.
     """
     cell, console, stop = load_config(config), Console(stderr=True), StopRequest()
     if mode not in _KINDS:
@@ -121,7 +142,7 @@ def fri_cabinet(
     cabinets, clients = {}, {}
     for arm, its in cell.fri.items():
         every = right_period if arm == "right" and right_period is not None else period
-        cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every)
+        cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every, multiplier)
         clients[str(arm)] = "127.0.0.1", its.port
     grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if isinstance(its.gripper, GripperIoConfig)}
     network = Network(loss, duplicate, 1e-3 * jitter, cut)
@@ -136,6 +157,8 @@ def fri_cabinet(
 
     def look(now: float) -> None:
         nonlocal last
+        if _enter_pressed():
+            pendant.toggle()
         pendant.look(now)
         if watch is not None and now - last >= _JUDGED_EVERY:
             watch.look(now, now - last)
@@ -180,7 +203,11 @@ def rehearsal(
         *(word for task in tasks for word in ("--task", task.name)),
     ]
     child = subprocess.Popen(
-        [sys.executable, "-m", "q2r2_control", *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        [sys.executable, "-m", "q2r2_control", *words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
     )
     results: list[TaskResult] = []
     try:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from q2r2_control.cli.fri import Pendant
+from q2r2_control.config.cell import load_config
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm, Trip
-from q2r2_control.plants.fri.wire import Safety, Session
+from q2r2_control.plants.fri.wire import LONGEST, Safety, Session, read_monitoring
 from tests.cli.command import q2r2
 
 CELL = "config/dual_iiwa7_fri.yaml"
@@ -37,6 +42,50 @@ def test_a_safety_stop_ends_a_session_and_lasts_a_second() -> None:
         seen.append(cabinets["left"].safety)
     assert seen == [Safety.NORMAL] * 2 + [Safety.STOP_1_ON_PATH] * 2 + [Safety.NORMAL]
     assert (cabinets["left"].trips, cabinets["right"].trips) == ([Trip.SAFETY], [])
+
+
+def test_enter_at_the_terminal_stops_all_overlays_and_starts_them_again(fri_cell: str) -> None:
+    ours, theirs = os.openpty()
+    # The first terminal that a new session opens is its own.
+    opening = f"import os; os.dup2(os.open({os.ttyname(theirs)!r}, os.O_RDWR), 0)"
+    code = f"{opening}; from q2r2_control.cli.app import app; app()"
+    command = (sys.executable, "-c", code, "fri-cabinet", fri_cell, "--json")
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as process:
+        assert process.stderr is not None
+        said = iter(process.stderr.readline, "")
+        assert any("right: monitoring wait" in line for line in said)
+        for told in ("overlays are stopped, Enter starts them\n", "overlays start\n"):
+            os.write(ours, b"\n")
+            assert next(said) == told
+        process.terminate()
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_overlays_that_were_stopped_at_the_pendant_start_at_the_next_key_only() -> None:
+    ones = (1.0,) * 7
+    settings = CabinetSettings(ones, ones, ones, ones, ones)
+    cabinets = {arm: Cabinet(settings, StillArm((0.0,) * 7)) for arm in ("left", "right")}
+    pendant = Pendant(cabinets, 0.5, None, None, Console(quiet=True))
+    for cabinet in cabinets.values():
+        cabinet.session = Session.COMMANDING_ACTIVE
+    pendant.toggle()
+    pendant.look(1.0)
+    pendant.look(9.0)
+    assert [(cabinet.trips, cabinet._overlay) for cabinet in cabinets.values()] == [([Trip.STOPPED], False)] * 2
+    pendant.toggle()
+    pendant.look(10.0)
+    assert all(cabinet._overlay for cabinet in cabinets.values())
+
+
+def test_the_messages_say_how_many_of_them_there_are_to_one_answer(fri_cell: str) -> None:
+    port = load_config(fri_cell).fri["left"].port
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.bind(("127.0.0.1", port))
+        client.settimeout(30.0)
+        assert q2r2("fri-cabinet", fri_cell, "--multiplier", "3", "--duration", "0.1").exit_code == 0
+        assert read_monitoring(client.recv(LONGEST)).multiplier == 3
 
 
 @pytest.mark.parametrize(

@@ -143,8 +143,8 @@ class Cabinet:
 
     @property
     def is_answered(self) -> bool:
-        """Whether the newest message was answered."""
-        return self._answer is not None
+        """Whether the newest message was answered, or asks for no answer."""
+        return self._answer is not None or self._sent % self.settings.multiplier > 0
 
     def start_overlay(self) -> None:
         """The application asks for the client's command, as after a press on the pendant."""

@@ -132,7 +132,9 @@ class SimulatedArms:
         return Command(CommandMode.TORQUE, q, v, tau, self.openings)
 
 
-def settings_of(robot: Robot, arm: str, kind: CommandKind, version: int, period: float) -> CabinetSettings:
+def settings_of(
+    robot: Robot, arm: str, kind: CommandKind, version: int, period: float, multiplier: int = 1
+) -> CabinetSettings:
     """A cabinet with the guards of an arm: the limits of the robot, and what catching up adds to its accelerations."""
     joints = robot.arms[arm].joints
     acceleration = (1.0 + CATCH_UP) ** 2 * robot.acceleration_limit + CATCH_UP_RAMP * robot.velocity_limit
@@ -144,6 +146,7 @@ def settings_of(robot: Robot, arm: str, kind: CommandKind, version: int, period:
         torque=joints_of(robot.torque_limit[joints]),
         version=version,
         period=period,
+        multiplier=multiplier,
         command=kind,
     )
 

@@ -122,6 +122,18 @@ def test_the_arm_goes_where_the_client_commands(version: int, multiplier: int) -
     assert message.q[0] > HOME[0] + 0.01
 
 
+def test_only_a_message_that_asks_for_an_answer_waits_for_one() -> None:
+    cabinet, client = Cabinet(replace(SETTINGS, multiplier=2), StillArm(HOME)), Client()
+    waits = []
+    for _ in range(4):
+        message = cabinet.send(0.0)
+        waits.append(not cabinet.is_answered)
+        if message.counter % 2 == 0:
+            cabinet.receive(write_command(client.answer(message), 2))
+            assert cabinet.is_answered
+    assert waits == [False, True] * 2
+
+
 def moved(by: float) -> Joints:
     return (HOME[0] + by, *HOME[1:])
 
