@@ -96,8 +96,12 @@ def test_ctrl_c_before_the_interpreter_has_started_waits_for_the_executable_of_a
 
 
 HANGS = """
-import os, sys
-from q2r2_control.ros.base_node import BaseNode, run_node
+import os, signal, sys, time
+from q2r2_control.ros.base_node import BaseNode
+from q2r2_control.ros.launch import executables
+
+def left():
+    return signal.getitimer(signal.ITIMER_REAL)[0]
 
 class Node(BaseNode):
     exit_code, priority = 0, 5
@@ -105,18 +109,30 @@ class Node(BaseNode):
     def __init__(self):
         super().__init__("hangs")
 
-    def destroy_node(self):
-        print(os.sched_getscheduler(0) == os.SCHED_OTHER, flush=True)
-        while True:
-            pass
+    def close(self):
+        steady = time.monotonic
+        time.monotonic = lambda: steady() + 3.0  # it brakes for so long
 
-sys.exit(run_node(Node))
+    def destroy_node(self):
+        print(os.sched_getscheduler(0) == os.SCHED_OTHER, 0.0 < left() <= 2.0, flush=True)
+        while HANGS:
+            pass
+        super().destroy_node()
+
+HANGS = sys.argv.pop() == "hangs"
+executables.NODES["hangs"] = "hangs", "Node"
+sys.modules["q2r2_control.ros.nodes.hangs"] = sys.modules["__main__"]
+print(executables._executable("hangs")(), 0.0 < left() <= 2.0)
 """
 
 
-def test_a_node_whose_middleware_does_not_end_goes_after_all_and_does_not_go_first_meanwhile() -> None:
-    run = subprocess.run([sys.executable, "-c", HANGS], cwd=ROOT, stdout=subprocess.PIPE, text=True, timeout=120)
-    assert (run.stdout, run.returncode) == ("True\n", -signal.SIGALRM)
+@pytest.mark.parametrize(("hangs", "said", "code"), [("hangs", "", -signal.SIGALRM), ("ends", "0 True\n", 0)])
+def test_a_node_goes_in_time_whatever_its_middleware_does_and_does_not_go_first_meanwhile(
+    hangs: str, said: str, code: int
+) -> None:
+    command = [sys.executable, "-c", HANGS, hangs]
+    run = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, timeout=120)
+    assert (run.stdout, run.returncode) == (f"True True\n{said}", code)
 
 
 LISTENER = """

@@ -11,8 +11,6 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 
-from q2r2_control.process.scheduling import LONGEST_END
-
 # Module of ``nodes``, and in it the class of a node, or the function that runs more than one.
 NODES = {
     "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),
@@ -41,10 +39,10 @@ def _executable(name: str) -> Callable[[], int]:
             print(f"{imported.__doc__}\nParameters, which docs/ros.md has: {name} --ros-args -p NAME:=VALUE")
             return 0
         node_or_run = getattr(imported, made)
-        from q2r2_control.ros.base_node import run_node
+        from q2r2_control.ros.base_node import end_in_time, run_node
 
         code = run_node(node_or_run) if isinstance(node_or_run, type) else int(node_or_run())
-        signal.alarm(LONGEST_END)  # what the middleware still does as the process goes
+        end_in_time()  # what the middleware still does as the process goes
         return code
 
     return run
