@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.pairs import link_of, pair_names
-from q2r2_control.robot.robot import Arm, Robot
 from q2r2_control.types import Array
+
+if TYPE_CHECKING:
+    from q2r2_control.robot.robot import Arm, Robot
 
 _SAMPLES, _BEST, _STEPS = 2000, 24, 150
 _INSIDE = 0.85  # of the half range that each joint may use

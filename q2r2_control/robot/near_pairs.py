@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ import pinocchio as pin
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.floor import FLOOR
+from q2r2_control.robot.home_search import find_home, mirrored_home
 from q2r2_control.robot.pairs import link_of
 from q2r2_control.types import Interval
 
@@ -118,8 +120,13 @@ def lines_to_paste(robot: Robot, config: Config, near: Iterable[NearPair]) -> li
     return lines
 
 
-def warning_at_home(robot: Robot) -> str | None:
-    """One line about pairs that are nearer at home than usual settings allow, and about overlapping ones that part."""
+def warning_at_home(
+    robot: Robot, exclusions: Iterable[ET.Element] | None, positions: Mapping[str, float]
+) -> str | None:
+    """One line about pairs that are nearer at home than usual settings allow, and about overlapping ones that part.
+
+    ``exclusions`` and ``positions`` of all joints are those that the robot is made of.
+    """
     kept = ControllerSettings().min_distance
     near = {(pair.name_a, pair.name_b): pair for pair in robot.distances(robot.home) if pair.distance < kept}
     if not near and not robot.ignored_pairs:
@@ -143,16 +150,39 @@ def warning_at_home(robot: Robot) -> str | None:
         return None
     more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
     text = f"{robot.name}: at home, with min_distance {1e3 * kept:g} mm: {'; '.join([*lines.values()][:_NAMED])}{more}"
-    remedies = [] if len(never) == len(lines) else ["home={joint: position, ...} where pairs are apart"]
+    if elsewhere := len(never) < len(lines):
+        # Those that overlap at this home are watched at one where they do not.
+        hardly = [links for links, (least, greatest) in spreads.items() if least < 0.0 <= greatest < kept]
+        never += [links for links in hardly if links not in never]
+    # With an SRDF, links that always overlap are no longer left out by themselves.
+    disabled = [_srdf_line(links) for links, (_, greatest) in spreads.items() if greatest < kept]
+    remedies = []
     if never:
-        # With an SRDF, links that overlap at home only are no longer left out by themselves.
-        overlapping = [(link_of(a), link_of(b)) for a, b in robot.ignored_pairs]
-        disabled = "".join(map(_srdf_line, dict.fromkeys([*never, *overlapping])))
         pairs = [{"pair": links, "distance": _whole_millimetres(spreads[links][0])} for links in never]
-        remedies.append(f"srdf='<robot name=\"{robot.name}\">{disabled}</robot>'")
+        file = f"srdf='<robot name=\"{robot.name}\">{''.join(disabled)}</robot>'"
+        remedies.append(file if exclusions is None else f"in the SRDF {''.join(disabled)}")
         if all(spreads[links][0] >= 0.0 for links in never):
             remedies.append(f"ControllerSettings(pairs={pairs})")
-    return f"{text}; the arm may not move freely from there; to change: {', or '.join(remedies)}"
+    change = ", or ".join(remedies)
+    if elsewhere:
+        watched = [*(exclusions or ()), *map(ET.fromstring, disabled)]
+        tools = {name: arm.tool_frame for name, arm in robot.arms.items()}
+        home = _home_apart(type(robot)(ET.fromstring(robot.urdf), watched, tools, positions, robot.name), kept)
+        also = f", and for links that hardly part {change}" if never else ""
+        change = f"home={home or '{joint: position, ...} where pairs are apart'}{also}"
+    return f"{text}; the arm may not move freely from there; to change: {change}"
+
+
+def _home_apart(robot: Robot, kept: float) -> dict[str, float] | None:
+    """Positions by joint at which all pairs are ``kept`` [m] apart; None where none are found."""
+    q, room, placed = robot.home.copy(), np.full(len(robot.collision_model.collisionPairs), kept), list[str]()
+    for name, arm in robot.arms.items():
+        like = mirrored_home(robot, name, placed[0], q) if placed else None
+        q[arm.joints] = find_home(robot, name, q, room, placed, like)
+        placed.append(name)
+    q = np.clip(q.round(2), robot.position_lower, robot.position_upper)
+    found = bool((robot.distance_values(q) >= room).all())
+    return dict(zip(robot.joint_names, q.tolist(), strict=True)) if found else None
 
 
 def _whole_millimetres(distance: float) -> float:

@@ -167,8 +167,9 @@ class Robot:
             raise RobotError(f"{where}: {given}; expected a mapping such as {{'left': 'left_tool_frame'}}")
         if len(set(arms.values())) < len(arms):
             raise RobotError(f"{where}: arms = {shown(arms, 200)}: allowed: a tool frame of its own for each arm")
-        robot = cls(urdf, exclusions, dict(arms), _home_of(urdf, home or {}, where), where)
-        if (warning := warning_at_home(robot)) is not None:
+        positions = _home_of(urdf, home or {}, where)
+        robot = cls(urdf, exclusions, dict(arms), positions, where)
+        if (warning := warning_at_home(robot, exclusions, positions)) is not None:
             _logger.warning(warning)
         return robot
 

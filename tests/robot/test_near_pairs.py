@@ -23,11 +23,13 @@ def ur5() -> Path:
     return load_description("example-robot-data:ur5").file
 
 
-def made(file: Path, caplog: pytest.LogCaptureFixture, **options: object) -> tuple[Robot, list[str]]:
+def made(
+    file: Path, caplog: pytest.LogCaptureFixture, tools: dict[str, str] | None = None, **options: object
+) -> tuple[Robot, list[str]]:
     """A robot of this file, and what was said of it."""
     caplog.clear()
     with caplog.at_level(logging.WARNING):
-        robot = Robot.from_urdf(file, {"left": "ee_link"}, **options)  # type: ignore[arg-type]
+        robot = Robot.from_urdf(file, tools or {"left": "ee_link"}, **options)  # type: ignore[arg-type]
     return robot, [record.getMessage() for record in caplog.records]
 
 
@@ -61,6 +63,32 @@ def test_what_the_warning_says_is_python_that_leaves_nothing_to_say(
     assert (left, preflight_faults(parted, ControllerSettings(), None)) == ([], ())
 
 
+@pytest.mark.parametrize(
+    ("model", "tools"),
+    [
+        ("panda", {"left": "panda_hand"}),
+        ("tiago_dual", {"left": "hand_left_grasping_frame", "right": "hand_right_grasping_frame"}),
+    ],
+)
+def test_where_home_and_links_that_hardly_part_are_in_the_way_both_are_named_and_only_both_let_arms_go(
+    model: str, tools: dict[str, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    file = load_description(f"example-robot-data:{model}").file
+    _, (said,) = made(file, caplog, tools)
+    home, srdf = said.partition("to change: ")[2].split(", and for links that hardly part ")
+    options: dict[str, object] = eval(f"dict({home}, {srdf})")
+    for name, option in options.items():
+        assert made(file, caplog, tools, **{name: option})[1] != [], f"{name} is not enough"
+    robot, left = made(file, caplog, tools, **options)
+    assert left == []
+    controller = CartesianController(robot)
+    controller.reset(robot.home)
+    goals = {arm: controller.tool_pose(arm) * pin.SE3(np.eye(3), np.array([0.05, 0.05, 0.0])) for arm in tools}
+    assert not any(controller.step(goals, 0.002).report.fallback for _ in range(750))
+    for arm, goal in goals.items():
+        assert np.linalg.norm(controller.tool_pose(arm).translation - goal.translation) < 1e-3
+
+
 def test_an_srdf_that_names_the_pair_leaves_nothing_to_say(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
     both = NEVER + '<disable_collisions link1="forearm_link" link2="wrist_2_link" reason="Never"/>'
     assert made(ur5, caplog, srdf=f'<robot name="ur5">{both}</robot>')[1] == []
@@ -70,7 +98,7 @@ def test_a_pair_that_can_part_is_a_matter_of_home(ur5: Path, caplog: pytest.LogC
     bent = {"elbow_joint": 2.9, "shoulder_lift_joint": -1.2}
     robot, (said,) = made(ur5, caplog, home=bent)
     assert robot.home[1:3].tolist() == [-1.2, 2.9]
-    assert "home={joint: position, ...} where pairs are apart" in said
+    assert "to change: home={'shoulder_pan_joint': " in said
     assert "base_link and wrist_2_link are 10.8 mm apart;" in said
     assert "base_link and forearm_link overlap, and are not watched, though they can part" in said
 
