@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -48,6 +49,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, trajectory_named
+from q2r2_control.plants.mujoco_cameras import has_display
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.types import CommandMode
@@ -188,6 +190,7 @@ def demo(
 ) -> None:
     """Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted hands.
 
+    At a terminal the arms are shown in MuJoCo's window, or in a browser where there is no display.
     Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
     With --record, whether all succeeded is in the recording, of which q2r2 report makes plots.
     With --seeds, exit code 1 where a task succeeded in less than 19 of 20 trials.
@@ -210,6 +213,12 @@ def demo(
     trajectory = "+".join(task.name for task in chosen)
     work = trajectory_named(trajectory)
     work = hurried(work, seed) if shaky else work
+    table = _shows_table(headless, viewer)
+    if table and not (viewer or web or fast):
+        viewer = plant == "mujoco" and has_display()
+        web, web_port = not viewer and find_spec("viser") is not None, 0
+        if not (viewer or web):
+            say("--viewer shows the arms in MuJoCo's window, and --web in a browser: pip install 'q2r2_control[web]'")
     options = RunOptions(
         name="demo",
         input="scripted",
@@ -218,7 +227,7 @@ def demo(
         duration=positive("--duration", duration) or work.duration,
         fast=fast,
         input_options={"trajectory": trajectory, "human": human or hands is not None, "seed": seed, "shaky": shaky},
-        table=_shows_table(headless, viewer),
+        table=table,
         window=viewer,
         page=(web_host, web_port) if web else None,
         real_time=rt,
@@ -227,8 +236,6 @@ def demo(
         record=record,
         notes={"task": "; ".join(task.about for task in chosen)},
     )
-    if options.table and not (viewer or web):
-        say("--viewer shows the arms in MuJoCo's window, --web in a browser")
     if plant == "fri":
         with rehearsal(_FRI_CONFIG, mode, chosen, period, rt) as results:
             done = run_cell(with_controls(load_config(_FRI_CONFIG)), options)

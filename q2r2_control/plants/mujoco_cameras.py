@@ -91,9 +91,14 @@ class CellPictures:
         return np.asarray(renderer.render())
 
 
+def has_display() -> bool:
+    """Whether a window can be looked at."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.viewer.Handle:
     """MuJoCo's passive viewer on a running simulation. Raises :class:`PlantError` where there is no display."""
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not has_display():
         raise PlantError("MuJoCo's window needs a display: neither DISPLAY nor WAYLAND_DISPLAY is set; run headless")
     import glfw
     from mujoco import viewer
