@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # "as" says to type checkers that a name is public
     from q2r2_control.control.controller import CartesianController as CartesianController
     from q2r2_control.errors import ConfigError as ConfigError
     from q2r2_control.errors import Q2R2Error as Q2R2Error
+    from q2r2_control.errors import RobotError as RobotError
     from q2r2_control.inputs.base import Input as Input
     from q2r2_control.inputs.policy import PolicyInput as PolicyInput
     from q2r2_control.pipeline.pipeline import Pipeline as Pipeline
@@ -55,6 +56,7 @@ _MODULES = {
     "Reference": "types",
     "RelativeMotion": "teleop.relative",
     "Robot": "robot.robot",
+    "RobotError": "errors",
     "RobotState": "types",
     "RunSummary": "summary.run_summary",
     "StepReport": "types",
