@@ -30,6 +30,11 @@ def test_every_seed_is_tried_and_those_that_fail_say_why() -> None:
     assert "flat_block: held 95 mm up for 0.0 s" in try_task(moved, CommandMode.POSITION, False, ("grasp", 0))
 
 
+@pytest.mark.slow
+def test_shaky_hands_that_are_lost_for_a_second_move_arms_that_yield_through_a_task() -> None:
+    assert try_task(coarse(CommandMode.TORQUE), CommandMode.TORQUE, True, ("grasp", 0)) == ""
+
+
 @pytest.fixture
 def demo() -> Iterator[subprocess.Popen[str]]:
     """A demo that tries a task twice."""
