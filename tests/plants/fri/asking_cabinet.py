@@ -33,11 +33,12 @@ class Cabinet:
     def now(self) -> float:
         return 0.005 * self.sent + self.silence
 
-    def ask(self, message: Monitoring, lost: bool = False) -> FriCommand | None:
-        """``lost``: the answer, which the cabinet does not hear."""
+    def ask(self, message: Monitoring, lost: bool = False, doubled: bool = False) -> FriCommand | None:
+        """``lost``: the answer, which the cabinet does not hear. ``doubled``: the message, of which it hears both."""
         self.sent += 1
-        message = replace(message, counter=self.sent, reflected=self.heard)
-        answer = self.session.answer(write_monitoring(message), self.now)
+        datagram = write_monitoring(replace(message, counter=self.sent, reflected=self.heard))
+        for late in (0.0, 0.002)[: 1 + doubled]:
+            answer = self.session.answer(datagram, self.now + late)
         if answer is None:
             return None
         command = read_command(answer)[1]

@@ -19,6 +19,7 @@ from q2r2_control.plants.fri.wire import (
     Safety,
     Session,
     write_command,
+    write_monitoring,
 )
 
 HOME = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
@@ -162,8 +163,15 @@ def test_an_answer_that_no_cabinet_would_follow_ends_the_command_and_the_arm_hol
     assert message.q == HOME
 
 
-def test_other_bytes_and_another_version_end_the_command_and_a_late_answer_counts_as_none() -> None:
-    for datagram, trip in ((b"hello", Trip.MALFORMED), (write_command(FriCommand(1, 1, q=HOME), 1), Trip.VERSION)):
+def test_what_is_no_answer_and_another_version_end_the_command_and_a_late_answer_counts_as_none() -> None:
+    endless, nowhere = (math.inf,) * 7, (math.nan, *HOME[1:])
+    for datagram, trip in (
+        (b"hello", Trip.MALFORMED),
+        (write_monitoring(Cabinet(SETTINGS, StillArm(HOME)).send(0.0)), Trip.MALFORMED),  # another identifier
+        (write_command(FriCommand(1, 1, q=nowhere), 2), Trip.MALFORMED),
+        (write_command(FriCommand(1, 1, q=HOME, tau=endless), 2), Trip.MALFORMED),
+        (write_command(FriCommand(1, 1, q=HOME), 1), Trip.VERSION),
+    ):
         cabinet, _ = commanding()
         cabinet.receive(datagram)
         assert cabinet.trips == [trip]

@@ -5,16 +5,18 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import pytest
 
 from q2r2_control.config.cell import Config
+from q2r2_control.errors import ProtocolError
 from q2r2_control.plants.fri.cabinet import Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.session_state import SessionState
-from q2r2_control.plants.fri.wire import LONGEST, CommandKind, Session
+from q2r2_control.plants.fri.wire import LONGEST, CommandKind, Session, read_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES
 from tests.plants.fri.conftest import PATIENCE
@@ -58,6 +60,7 @@ class Answered:
     def __init__(self, config: Config, robot: Robot, network: Network = PERFECT) -> None:
         settings = {"left": settings_of(robot, "left", CommandKind.POSITION, 2, PERIOD)}
         self._session, self.answers = ArmSession("left", "cabinet"), 0
+        self.counters: list[int] = []  # of the messages that came
         self._client = socket.socket(type=socket.SOCK_DGRAM)
         self._client.bind(("127.0.0.1", 0))
         self._client.setblocking(False)
@@ -76,6 +79,8 @@ class Answered:
             datagram, source = self._client.recvfrom(LONGEST)
         except BlockingIOError:
             return False
+        with suppress(ProtocolError):
+            self.counters.append(read_monitoring(datagram).counter)
         if (reply := self._session.answer(datagram, now)) is None:
             return False
         self._client.sendto(reply, source)
@@ -114,9 +119,35 @@ def test_an_answer_that_came_while_the_cabinet_stood_still_is_heard(config: Conf
     assert (one.cabinet.session, one.cabinet.missed) == (Session.COMMANDING_ACTIVE, 0)
 
 
+@pytest.mark.parametrize(
+    ("network", "faults"),
+    [
+        pytest.param(PERFECT, (False, False, False), id="perfect"),
+        pytest.param(Network(loss=0.05), (True, False, False), id="loss"),
+        pytest.param(Network(duplicate=0.1), (False, True, False), id="duplicates"),
+        pytest.param(Network(jitter=1.5 * PERIOD), (False, False, True), id="jitter"),
+    ],
+)
+def test_messages_are_lost_come_twice_and_overtake_others_as_the_network_is_asked_to(
+    config: Config, robot: Robot, network: Network, faults: tuple[bool, bool, bool]
+) -> None:
+    one = Answered(config, robot, network)
+    one.run(lambda now: one.answer(now) and len(one.counters) > 200)
+    counters, came = one.counters, set(one.counters)
+    is_lost = not came.issuperset(range(1, max(came) - 5))  # the last ones may be under way
+    assert (is_lost, len(came) < len(counters), counters != sorted(counters)) == faults
+    if network.loss:
+        assert one.cabinet.missed > 0, "answers are lost too"
+
+
 def test_a_message_that_was_cut_is_not_answered_and_an_answer_that_was_cut_ends_the_session(
     config: Config, robot: Robot
 ) -> None:
     one = Answered(config, robot, Network(cut=0.02))
-    one.run(lambda now: one.answer(now) and bool(one.cabinet.trips) and one.state.unreadable > 0)
+
+    def until(now: float) -> bool:
+        one.cabinet.start_overlay()  # which an answer that was cut ends in monitoring, too
+        return one.answer(now) and bool(one.cabinet.trips) and one.state.unreadable > 0
+
+    one.run(until)
     assert set(one.cabinet.trips) == {Trip.MALFORMED}

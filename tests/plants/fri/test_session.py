@@ -252,6 +252,30 @@ def test_an_older_message_is_not_answered_and_lost_ones_are_counted() -> None:
     assert cabinet.session.state.lost == 3
 
 
+def test_a_message_that_comes_twice_gets_the_same_answer_and_moves_nothing() -> None:
+    cabinets, ones = {doubled: Cabinet() for doubled in (False, True)}, (1.0,) * 7
+    heard: dict[bool, list[object]] = {False: [], True: []}
+    for doubled, cabinet in cabinets.items():
+        cabinet.ask(WAITING)
+        cabinet.ask(ACTIVE)
+        for t in np.linspace(0.005, 0.1, 20):  # a reference that leaves IPO at 1 rad/s^2
+            end, there = cabinet.now + 0.003, tuple(q + 0.5 * t**2 for q in IPO)
+            cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, there, (t,) * 7, ones))
+            answer = cabinet.ask(replace(ACTIVE, q=there), doubled=doubled)
+            assert answer is not None
+            heard[doubled].append((answer.reflected, answer.q, cabinet.session.state.velocity))
+        assert cabinet.session.state.lost == 0
+    assert heard[True] == heard[False]
+
+
+def test_a_cabinet_of_another_version_than_the_yamls_is_not_answered_and_said() -> None:
+    cabinet = Cabinet(ArmSession("left", "cabinet", version=1))
+    assert cabinet.ask(MONITORING) is None
+    fault = cabinet.session.state.fault(cabinet.now)
+    assert fault is not None
+    assert sentence(fault) == "left: cabinet: FRI 2: allowed by the YAML: 1"
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
