@@ -75,6 +75,14 @@ def test_a_port_that_is_taken_is_named(robot: Robot, fri_config: Config) -> None
             FriPlant.from_config(robot, fri_config).reset()
 
 
+def test_the_sessions_keep_the_cells_limit_of_torque_rate(robot: Robot, fri_config: Config) -> None:
+    impedance = fri_config.impedance.model_copy(update={"torque_rate_limit": 7000.0})
+    lines = FriPlant.from_config(robot, fri_config.model_copy(update={"impedance": impedance}))._lines()
+    for line in lines:
+        socket.close(line.file)
+    assert {line.session._torque_rate_limit for line in lines} == {7000.0}
+
+
 def test_an_arm_without_a_cabinet_is_named(robot: Robot, config: Config) -> None:
     with pytest.raises(ConfigError, match=r"fri\.left: missing"):
         FriPlant.from_config(robot, config)
