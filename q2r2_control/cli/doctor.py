@@ -19,7 +19,7 @@ from q2r2_control.cli.ros import print_findings
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.inputs.listener import access_lines
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
-from q2r2_control.process.machine_notes import machine_notes, network_notes
+from q2r2_control.process.machine_notes import has_display, machine_notes, network_notes
 from q2r2_control.ros.launch.build import interface_packages
 from q2r2_control.ros.watching.findings import Finding, error
 
@@ -99,7 +99,7 @@ def _ports(cell: Config) -> Iterator[Finding]:
 
 def _display(environment: Mapping[str, str]) -> Iterator[Finding]:
     """MuJoCo's window needs one, nothing else."""
-    if sys.platform == "linux" and not (environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY")):
+    if not has_display(environment):
         yield Finding(False, "no display: no --viewer", "log in on the desktop or by ssh -X; a run without needs none")
 
 

@@ -49,7 +49,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, trajectory_named
-from q2r2_control.plants.mujoco_cameras import has_display
+from q2r2_control.process.machine_notes import has_display
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.types import CommandMode

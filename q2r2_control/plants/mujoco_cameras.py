@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Iterable, Mapping
 
 import mujoco
@@ -14,6 +12,7 @@ import pinocchio as pin
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import PlantError
+from q2r2_control.process.machine_notes import has_display
 from q2r2_control.types import Array
 
 # MuJoCo's camera looks along -z, with y up in the picture; ours looks along x, with z up.
@@ -89,11 +88,6 @@ class CellPictures:
         renderer = self._renderers[camera]
         renderer.update_scene(self._data, camera)
         return np.asarray(renderer.render())
-
-
-def has_display() -> bool:
-    """Whether a window can be looked at."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.viewer.Handle:

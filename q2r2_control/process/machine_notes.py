@@ -1,4 +1,4 @@
-"""Reasons why this computer may answer a robot late, each with the command that helps."""
+"""Reasons why this computer may answer a robot late, each with the command that helps; and whether it has a display."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from q2r2_control.process.scheduling import real_time
@@ -16,6 +16,11 @@ _LEAST_MTU = 1500  # that takes every message of a cabinet in one piece [bytes]
 _FAIR_SERVER = "/sys/kernel/debug/sched/fair_server"
 _GATHERS = re.compile(r"^(Adaptive RX: on|rx-usecs: *[1-9]\d*)", re.MULTILINE)
 _RING = re.compile(r"^RX:\s*(\d+)", re.MULTILINE)
+
+
+def has_display(environment: Mapping[str, str] = os.environ) -> bool:
+    """Whether a window can be looked at."""
+    return sys.platform != "linux" or bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
 
 
 def machine_notes() -> list[str]:
