@@ -76,6 +76,21 @@ def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Ro
     node.destroy_node()
 
 
+def test_a_target_that_was_made_before_its_sender_stood_still_is_late_by_its_stamp(
+    context: Any, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = BaseNode("intake", context=context)
+    intake = TargetIntake(node, robot, lambda: None)
+    taken: list[bool] = []
+    intake.subscribe(lambda arm, pose, *_: taken.append(pose is not None), lambda arm: None)
+    targets = Arrivals(node, "/q2r2/left/target_frame")
+    for received, made in [(100.00, 99.0), (100.01, 99.01), (102.02, 99.02), (102.03, 101.03), (105.0, 101.03)]:
+        monkeypatch.setattr(BaseNode, "now", received)
+        targets.arrive(stamped_pose(pin.SE3.Identity(), "world", made), USUAL)
+    assert taken == [True, True, False, True, True]  # a stamp that stands still says nothing
+    node.destroy_node()
+
+
 def test_a_target_that_is_not_used_is_reported_once_for_each_reason(context: Any, robot: Robot) -> None:
     node, reports = BaseNode("intake", context=context), []
     intake = TargetIntake(node, robot, lambda: reports.append(intake.faults()["left"]))
