@@ -102,6 +102,9 @@ def fri_cabinet(
     period: Annotated[float, Option(min=1, max=10, help="Between two messages [ms].")] = 10.0,
     right_period: Annotated[float | None, Option(min=1, max=10, help="Of the right arm's cabinet [ms].")] = None,
     multiplier: Annotated[int, Option(min=1, max=10, help="Messages to one answer: FRI's receiveMultiplier.")] = 1,
+    stiffness: Annotated[
+        float, Option(min=0, max=5000, help="Of the joint impedance under torques; it has to be 0 [Nm/rad].")
+    ] = 0.0,
     fri: Annotated[int, Option(min=1, max=2, help="Version of FRI.")] = 2,
     start_after: Annotated[float, Option(min=0, help="An overlay is started after so long with a client [s].")] = 0.5,
     drop_every: Annotated[float | None, Option(help="The pendant ends a session as often as this [s].")] = None,
@@ -136,7 +139,7 @@ def fri_cabinet(
     if mode not in _KINDS:
         raise ConfigError(f"--mode {mode}: allowed: {', '.join(_KINDS)}")
     robot = Robot.from_config(cell)
-    arms = SimulatedArms(robot, cell)
+    arms = SimulatedArms(robot, cell, stiffness)
     if missing := [arm for arm in robot.arms if arm not in cell.fri]:
         raise ConfigError(f"{config}: fri.{missing[0]}: missing; allowed: the cabinet of each arm")
     cabinets, clients = {}, {}

@@ -28,6 +28,7 @@ _LONGEST_CATCH_UP = 0.05  # what it falls behind by more is dropped [s]
 _LOOK_AGAIN = 2e-4  # whether the answer has come that a message waits for, which is late already [s]
 _ROUNDING = 1e-6
 _SAG = 1e-3  # the simulated arm may be this much beyond its limits [rad]
+_DAMPING_RATIO = 0.7  # of the application's joint impedance: the cabinet's own without another setting
 _HOLDING = 0.02  # time constant by which a cabinet holds an arm that no torque overlays, critically damped [s]
 
 
@@ -90,8 +91,9 @@ class SimulatedArm:
 class SimulatedArms:
     """All arms of a cell in one simulation."""
 
-    def __init__(self, robot: Robot, config: Config) -> None:
-        self.robot, self.plant = robot, MujocoPlant(robot, config)
+    def __init__(self, robot: Robot, config: Config, stiffness: float = 0.0) -> None:
+        """``stiffness``: of the joint impedance that overlays of torque come on top of [Nm/rad]."""
+        self.robot, self.plant, self._stiffness = robot, MujocoPlant(robot, config), stiffness
         self.now, self.openings = 0.0, dict.fromkeys(self.plant.gripper_openings(), 1.0)
         self._simulated, self._step = 0.0, (1.0 - _ROUNDING) * config.mujoco.timestep
         self.state = self.plant.state()
@@ -126,9 +128,10 @@ class SimulatedArms:
         tau = pin.computeGeneralizedGravity(self.robot.model, self._data, state.q).copy()
         inertia = pin.crba(self.robot.model, self._data, state.q).diagonal()
         back = inertia / _HOLDING * ((q - state.q) / (4.0 * _HOLDING) - state.v)
+        spring = self._stiffness * (q - state.q) - 2.0 * _DAMPING_RATIO * np.sqrt(self._stiffness * inertia) * state.v
         for name, arm in self.arms.items():
             joints = self.robot.arms[name].joints
-            tau[joints] += back[joints] if arm.overlay is None else arm.overlay
+            tau[joints] += back[joints] if arm.overlay is None else spring[joints] + arm.overlay
         return Command(CommandMode.TORQUE, q, v, tau, self.openings)
 
 

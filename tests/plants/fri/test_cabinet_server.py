@@ -16,7 +16,7 @@ from q2r2_control.plants.fri.cabinet import Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.session_state import SessionState
-from q2r2_control.plants.fri.wire import LONGEST, CommandKind, Session, read_monitoring
+from q2r2_control.plants.fri.wire import LONGEST, CommandKind, Session, joints_of, read_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES
 from tests.plants.fri.conftest import PATIENCE
@@ -38,6 +38,23 @@ def test_an_arm_goes_where_its_cabinet_commands_and_the_other_one_stays(
         cell.arms["right"].advance(PERIOD, tuple(start["right"]), overlay)
     np.testing.assert_allclose(cell.arms["left"].q, start["left"] + [0.1, 0, 0, 0, 0, 0, 0], atol=0.01)
     np.testing.assert_allclose(cell.arms["right"].q, start["right"], atol=0.02)
+
+
+@pytest.mark.parametrize("stiffness", [0.0, 100.0])
+def test_an_overlay_of_torque_comes_on_top_of_the_joint_impedance(
+    config: Config, robot: Robot, stiffness: float
+) -> None:
+    cell = SimulatedArms(robot, config, stiffness)
+    joints = robot.arms["left"].joints
+    start, tau = robot.home[joints], np.array([5.0, *np.zeros(6)])
+    for tick in range(1, 301):
+        cell.arms["left"].advance(0.005, joints_of(start), joints_of(tau))
+        cell.advance(0.005 * tick)
+    turned = cell.state.q[joints] - start
+    if stiffness:
+        np.testing.assert_allclose(turned, tau / stiffness, atol=2e-3)
+    else:
+        assert turned[0] > 0.5
 
 
 def test_the_guards_leave_the_reference_room_for_catching_up(robot: Robot) -> None:
