@@ -26,6 +26,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array
 from tests.cli.command import q2r2
 from tests.pipeline.slow_cell import PendantCabinets, StuckArm, slow_run
+from tests.plants.fri.conftest import free_ports
+from tests.plants.fri.waiting_cabinets import waiting_cabinets
 
 MODULE = "q2r2_control.cli.commission"
 GUIDED = ["", "y", "", "y"]  # both arms, and the joints are right
@@ -113,6 +115,24 @@ def test_a_cell_that_shows_all_it_has_to_is_signed_off_and_may_run(
     assert "a tenth" not in q2r2("run", str(cell), "--trajectory", "nowhere", "--full-speed").stderr
     cell.write_text(cell.read_text(encoding="utf-8").replace("192.0.2.1", "192.0.2.2"), encoding="utf-8")
     assert "were changed since" in q2r2("run", str(cell), "--input", "scripted").stderr
+
+
+@pytest.mark.slow
+def test_a_commissioning_goes_through_all_steps_by_sockets_and_processes(tmp_path: Path) -> None:
+    text = find_resource("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
+    for port, free in zip((30200, 30201), free_ports(2), strict=True):
+        text = text.replace(f"port: {port}", f"port: {free}")
+    (cell := tmp_path / "my_cell.yaml").write_text(text, encoding="utf-8")
+    config = load_config(cell)
+    answers = ["", "confirm", "", "confirm", "keep", "", "", "Ada"]
+    with waiting_cabinets(Robot.from_config(config), config):
+        code, lines, out = commission(cell, answers, "--json")
+    assert code == 0, lines[-1]
+    steps = json.loads(out)["steps"]
+    assert all(its["quality"] == "excellent" for its in steps["cabinets"])
+    assert [len(steps[name]) for name in ("motion", "stop", "kill")] == [14, 2, 2]
+    for stop in (*steps["stop"], *steps["kill"]):
+        assert stop["tool_speed_mm_s"] > 10.0
 
 
 def test_a_user_who_knows_runs_a_cell_without_a_sign_off(cell: Path) -> None:

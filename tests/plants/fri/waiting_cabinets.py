@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from q2r2_control.config.cell import Config
 from q2r2_control.plants.fri.cabinet import Cabinet, StillArm
@@ -17,40 +17,41 @@ from q2r2_control.types import SIDES
 
 _PERIOD = 0.005  # [s]
 _LOOKS = 0.02  # between two messages to a client that is not there, and two looks at the end [s]
+_GONE = 1.0  # without an answer: the client has ended before it read the message [s]
 
 
 @contextmanager
 def waiting_cabinets(robot: Robot, config: Config, version: int = 2) -> Iterator[dict[str, Cabinet]]:
-    """One for each arm, in a thread; each has started its overlay."""
+    """One for each arm, in a thread; each starts its overlay whenever it may."""
     made, done = {}, threading.Event()
     for arm in SIDES:
         settings = settings_of(robot, arm, CommandKind.POSITION, version, _PERIOD)
         made[arm] = Cabinet(settings, StillArm(tuple(robot.home[robot.arms[arm].joints])))
-        made[arm].start_overlay()
 
-    def answer_to(opened: socket.socket, heard: bool) -> bytes | None:
-        while not done.is_set():
+    def answer_to(opened: socket.socket) -> bytes | None:
+        end = time.monotonic() + _GONE
+        while not done.is_set() and time.monotonic() < end:
             try:
                 return opened.recv(2000)
             except TimeoutError:
-                if not heard:
-                    break
+                continue
             except OSError:  # nobody listens there
                 done.wait(_LOOKS)
                 break
         return None
 
     def serve(cabinet: Cabinet, port: int) -> None:
-        heard, due = False, time.monotonic()
+        due = time.monotonic()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-            opened.bind(("127.0.0.1", 0))
+            opened.connect(("127.0.0.1", port))
             opened.settimeout(_LOOKS)
             while not done.wait(max(due - time.monotonic(), 0.0)):
                 due += _PERIOD
-                opened.sendto(write_monitoring(cabinet.send(0.0)), ("127.0.0.1", port))
-                if (answer := answer_to(opened, heard)) is not None:
+                cabinet.start_overlay()
+                with suppress(OSError):  # of the message before, which nobody listened to
+                    opened.send(write_monitoring(cabinet.send(0.0)))
+                if (answer := answer_to(opened)) is not None:
                     cabinet.receive(answer)
-                    heard = True
                 else:
                     due = time.monotonic()
 
