@@ -27,7 +27,8 @@ def main(requests: Iterator[Config], answer: Callable[[Any], None]) -> None:
     """In the process that is killed: lead all arms of each cell upwards, and answer every moment."""
     for config in requests:
         with SlowRun(config, FriPlant, listener=answer) as run:
-            run.let_go(list(run.robot.arms), 2.0 * LED)
+            run.let_go(list(run.robot.arms), 1.5 * LED)
+        raise PlantError("the arms did not go up; begin where each tool has 100 mm of room above it")
 
 
 def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED) -> list[StopReport]:

@@ -32,6 +32,12 @@ def test_arms_of_a_killed_run_come_to_rest_within_their_certified_stop(config: C
         assert 0.0 < report.stopped_mm < report.allowed_mm
 
 
+def test_arms_that_hardly_go_up_are_not_killed_and_it_says_where_to_begin(config: Config) -> None:
+    slow = config.model_copy(update={"control": config.control.model_copy(update={"max_linear_speed": 0.005})})
+    with waiting_cabinets(Robot.from_config(slow), slow), pytest.raises(PlantError, match="100 mm of room above it"):
+        measure_kill(slow, lambda: np.zeros(14), led=0.3)
+
+
 def test_a_run_that_cannot_begin_says_why(config: Config) -> None:
     port = config.fri["left"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
