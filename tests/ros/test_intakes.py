@@ -84,10 +84,13 @@ def test_a_target_that_was_made_before_its_sender_stood_still_is_late_by_its_sta
     taken: list[bool] = []
     intake.subscribe(lambda arm, pose, *_: taken.append(pose is not None), lambda arm: None)
     targets = Arrivals(node, "/q2r2/left/target_frame")
-    for received, made in [(100.00, 99.0), (100.01, 99.01), (102.02, 99.02), (102.03, 101.03), (105.0, 101.03)]:
+    stream = [(100.00, 99.0), (100.04, 99.01)]  # of which the second one was late a little
+    stream += [(102.05, 99.02), (102.06, 101.06), (105.0, 101.06)]  # old, in time, and repeated
+    stream += [(105.0 + 0.4 * tick, 102.0 + 0.1 * tick) for tick in range(1, 4)]  # a slow clock
+    for received, made in stream:
         monkeypatch.setattr(BaseNode, "now", received)
         targets.arrive(stamped_pose(pin.SE3.Identity(), "world", made), USUAL)
-    assert taken == [True, True, False, True, True]  # a stamp that stands still says nothing
+    assert taken == [True, True, False, *[True] * 5]
     node.destroy_node()
 
 

@@ -39,7 +39,7 @@ from q2r2_control.wording import sentence
 
 _SHARED = "joint_states"  # where no other topic is asked for
 _LATEST = 0.02  # that a target is received, later than others after the time of its stamp, for that to say anything [s]
-_OLD = 0.5  # a target that was made longer ago than usual by more is of before its sender stood still [s]
+_OLD = 0.5  # a target that is older than the one before it, by so much, was made before its sender stood still [s]
 _WARNING_TIME = 1.0  # refused targets are reported for this long [s]
 # Takes an arm's target in the world frame, or None if it is no pose, the time [s], the message's number, and when the
 # target is due [s], or None.
@@ -69,7 +69,7 @@ class TargetIntake:
         self.publishers = Publishers(node, self.topics.values())
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
         self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # the delays since targets were made
-        self._made = dict.fromkeys(robot.arms, 0)  # the newest stamps [ns]
+        self._newest = dict.fromkeys(robot.arms, (0, 0.0))  # the last target's stamp [ns], and how old it was [s]
         self._refused: dict[str, tuple[Reason, float]] = {}  # why an arm's last target was not used, and when [s]
         self.rejected = dict.fromkeys(robot.arms, 0)
 
@@ -93,9 +93,10 @@ class TargetIntake:
     def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
         frame, now, frame_id = self.frames[arm], self._node.now, message.header.frame_id
         pose = pose_of(message.pose) if frame_id == frame.name else None
-        due, old = self._due(arm, nanoseconds(message.header.stamp), now - age(info))
-        late = self._delays[arm].take(delay(info), time.monotonic()) or old
+        made, received = nanoseconds(message.header.stamp), now - age(info)
+        late = self._delays[arm].take(delay(info), time.monotonic()) or self._stood_still(arm, made, received)
         wanted = None if pose is None or late else frame.pose * pose
+        due = self._due(arm, made, received)
         refusal = take(arm, wanted, now, info["publication_sequence_number"], due)
         if refusal is not None:
             self._refuse(arm, refusal)
@@ -108,17 +109,20 @@ class TargetIntake:
         else:
             self._refused.pop(arm, None)
 
-    def _due(self, arm: str, made: int, received: float) -> tuple[float | None, float]:
-        """When a target is due that was received then [s], by its stamp [ns], and how much too late it is [s].
-
-        None and 0 where the stamp does not say. A sender that was frozen just before its middleware noted the time of
-        sending shows by its stamp alone that the target is of long ago.
-        """
+    def _due(self, arm: str, made: int, received: float) -> float | None:
+        """When a target is due that was received then [s], by its stamp [ns]; None where the stamp does not say."""
         stamp, stamps = 1e-9 * made, self._stamps[arm]
-        newer, self._made[arm] = made > self._made[arm], made
-        late = stamps.take(received - stamp if stamp > 0.0 else math.nan, received)
-        due = stamp + stamps.usual if stamp > 0.0 and late == 0.0 else None
-        return due, late if newer and late > _OLD else 0.0
+        known = stamp > 0.0 and stamps.take(received - stamp, received) == 0.0
+        return stamp + stamps.usual if known else None
+
+    def _stood_still(self, arm: str, made: int, received: float) -> float:
+        """For how long a target's sender did [s] between making it and sending it, by the stamp; 0 for a moment.
+
+        Only the stamp tells, where it was frozen just before its middleware noted the time of sending.
+        """
+        (before, usual), self._newest[arm] = self._newest[arm], (made, received - 1e-9 * made)
+        late = received - 1e-9 * made - usual
+        return late if 0 < before < made and late > _OLD else 0.0
 
     def _refuse(self, arm: str, refusal: Reason) -> None:
         """Log why targets are not used: once for each kind of fault, until a target is used again or none comes."""
