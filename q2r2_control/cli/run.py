@@ -49,7 +49,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, trajectory_named
-from q2r2_control.process.machine_notes import has_display
+from q2r2_control.plants.mujoco_cameras import window_fault
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.types import CommandMode
@@ -214,8 +214,8 @@ def demo(
     work = trajectory_named(trajectory)
     work = hurried(work, seed) if shaky else work
     table = _shows_table(headless, viewer)
-    if table and not (viewer or web or fast):
-        viewer = plant == "mujoco" and has_display()
+    if table and plant == "mujoco" and not (viewer or web or fast):
+        viewer = window_fault() is None
         web, web_port = not viewer and find_spec("viser") is not None, 0
         if not (viewer or web):
             say("--viewer shows the arms in MuJoCo's window, and --web in a browser: pip install 'q2r2_control[web]'")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping
 
 import mujoco
@@ -90,19 +91,33 @@ class CellPictures:
         return np.asarray(renderer.render())
 
 
+def window_fault() -> str | None:
+    """Why no window can be opened, None where one can: MuJoCo waits for ever for one that its thread cannot open."""
+    if not has_display():
+        return "MuJoCo's window needs a display: neither DISPLAY nor WAYLAND_DISPLAY is set; run headless"
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", glfw.GLFWError)
+        if glfw.init():
+            glfw.window_hint(glfw.VISIBLE, False)
+            window = glfw.create_window(64, 64, "", None, None)
+            glfw.default_window_hints()
+            if window:
+                glfw.destroy_window(window)
+                return None
+    return "MuJoCo's window cannot be opened on this display; run headless"
+
+
 def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.viewer.Handle:
     """MuJoCo's passive viewer on a running simulation. Raises :class:`PlantError` where there is no display."""
-    if not has_display():
-        raise PlantError("MuJoCo's window needs a display: neither DISPLAY nor WAYLAND_DISPLAY is set; run headless")
-    import glfw
+    if (fault := window_fault()) is not None:
+        raise PlantError(fault)
     from mujoco import viewer
 
     try:
-        # MuJoCo waits for ever for a window that its thread cannot open, so try first.
-        if not glfw.init():
-            raise PlantError("MuJoCo's window cannot be opened on this display; run headless")
         return viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
-    except (RuntimeError, mujoco.FatalError, glfw.GLFWError) as error:
+    except (RuntimeError, mujoco.FatalError) as error:
         raise PlantError(f"MuJoCo's window cannot be opened: {error}") from error
 
 

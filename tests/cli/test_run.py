@@ -82,7 +82,7 @@ def test_a_demo_at_a_terminal_shows_the_arms_where_there_is_a_way_to(
         raise Exit(7)
 
     monkeypatch.setattr(f"{MODULE}._shows_table", lambda headless, viewer: True)
-    monkeypatch.setattr(f"{MODULE}.has_display", lambda: display)
+    monkeypatch.setattr(f"{MODULE}.window_fault", lambda: None if display else "no display")
     monkeypatch.setattr(f"{MODULE}.find_spec", lambda name: viser or None)
     monkeypatch.setattr(f"{MODULE}.run_cell", run_cell)
     result = q2r2("demo")
