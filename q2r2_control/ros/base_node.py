@@ -43,7 +43,7 @@ from q2r2_control.wording import sentence
 # A process that goes first and never sleeps would leave nothing of its processor to others; Linux counts [s].
 _NEVER_IDLE = 0.5
 _LEAST_END = 2.0  # that a process has in any case once its nodes are closed: arms brake for 3 s at most [s]
-_asked_to_end = -math.inf  # when this process was, of the steady clock [s]
+_deadline = math.inf  # when this process has to be gone that was asked to end, of the steady clock [s]
 # All keep the last messages, and are reliable and volatile where they do not say otherwise.
 # Commands, at the receiver: only the newest counts, and it has to arrive.
 COMMAND_QOS = QoSProfile(depth=1)
@@ -287,12 +287,13 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
     except ExternalShutdownException:
         pass
     finally:
-        global _asked_to_end
-        _asked_to_end = time.monotonic()
+        asked = time.monotonic()
         for node in reversed(nodes):
             node.close()
         # No arm waits for this process any more. The middleware may take long to end, but neither first nor for ever.
         schedule_process_as_others()
+        global _deadline
+        _deadline = max(asked + LONGEST_END, time.monotonic() + _LEAST_END)
         end_in_time()
         for node in reversed(nodes):
             node.destroy_node()
@@ -303,8 +304,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
 
 def end_in_time() -> None:
     """Let SIGALRM end this process ``LONGEST_END`` after it was asked to end, in which its nodes were closed too."""
-    left = _asked_to_end + LONGEST_END - time.monotonic()
-    signal.setitimer(signal.ITIMER_REAL, max(left, _LEAST_END))
+    signal.setitimer(signal.ITIMER_REAL, max(min(_deadline - time.monotonic(), LONGEST_END), 1e-3))
 
 
 def _take_priority(nodes: Sequence[BaseNode]) -> None:
