@@ -54,11 +54,13 @@ def test_enter_at_the_terminal_stops_all_overlays_and_starts_them_again(fri_cell
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as process:
         assert process.stderr is not None
         said = iter(process.stderr.readline, "")
-        assert any("right: monitoring wait" in line for line in said)
-        for told in ("overlays are stopped, Enter starts them\n", "overlays start\n"):
-            os.write(ours, b"\n")
-            assert next(said) == told
-        process.terminate()
+        try:
+            assert any("right: monitoring wait" in line for line in said)
+            for told in ("overlays are stopped, Enter starts them\n", "overlays start\n"):
+                os.write(ours, b"\n")
+                assert next(said) == told
+        finally:
+            process.terminate()
     os.close(ours)
     os.close(theirs)
 

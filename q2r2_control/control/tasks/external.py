@@ -53,7 +53,7 @@ def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> tuple[T
 def _fault(made: Any, settings: Mapping[str, Any], error: Exception) -> str:
     """The first setting that is unknown or missing; else what the task itself says."""
     parameters = list(inspect.signature(made).parameters.values())[1:]
-    known = [one.name for one in parameters if one.kind is not one.VAR_KEYWORD]
+    known = [one.name for one in parameters if one.kind not in (one.VAR_KEYWORD, one.VAR_POSITIONAL)]
     allowed = f"; its settings: {', '.join(known) or 'none'}"
     for key, value in settings.items():
         if key not in known and len(known) == len(parameters):

@@ -55,7 +55,7 @@ class ArmSession:
 
         ``torque_limit`` (n,): of overlays; ``velocity_limit`` (n,): none is measured beyond. A position that jumps once
         lets the damping then push a joint back by the way of one period at that speed, and no further.
-        ``torque_rate_limit``: between two answers [Nm/s]. It holds for the damping too, down to 5000.
+        ``torque_rate_limit``: between two answers [Nm/s]. The damping keeps it too, or 5000 where that is lower.
         """
         self.state, self._version = SessionState(arm, source, wanted), version
         self.path = ReferencePath(0.0, np.zeros(JOINTS))
