@@ -13,7 +13,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
-from q2r2_control.plants.mujoco_cameras import draw_obstacles, open_window
+from q2r2_control.plants.mujoco_cameras import close_window, draw_obstacles, open_window
 from q2r2_control.plants.mujoco_model import build_model, settle_mimics
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
@@ -193,7 +193,7 @@ class MujocoPlant:
 
     def close(self) -> None:
         if self._window is not None:
-            self._window.close()
+            close_window(self._window)
             self._window = None
 
     def _tuned(self, config: Config) -> tuple[Array, Array]:

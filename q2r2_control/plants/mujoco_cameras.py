@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 from collections.abc import Iterable, Mapping
 
@@ -19,6 +20,7 @@ from q2r2_control.types import Array
 # MuJoCo's camera looks along -z, with y up in the picture; ours looks along x, with z up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _STRAIGHT = 1e-9  # of the sine between the line of sight and the vertical
+_LONGEST_CLOSE = 5.0  # of a window [s]
 _OPACITY = 0.6  # of moving obstacles
 # Without a graphics card, a window's 8 samples a pixel and shadow map of 8192 take five times as long, and its round
 # shapes of 28 x 16 parts twice as long.
@@ -119,6 +121,14 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.viewer.Han
         return viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
     except (RuntimeError, mujoco.FatalError) as error:
         raise PlantError(f"MuJoCo's window cannot be opened: {error}") from error
+
+
+def close_window(window: mujoco.viewer.Handle) -> None:
+    """Close it, and wait for its thread: one that still draws as the process ends brings it down."""
+    window.close()
+    for thread in threading.enumerate():
+        if "_launch_internal" in thread.name:  # by the name of MuJoCo's function
+            thread.join(_LONGEST_CLOSE)
 
 
 # Kind of each shape, and its sizes there in those of ours.
