@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -51,9 +52,12 @@ def demo() -> Iterator[subprocess.Popen[str]]:
 
 def trials_of(demo: subprocess.Popen[str]) -> list[int]:
     """Its processes that have begun a trial."""
-    its = {pid: Path(f"/proc/{pid}") for pid in children(demo.pid)}
-    workers = {pid: folder for pid, folder in its.items() if b"spawn_main" in (folder / "cmdline").read_bytes()}
-    return [pid for pid, folder in workers.items() if "libmujoco" in (folder / "maps").read_text()]
+    trials = []
+    for pid, folder in ((pid, Path(f"/proc/{pid}")) for pid in children(demo.pid)):
+        with suppress(OSError):  # of one that has ended meanwhile, as a command does that a library calls
+            if b"spawn_main" in (folder / "cmdline").read_bytes() and "libmujoco" in (folder / "maps").read_text():
+                trials.append(pid)
+    return trials
 
 
 def test_ctrl_c_does_not_wait_for_trials(demo: subprocess.Popen[str]) -> None:
