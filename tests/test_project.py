@@ -114,7 +114,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
         pytest.param("viewer.headset_table", HEAVY, id="a table of topics"),
         pytest.param("plants", ("mujoco", "numba", "matplotlib"), id="plants"),
         pytest.param("recording.writer", (*HEAVY, f"{PACKAGE}.pipeline"), id="the process that writes recordings"),
-        pytest.param("cli.app", ("matplotlib", "rclpy"), id="the command line"),
+        pytest.param("cli.run", ("matplotlib", "rclpy"), id="a command that runs a cell"),
     ],
 )
 def test_importing_a_light_module_imports_nothing_heavy(module: str, forbidden: tuple[str, ...]) -> None:

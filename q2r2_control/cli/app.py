@@ -1,4 +1,4 @@
-"""The ``q2r2`` command: its subcommands, and what all of them share."""
+"""The ``q2r2`` command: what all commands of the table in ``commands`` share."""
 
 from __future__ import annotations
 
@@ -13,17 +13,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from q2r2_control.cli.bench import bench, soak
-from q2r2_control.cli.check import check
-from q2r2_control.cli.commission import commission
-from q2r2_control.cli.doctor import doctor
-from q2r2_control.cli.fri import fri_cabinet
-from q2r2_control.cli.fri_check import fri_check
-from q2r2_control.cli.mounts import mounts
-from q2r2_control.cli.new_cell import new_cell
-from q2r2_control.cli.recordings import export, judge, replay, report
-from q2r2_control.cli.ros import app as ros_app
-from q2r2_control.cli.run import demo, headset_check, run
+from q2r2_control.cli.commands import COMMANDS, CommandOnDemand
 from q2r2_control.errors import Q2R2Error
 
 # typer raises its own copy of click's exceptions, or click's, depending on its version; this is the root of either.
@@ -31,7 +21,12 @@ _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
 
 class ErrorHandlingGroup(TyperGroup):
-    """Commands whose bad usage and :class:`Q2R2Error` end in one line on stderr and exit code 2, Ctrl-C in 130."""
+    """All commands; bad usage and :class:`Q2R2Error` end in one line on stderr and exit code 2, Ctrl-C in 130."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for command in COMMANDS:
+            self.add_command(CommandOnDemand(command))
 
     def main(self, *args: Any, **extra: Any) -> Any:
         """Run the command line; leaves by :class:`SystemExit`."""
@@ -58,23 +53,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Bimanual VR teleoperation: a headset's hands move two robot arms, safely.",
 )
-app.command(epilog="Example: q2r2 demo --viewer")(demo)
-app.command(epilog="Example: q2r2 run config/dual_iiwa7.yaml --input headset --host 0.0.0.0")(run)
-app.command(epilog="Example: q2r2 replay recordings/20260101-120000-dual_iiwa7 --compare")(replay)
-app.command(epilog="Example: q2r2 judge recordings --json")(judge)
-app.command(epilog="Example: q2r2 report recordings --output report.html")(report)
-app.command("new-cell", epilog="Example: q2r2 new-cell my_cell --left arm.urdf --right arm.urdf")(new_cell)
-app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf")(check)
-app.command(epilog="Example: q2r2 doctor my_cell.yaml")(doctor)
-app.command(epilog="Example: q2r2 commission my_cell.yaml --duration 60")(commission)
-app.command("fri-cabinet", epilog="Example: q2r2 fri-cabinet config/dual_iiwa7_fri.yaml --period 2")(fri_cabinet)
-app.command("fri-check", epilog="Example: q2r2 fri-check config/dual_iiwa7_fri.yaml --duration 60")(fri_check)
-app.command("mounts", epilog="Example: q2r2 mounts my_cell.yaml --tip 0 0 0.1")(mounts)
-app.command("headset-check", epilog="Example: q2r2 headset-check --host 0.0.0.0")(headset_check)
-app.command(epilog="Example: q2r2 bench --ticks 20000, or --work --motion meet")(bench)
-app.command(epilog="Example: q2r2 soak --ticks 100000 --contact")(soak)
-app.command(epilog="Example: q2r2 export lerobot recordings --output datasets/circle --fps 30")(export)
-app.add_typer(ros_app, name="ros")
 
 
 class _StderrHandler(logging.Handler):

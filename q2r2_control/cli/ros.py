@@ -181,7 +181,8 @@ def print_findings(facts: dict[str, str], findings: list[Finding], worst: str = 
         console.print(Text(f"{'':<11} cure: {finding.cure}"))
 
 
-app = typer.Typer(rich_markup_mode=None, help="ROS 2 Jazzy, from apt or from the Python registry.")
+_ABOUT = "ROS 2 Jazzy, from apt or from the Python registry."
+app = typer.Typer(add_completion=False, rich_markup_mode=None, help=_ABOUT)
 app.command(epilog="Example: q2r2 ros watch config/dual_iiwa7.yaml --once")(watch)
 app.command(epilog="Example: q2r2 ros doctor config/dual_iiwa7.yaml")(doctor)
 

@@ -11,14 +11,6 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.verification.soak import SoakReport, run_soak
 from tests.cli.command import CELL, FAST, changed_cell, external_cell, one_object, q2r2
 
-COMMANDS = ("export", "demo", "run", "check", "headset-check", "bench", "soak")
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_help_lists_every_command_whose_own_has_an_example(command: str) -> None:
-    assert f"\n  {command} " in q2r2("--help").stdout
-    assert f"Example: q2r2 {command}" in q2r2(command, "--help").stdout
-
 
 @pytest.mark.parametrize(
     ("arguments", "named"),

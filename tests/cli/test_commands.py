@@ -1,0 +1,52 @@
+"""The table of commands: what the help says without them, and what is behind it."""
+
+from __future__ import annotations
+
+import inspect
+import shlex
+import subprocess
+import sys
+
+import pytest
+import typer
+
+from q2r2_control.cli.commands import COMMANDS, Command, load
+from tests.cli.command import q2r2
+
+HEAVY = ("numba", "pinocchio", "mujoco", "scipy", "rclpy", "numpy", "matplotlib")
+EACH_COMMAND = pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+
+
+def first_sentence(text: str) -> str:
+    words = inspect.cleandoc(text).partition("\n\n")[0].split()
+    return " ".join(words[: next((i for i, word in enumerate(words, 1) if word.endswith(".")), len(words))])
+
+
+@pytest.mark.parametrize("arguments", [("--help",), (), ("rum",)], ids=["help", "no command", "a wrong command"])
+def test_the_help_imports_nothing_that_commands_need(arguments: tuple[str, ...]) -> None:
+    code = (
+        f"import atexit, sys; sys.argv = ['q2r2', *{arguments!r}]\n"
+        f"atexit.register(lambda: print('imported:', *(name for name in {HEAVY!r} if name in sys.modules)))\n"
+        "from q2r2_control.__main__ import main; main()"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == (0 if arguments == ("--help",) else 2), result.stderr
+    assert result.stdout.splitlines()[-1] == "imported:"
+
+
+@EACH_COMMAND
+def test_the_help_lists_every_command_with_the_first_sentence_of_its_function(command: Command) -> None:
+    assert f"\n  {command.name} " in q2r2("--help").stdout
+    assert command.about == first_sentence(load(command).help)
+
+
+@EACH_COMMAND
+def test_the_example_of_a_command_stands_in_its_help_and_is_understood(command: Command) -> None:
+    loaded = load(command)
+    if isinstance(loaded, typer.core.TyperGroup):
+        assert all(f"Example: q2r2 {command.name} {name}" in one.epilog for name, one in loaded.commands.items())
+        return
+    assert f"Example: {command.example}\n" in q2r2(command.name, "--help").stdout
+    program, name, *arguments = shlex.split(command.example)
+    assert (program, name) == ("q2r2", command.name)
+    loaded.make_context(name, arguments)  # raises for an option that there is not
