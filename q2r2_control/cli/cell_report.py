@@ -16,7 +16,7 @@ from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
-from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.controller import CartesianController, check_settings
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
 from q2r2_control.robot.kept_distances import kept_distances, near_at_home
 from q2r2_control.robot.near_pairs import lines_to_paste
@@ -83,11 +83,9 @@ def check_cell(config: Config) -> CellCheck:
         config.teleop.bindings.check_device(controls)
     load_class(PLANTS, config.plant)
     robot = Robot.from_config(config)
-    with notice_of_compiling():
-        # With what may touch too, so that every name and number is checked; what is kept is that of position mode.
-        CartesianController(robot, config.control)
-        settings = config.control.without_contact()
-        controller = CartesianController(robot, settings)
+    # With what may touch too, so that every name and number is checked; what is kept is that of position mode.
+    check_settings(robot, config.control)
+    settings = config.control.without_contact()
     kept = kept_distances(robot, settings)
     pairs = zip(robot.distances(robot.home), kept.values.tolist(), strict=True)
     distances = sorted(pairs, key=lambda found: found[0].distance)
@@ -111,7 +109,8 @@ def check_cell(config: Config) -> CellCheck:
         min_distance=settings.min_distance,
         contacts=tuple(config.control.contact_allowed),
         nearest=[KeptPair(pair.name_a, pair.name_b, pair.distance, least) for pair, least in distances[:_NEAREST]],
-        faults=preflight_faults(robot, settings, controller),
+        # Without a controller, whose kernels take minutes to compile: at rest its certificate says no more than this.
+        faults=preflight_faults(robot, settings, None),
         remedies=lines_to_paste(robot, config, near_at_home(robot, kept)),
         stop_torques=stops,
         driven={} if config.external is None else describe(config.external),
@@ -127,7 +126,8 @@ def _capsules_note(config: Config, robot: Robot) -> str:
     settings = config.control.model_copy(update={"pairs": ()})  # that need not be pairs without these shapes
     costs = []
     for its in (robot, Robot.from_config(config.model_copy(update={"capsules": {}, "control": settings}))):
-        controller = CartesianController(its, settings.without_contact())
+        with notice_of_compiling():
+            controller = CartesianController(its, settings.without_contact())
         controller.reset(its.home)
         tick = 1e6 * float(np.median(timeit.repeat(partial(controller.step, {}, 1e-3), number=1, repeat=_TICKS)))
         costs.append((len(its.collision_model.collisionPairs), tick))

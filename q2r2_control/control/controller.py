@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.jit import bound
+from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.qp import DaqpSolver, QpProblem, Solver, assemble, find_minimum
 from q2r2_control.control.reference import move_reference, start_reference
 from q2r2_control.control.safety.safety_data import ROUNDING
@@ -249,6 +250,16 @@ class CartesianController(WatchedPairs):
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
+
+
+def check_settings(robot: Robot, settings: ControllerSettings) -> None:
+    """Check ``settings`` for ``robot`` without compiling a kernel.
+
+    Raises what :class:`CartesianController` raises for them: :class:`ConfigError` for names that the robot does not
+    have and for tasks that cannot be made, :class:`RobotError` for joints and shapes that no kernel handles.
+    """
+    kernel_model_of(robot, settings)
+    load_tasks(robot, settings.tasks)
 
 
 def _passes(dt: float) -> bool:

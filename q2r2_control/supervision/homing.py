@@ -244,8 +244,8 @@ def preflight_faults(
     """One line for each reason why ``robot`` should not start at home; empty for a cell that may run.
 
     Position limits are checked with their margin, gravity against torque limits, and every monitored pair against the
-    distance that it keeps. The
-    ``controller`` has to know a certified stop at home, where it is left reset; None: it moves nothing here.
+    distance that it keeps. The ``controller`` has to know a certified stop at home, where it is left reset. None where
+    no controller is about to move the arms: a stop of arms at rest keeps all apart where the distances are kept.
     """
     lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
     faults = [

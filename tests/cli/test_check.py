@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -27,6 +30,14 @@ def test_check_prints_arms_limits_obstacles_and_the_nearest_pairs_of_a_good_cell
         assert expected in result.stdout
     assert "arms driven by the built-in controller\n" in result.stdout
     assert "FAULT" not in result.stdout
+
+
+def test_check_compiles_no_kernel(tmp_path: Path) -> None:
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    command = [sys.executable, "-m", "q2r2_control", "check", CELL]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert not any(tmp_path.rglob("*.nb?"))
 
 
 def test_check_says_what_drives_the_arms_and_how(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.controller import check_settings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.types import Array
@@ -84,6 +85,7 @@ def test_fingers_of_both_hands_may_touch_each_other() -> None:
     assert -depth <= min(pair.distance for pair in names) < -depth + 1e-3
 
 
+@pytest.mark.parametrize("look", [CartesianController, check_settings])
 @pytest.mark.parametrize(
     ("allowed", "says"),
     [
@@ -97,6 +99,8 @@ def test_fingers_of_both_hands_may_touch_each_other() -> None:
         ),
     ],
 )
-def test_names_and_depths_that_cannot_be_are_refused(allowed: dict[str, Any], says: str) -> None:
+def test_names_and_depths_that_cannot_be_are_refused(
+    look: Callable[[Robot, ControllerSettings], object], allowed: dict[str, Any], says: str
+) -> None:
     with pytest.raises(ConfigError, match=says):
-        CartesianController(ROBOT, settings(allowed))
+        look(ROBOT, settings(allowed))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control import CartesianController, ControllerSettings
+from q2r2_control import CartesianController, ControllerSettings, Robot
+from q2r2_control.control.controller import check_settings
 from q2r2_control.control.tasks.elbow import ElbowSwivel
 from q2r2_control.errors import ConfigError
 from q2r2_control.types import Array
@@ -126,6 +128,7 @@ def test_a_cost_that_is_no_number_is_not_used() -> None:
     assert moved_by(ControllerSettings(tasks={"broken": {}})) == pytest.approx(moved_by(ControllerSettings()), abs=1e-9)
 
 
+@pytest.mark.parametrize("look", [CartesianController, check_settings])
 @pytest.mark.parametrize(
     ("tasks", "message"),
     [
@@ -133,6 +136,8 @@ def test_a_cost_that_is_no_number_is_not_used() -> None:
         ({"elbow": {"gain": 1.0}}, "control.tasks.elbow.gain = 1.0: no such setting; its settings: angle"),
     ],
 )
-def test_an_unknown_task_and_a_bad_setting_are_refused_by_name(tasks: dict, message: str) -> None:
+def test_an_unknown_task_and_a_bad_setting_are_refused_by_name(
+    look: Callable[[Robot, ControllerSettings], object], tasks: dict, message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
-        CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks=tasks))
+        look(cell("dual_iiwa7").robot, ControllerSettings(tasks=tasks))
