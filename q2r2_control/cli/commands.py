@@ -10,7 +10,7 @@ from typer.core import TyperCommand
 from typer.main import get_command
 
 
-class Command(NamedTuple):
+class ListedCommand(NamedTuple):
     """A command as the help of ``q2r2`` lists it, and where it is."""
 
     name: str
@@ -20,106 +20,106 @@ class Command(NamedTuple):
 
 
 COMMANDS = (
-    Command(
+    ListedCommand(
         "demo",
         "run:demo",
         "Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted "
         "hands.",
         "q2r2 demo --viewer",
     ),
-    Command(
+    ListedCommand(
         "run",
         "run:run",
         "Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.",
         "q2r2 run config/dual_iiwa7.yaml --input headset --host 0.0.0.0",
     ),
-    Command(
+    ListedCommand(
         "replay",
         "recordings:replay",
         "Give a recorded run's hand samples and measured states to the same loop again, tick by tick.",
         "q2r2 replay recordings/20260101-120000-dual_iiwa7 --compare",
     ),
-    Command(
+    ListedCommand(
         "judge",
         "recordings:judge",
         "Say of each recorded episode whether to keep or to discard it, why, and by which numbers.",
         "q2r2 judge recordings --json",
     ),
-    Command(
+    ListedCommand(
         "report",
         "recordings:report",
         "Write one HTML page of recorded episodes: verdicts, numbers and plots.",
         "q2r2 report recordings --output report.html",
     ),
-    Command(
+    ListedCommand(
         "new-cell",
         "new_cell:new_cell",
         "Write the YAML of a cell for models of your own: tips, grippers, mounts, a home, pairs of links, "
         "accelerations.",
         "q2r2 new-cell my_cell --left arm.urdf --right arm.urdf",
     ),
-    Command(
+    ListedCommand(
         "check",
         "check:check",
         "Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe.",
         "q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf",
     ),
-    Command(
+    ListedCommand(
         "doctor",
         "doctor:doctor",
         "Say what this computer lacks to run a cell, a line each with what cures it; exit 1 where it cannot run it.",
         "q2r2 doctor my_cell.yaml",
     ),
-    Command(
+    ListedCommand(
         "commission",
         "commission:commission",
         "Commission the arms behind real cabinets, step by step: what each has to show is asked for, or measured.",
         "q2r2 commission my_cell.yaml --duration 60",
     ),
-    Command(
+    ListedCommand(
         "fri-cabinet",
         "fri:fri_cabinet",
         "Stand in for the Sunrise cabinets of a cell: q2r2 run CONFIG --plant fri, in another terminal, drives its "
         "arms.",
         "q2r2 fri-cabinet config/dual_iiwa7_fri.yaml --period 2",
     ),
-    Command(
+    ListedCommand(
         "fri-check",
         "fri_check:fri_check",
         "Listen to the cabinets of a cell and say what they send; exit 1 where an arm could not be commanded.",
         "q2r2 fri-check config/dual_iiwa7_fri.yaml --duration 60",
     ),
-    Command(
+    ListedCommand(
         "mounts",
         "mounts:mounts",
         "Find where the right arm's base is: guide both tips by hand to the same points, one after the other.",
         "q2r2 mounts my_cell.yaml --tip 0 0 0.1",
     ),
-    Command(
+    ListedCommand(
         "headset-check",
         "run:headset_check",
         "Show what a headset sends: connection, rates, ages, last values, and which way each hand moves.",
         "q2r2 headset-check --host 0.0.0.0",
     ),
-    Command(
+    ListedCommand(
         "bench",
         "bench:bench",
         "Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.",
         "q2r2 bench --work --motion meet",
     ),
-    Command(
+    ListedCommand(
         "soak",
         "bench:soak",
         "Check every promise of the controller in random hostile targets, ticks, starts and solver failures.",
         "q2r2 soak --ticks 100000 --contact",
     ),
-    Command(
+    ListedCommand(
         "export",
         "recordings:export",
         "Make a dataset to train on of recordings of q2r2 run --record, an episode each.",
         "q2r2 export lerobot recordings --output datasets/circle --fps 30",
     ),
-    Command(
+    ListedCommand(
         "ros",
         "ros:app",
         "ROS 2 Jazzy, from apt or from the Python registry.",
@@ -130,7 +130,7 @@ COMMANDS = (
 class CommandOnDemand(TyperCommand):
     """A command that the help knows by its line in the table; parsing its arguments imports it."""
 
-    def __init__(self, command: Command) -> None:
+    def __init__(self, command: ListedCommand) -> None:
         super().__init__(command.name, help=command.about)
         self._command = command
 
@@ -139,7 +139,7 @@ class CommandOnDemand(TyperCommand):
         return load(self._command).make_context(info_name, args, parent, **extra)
 
 
-def load(command: Command) -> Any:
+def load(command: ListedCommand) -> Any:
     """Import a command; returns it as click knows it."""
     module, _, name = command.at.partition(":")
     found = getattr(import_module(f"{__package__}.{module}"), name)

@@ -10,7 +10,7 @@ import sys
 import pytest
 import typer
 
-from q2r2_control.cli.commands import COMMANDS, Command, load
+from q2r2_control.cli.commands import COMMANDS, ListedCommand, load
 from tests.cli.command import q2r2
 
 HEAVY = ("numba", "pinocchio", "mujoco", "scipy", "rclpy", "numpy", "matplotlib")
@@ -35,13 +35,13 @@ def test_the_help_imports_nothing_that_commands_need(arguments: tuple[str, ...])
 
 
 @EACH_COMMAND
-def test_the_help_lists_every_command_with_the_first_sentence_of_its_function(command: Command) -> None:
+def test_the_help_lists_every_command_with_the_first_sentence_of_its_function(command: ListedCommand) -> None:
     assert f"\n  {command.name} " in q2r2("--help").stdout
     assert command.about == first_sentence(load(command).help)
 
 
 @EACH_COMMAND
-def test_the_example_of_a_command_stands_in_its_help_and_is_understood(command: Command) -> None:
+def test_the_example_of_a_command_stands_in_its_help_and_is_understood(command: ListedCommand) -> None:
     loaded = load(command)
     if isinstance(loaded, typer.core.TyperGroup):
         assert all(f"Example: q2r2 {command.name} {name}" in one.epilog for name, one in loaded.commands.items())
