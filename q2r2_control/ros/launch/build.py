@@ -74,6 +74,7 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
         if missing := missing_tools(prefix):
             raise BuildError(f"{package.name} not built: missing {'; '.join(missing)}")
         log = prefix / "share" / "q2r2_control" / "log" / f"{package.name}.log"
+        report(f"{package.name}: building, about half a minute")
         began = time.monotonic()
         build(package, prefix, log)
         if package.found_in() is None:
@@ -82,6 +83,17 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
     sourced = _sourced()
     if held and sourced and prefix not in sourced:  # whose libraries the sourced ROS does not find
         report(f"before use: source {prefix}/share/{held[0]}/local_setup.bash")
+
+
+def build_missing(report: Callable[[str], None]) -> None:
+    """Build the message packages where this environment lacks some. Raises :class:`BuildError`.
+
+    It looks for their names only, since importing them all takes seconds: for the start of nodes.
+    """
+    if any(importlib.util.find_spec(package.name) is None for package in interface_packages()):
+        report("building message packages, once for this environment")
+        build_interfaces(report)
+        importlib.invalidate_caches()
 
 
 def missing_tools(prefix: Path) -> list[str]:

@@ -20,6 +20,7 @@ from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.plugins import INPUTS, load_class
 from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_signals
+from q2r2_control.ros.launch.build import build_missing
 from q2r2_control.types import SIDES
 
 NO_INPUT = "none"  # another node sends the hands
@@ -113,9 +114,11 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
     Ctrl-C or SIGTERM ends all of them: 0. A node that ends by itself is reported at once and ends the others: 1. None
     is restarted. Each is a session of its own, so that Ctrl-C in a terminal reaches it only from here, in order. If
     this process is killed, Linux interrupts them all: arms must not move in a teleoperation that cannot be ended.
-    ``say`` is called by several threads, one at a time. Raises :class:`UpError`.
+    ``say`` is called by several threads, one at a time. Message packages that are missing are built first. Raises
+    :class:`UpError`, and :class:`BuildError` where these cannot be built.
     """
     check_rclpy()
+    build_missing(say)
     stop, lock = StopRequest(), threading.Lock()
     running: dict[str, subprocess.Popen[str]] = {}
     readers: list[threading.Thread] = []
@@ -143,7 +146,8 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
 def check_rclpy() -> None:
     """Raise :class:`UpError` where there is no ROS."""
     if importlib.util.find_spec("rclpy") is None:
-        raise UpError("rclpy cannot be imported: pip install 'q2r2_control[ros]', or source a ROS 2 Jazzy")
+        cure = "pip install 'q2r2_control[ros]', in a clone pip install -e '.[ros]', or source a ROS 2 Jazzy"
+        raise UpError(f"rclpy cannot be imported: {cure}")
 
 
 def _start(node: NodeProcess) -> subprocess.Popen[str]:
