@@ -44,7 +44,9 @@ def test_the_help_lists_every_command_with_the_first_sentence_of_its_function(co
 def test_the_example_of_a_command_stands_in_its_help_and_is_understood(command: ListedCommand) -> None:
     loaded = load(command)
     if isinstance(loaded, typer.core.TyperGroup):
-        assert all(f"Example: q2r2 {command.name} {name}" in one.epilog for name, one in loaded.commands.items())
+        assert all(
+            f"Example: q2r2 {command.name} {name}" in (one.epilog or "") for name, one in loaded.commands.items()
+        )
         return
     assert f"Example: {command.example}\n" in q2r2(command.name, "--help").stdout
     program, name, *arguments = shlex.split(command.example)
