@@ -32,7 +32,7 @@ class WayHome:
         self.teleop = Teleop(TeleopSettings(), ["left", "right"])
         self.services = {name: MagicMock() for name in ("home", "hold")}
         node = SimpleNamespace(create_client=lambda kind, name: self.services[name.rpartition("/")[2]])
-        self._client: Any = HomeClient(node, "/c")  # type: ignore[arg-type]
+        self._client: Any = HomeClient(node, "/c")
 
     def update(self, now: float, goes: bool, outcome: Reason | None = None) -> list[str]:
         """The events of this time [s]: the state that an arm comes to, and why."""
