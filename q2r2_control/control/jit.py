@@ -345,10 +345,11 @@ class _Progress(Listener):
 
     def __init__(self, progress: Callable[[int, int], None]) -> None:
         self._progress = progress
-        self._done = 0
+        self._done = -1
 
     def on_start(self, event: Any) -> None:
-        if self._done == 0 and event.data["dispatcher"] in _kernels:
+        if self._done < 0 and event.data["dispatcher"] in _kernels:
+            self._done = 0
             self._tell()
 
     def on_end(self, event: Any) -> None:
