@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
@@ -15,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
 
-from q2r2_control.control.jit import calling_before_compiling
+from q2r2_control.control.jit import compiling
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import ReasonKind
@@ -28,7 +29,8 @@ from q2r2_control.wording import sentence
 
 # A loop that was late by more [us], or by over a period in a larger share of its ticks, may be why a task failed.
 _LATE, _OFTEN = 2e4, 0.2
-_COMPILING = "compiling the controller for this machine, once for each version of its code; 1-2 minutes"
+# Time without a word about kernels that are being compiled, and between two lines about them [s].
+_SILENT_S, _BETWEEN_LINES_S = 3.0, 5.0
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
 ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
@@ -76,10 +78,29 @@ def print_progress(what: str) -> None:
         console.print(what, highlight=False)
 
 
+class _CompilingLines:
+    """Says how far compiling the controller's kernels has got, a line every few seconds."""
+
+    def __init__(self) -> None:
+        self._start: float | None = None
+        self._due = 0.0
+
+    def __call__(self, done: int, total: int) -> None:
+        """Print a line if one is due; the time to go is that of the kernels that are done, scaled to the rest."""
+        now = time.monotonic()
+        if self._start is None:
+            self._start, self._due = now, now + _SILENT_S
+        if now < self._due or done == 0:
+            return
+        self._due = now + _BETWEEN_LINES_S
+        to_go = (now - self._start) / done * (total - done)
+        say(f"compiling {done} of {total} kernels, once for each version of the code; about {to_go:.0f} s to go")
+
+
 @contextmanager
 def notice_of_compiling() -> Iterator[None]:
-    """Say what takes so long, where the controller's kernels have to be compiled."""
-    with calling_before_compiling(lambda: say(_COMPILING)):
+    """Say what takes so long, where the controller's kernels have to be compiled for longer than three seconds."""
+    with compiling(_CompilingLines()):
         yield
 
 
@@ -212,9 +233,9 @@ def _torque_rows(torque: TorqueSummary) -> Iterator[tuple[str, str]]:
     yield "wall pressed by", f"{pressed or 'no pair'}{force}"
     limits = f"{torque.saturated_ticks} ticks at a limit, {torque.rate_limited_ticks} at the rate limit"
     yield "torque", f"{limits}, {torque.held_ticks} held without a measurement"
-    for arm, time in torque.off_reference_s.items():
-        if time > 0.0:
-            yield f"{arm} arm off its reference", f"[red]{time:.2f} s[/] beyond the impedance's error clip"
+    for arm, off_s in torque.off_reference_s.items():
+        if off_s > 0.0:
+            yield f"{arm} arm off its reference", f"[red]{off_s:.2f} s[/] beyond the impedance's error clip"
 
 
 def _percentiles(values: Percentiles, unit: str, digits: int) -> str:

@@ -101,7 +101,12 @@ class DaqpSolver:
 @kernel
 def find_minimum(data_pointer: KernelPointer) -> bool:
     """Write -H^-1 g to ``tasks.minimum`` (nv,) [rad/s]; whether it is finite and within the box and all rows."""
-    data: KernelData = pointee(data_pointer)
+    return _find_minimum(pointee(data_pointer))
+
+
+@kernel
+def _find_minimum(data: KernelData) -> bool:
+    """:func:`find_minimum` as a part of :func:`assemble`: of kernels, only those that Python calls are optimised."""
     tasks, box, rows, minimum = data.tasks, data.safety.box, data.safety.rows, data.tasks.minimum
     nv = minimum.shape[0]
     for i in range(nv):
@@ -138,4 +143,4 @@ def assemble(
     write_task_cost(model.tasks, data.tasks, targets, state.q)
     write_separation_rows(model.safety, data.safety, h)
     inside = next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
-    return usable, inside, find_minimum(data_pointer)
+    return usable, inside, _find_minimum(data)

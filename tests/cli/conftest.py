@@ -15,7 +15,7 @@ import pytest
 @pytest.fixture(autouse=True)
 def _no_notice_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels may have to be compiled in any test."""
-    monkeypatch.setattr("q2r2_control.cli.output.calling_before_compiling", nullcontext)
+    monkeypatch.setattr("q2r2_control.cli.output.compiling", nullcontext)
 
 
 @pytest.fixture

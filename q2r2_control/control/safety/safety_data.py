@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, Contact
-from q2r2_control.control.geometry.kinematics import IntArray, Placements
+from q2r2_control.control.geometry.collision import CollisionData, CollisionModel
+from q2r2_control.control.geometry.kinematics import IntArray
+from q2r2_control.control.jit import KernelPointers, pointers_to
 from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox
 from q2r2_control.control.safety.speed_bound import BodyVelocities
 from q2r2_control.types import Array
@@ -81,14 +82,8 @@ class Rollout(NamedTuple):
 
     q: Array  # (s, nv)
     v: Array  # (s, nv)
-    start: Array  # (s, g, 3)
-    end: Array  # (s, g, 3)
-    rotation: Array  # (s, g, 3, 3)
-    translation: Array  # (s, n, 3) of joint frames
-    axis: Array  # (s, n, 3)
+    samples: KernelPointers  # (s,) CollisionData at each; rotations of joint frames and contact are shared scratch
     known: Array  # (s,) 1 where the sample's bodies are placed
-    frame: Array  # (n, 3, 3) rotations of joint frames, scratch
-    contact: Contact
     step: QuadraticPiece  # from the reference to the candidate
     stop: QuadraticPiece  # all of the candidate's stop
     piece: QuadraticPiece  # a part of it
@@ -96,19 +91,18 @@ class Rollout(NamedTuple):
 
     @classmethod
     def empty(cls, model: CollisionModel) -> Rollout:
-        n, g = len(model.chain.parent), len(model.bodies.joint)
-        samples, nv = _SAMPLES, n - 1
+        nv = len(model.chain.parent) - 1
+        first = CollisionData.empty(model)
+        samples = [first]
+        for _ in range(_SAMPLES - 1):
+            sample = CollisionData.empty(model)
+            placements = sample.placements._replace(rotation=first.placements.rotation)
+            samples.append(sample._replace(placements=placements, contact=first.contact))
         return cls(
-            q=np.zeros((samples, nv)),
-            v=np.zeros((samples, nv)),
-            start=np.zeros((samples, g, 3)),
-            end=np.zeros((samples, g, 3)),
-            rotation=np.zeros((samples, g, 3, 3)),
-            translation=np.zeros((samples, n, 3)),
-            axis=np.zeros((samples, n, 3)),
-            known=np.zeros(samples),
-            frame=Placements.empty(model.chain).rotation,
-            contact=Contact.empty(),
+            q=np.zeros((_SAMPLES, nv)),
+            v=np.zeros((_SAMPLES, nv)),
+            samples=pointers_to(samples),
+            known=np.zeros(_SAMPLES),
             step=QuadraticPiece(*np.zeros((4, nv))),
             stop=QuadraticPiece(*np.zeros((4, nv))),
             piece=QuadraticPiece(*np.zeros((4, nv))),

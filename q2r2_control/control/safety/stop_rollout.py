@@ -5,9 +5,8 @@ The instants are spaced evenly in time, so that samples which one pair needs ser
 
 from __future__ import annotations
 
-from q2r2_control.control.geometry.collision import BodyPlacements, CollisionData, update_placements
-from q2r2_control.control.geometry.kinematics import Placements
-from q2r2_control.control.jit import inlined_kernel, kernel
+from q2r2_control.control.geometry.collision import CollisionData, update_placements
+from q2r2_control.control.jit import inlined_kernel, kernel, pointee_at
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData, SafetyModel
 from q2r2_control.types import Array
@@ -87,9 +86,7 @@ def stay_with_stop(data: SafetyData) -> None:
 def sample_of(model: SafetyModel, data: SafetyData, i: int, duration: float) -> CollisionData:
     """The bodies at sample ``i`` of the candidate's stop."""
     candidate, rollout = data.candidate, data.rollout
-    placements = Placements(rollout.frame, rollout.translation[i], rollout.axis[i])
-    posed = BodyPlacements(rollout.start[i], rollout.end[i], rollout.rotation[i])
-    sample = CollisionData(placements, posed, rollout.contact)
+    sample = pointee_at(rollout.samples, i)
     if rollout.known[i] == 0.0:
         t = duration * i / (rollout.q.shape[0] - 1)
         brake(candidate.q, candidate.v, candidate.deceleration, t, rollout.q[i], rollout.v[i])
