@@ -54,6 +54,7 @@ class MujocoPlant:
     """
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY, CommandMode.TORQUE)
+    simulated = True
 
     def __init__(self, robot: Robot, config: Config) -> None:
         """``robot`` has to be the one of ``config``. Raises :class:`PlantError` where MuJoCo cannot model it."""
