@@ -28,13 +28,14 @@ from q2r2_control.inputs.base import is_simulated, make_input
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.base import WindowedPlant
+from q2r2_control.plants.base import Plant, WindowedPlant, make_plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.scheduling import real_time
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
+from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
@@ -67,6 +68,8 @@ def show_window(pipeline: Pipeline) -> None:
     if not isinstance(plant, WindowedPlant):
         return
     plant.launch_viewer()
+    if isinstance(plant, MujocoPlant):
+        plant.viewer_say("")
 
     def show(tick: Tick) -> None:
         nonlocal due
@@ -147,12 +150,37 @@ def _run_recorded(config: Config, options: RunOptions, page: PageView | None) ->
 
 def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, page: PageView | None) -> CellRun:
     console = Console(stderr=True)
-    with notice_of_compiling():
-        source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
-        pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
-        if not options.simulated_time:
-            pipeline.fit_rate()  # before a recording begins, which says the rate
-        faults = preflight_faults(pipeline.robot, config.control.without_contact(), pipeline.controller)
+    source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
+    robot = Robot.from_config(config)
+    plant = make_plant(options.plant, robot, config)
+    try:
+        if options.window:
+            _open_window(plant)
+        with notice_of_compiling():
+            pipeline = Pipeline(config, robot, source, plant, options.mode)
+            faults = preflight_faults(robot, config.control.without_contact(), pipeline.controller)
+        return _run_pipeline(pipeline, faults, options, recorder, page, console)
+    finally:
+        plant.close()  # also where no run began: a window that is open brings the process down at its end
+
+
+def _open_window(plant: Plant) -> None:
+    """Show the arms at home before the controller is built, which takes long where its kernels are compiled."""
+    if isinstance(plant, MujocoPlant):
+        plant.launch_viewer()
+        plant.viewer_say("preparing the controller")
+        plant.viewer_sync()
+
+
+def _run_pipeline(
+    pipeline: Pipeline,
+    faults: tuple[str, ...],
+    options: RunOptions,
+    recorder: Recorder | None,
+    page: PageView | None,
+    console: Console,
+) -> CellRun:
+    config, source = pipeline.config, pipeline.input
     if faults and not options.force:
         raise ConfigError(f"{config.name}: {'; '.join(faults)}; --force runs it all the same")
     for fault in faults:

@@ -184,6 +184,11 @@ class MujocoPlant:
         if self._window is None:
             self._window = open_window(self.model, self.data)
 
+    def viewer_say(self, words: str) -> None:
+        """Write ``words`` into the window, if there is one, in place of those of before."""
+        if self._window is not None:
+            self._window.set_texts((mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos.mjGRID_TOPLEFT, words, ""))
+
     def viewer_sync(self, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]] = ()) -> bool:
         """See :meth:`WindowedPlant.viewer_sync`; False as well when there is no window."""
         if self._window is None or not self._window.is_running():

@@ -68,7 +68,7 @@ def test_simulated_time_takes_no_time_and_is_never_late() -> None:
 
 
 def paced_run(monkeypatch: pytest.MonkeyPatch, ticks: int, busy_s: float) -> tuple[LoopClock, float]:
-    """A paced clock after its ticks, each of which keeps the computer busy, and the computer's time that they took [s]."""
+    """A paced clock after its ticks, each of which keeps the computer busy, and the time they took [s]."""
     computer = LateSleeper([])
     monkeypatch.setattr(loop_clock, "time", computer)
     loop, began = LoopClock(PERIOD, realtime=False, pace=WallPace()), computer.monotonic()
