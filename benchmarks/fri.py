@@ -142,10 +142,10 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     arrived, took = np.array(plant.answers).T
     period = max(state.period for state in plant.states().values())
     late = [(came, came + its) for came, its in zip(arrived, took, strict=True) if its > period]
-    errors = way.errors(range(round(_LONGEST_DELAY * config.loop_rate_hz)))
+    errors = way.errors(range(round(_LONGEST_DELAY * config.nominal_rate_hz)))
     direct_error, direct_errors = measure_directly(mode, min(duration, 30.0))  # the circles repeat
     return {
-        "delay_ms": 1e3 * int(np.argmin(errors)) / config.loop_rate_hz,
+        "delay_ms": 1e3 * int(np.argmin(errors)) / config.nominal_rate_hz,
         "error_after_delay_mm_rms": min(errors),
         "direct_error_mm_rms": direct_error,
         "answers": len(took),

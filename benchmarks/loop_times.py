@@ -158,7 +158,7 @@ class Case:
         self._times.setdefault(what, []).append(times)
 
     def _run(self, stages: bool = False, paced: bool = True, folder: Path | None = None) -> Array:
-        pipeline, rate = self._pipeline, self._config.loop_rate_hz
+        pipeline, rate = self._pipeline, self._config.nominal_rate_hz
         engaged = round(ENGAGED_AFTER * rate)
         pipeline.input = ScriptedInput(TRAJECTORY, hands=tuple(pipeline.robot.arms))
         clock = StageClock(1.0 / rate if paced else 0.0)
@@ -194,7 +194,7 @@ def main(
         "cases": {name: {what: asdict(times) for what, times in rows.items()} for name, rows in found.items()},
     }
     table = figure_table(
-        f"{config.name}: one tick of the live loop at {config.loop_rate_hz:g} Hz, {rounds} runs of {ticks} ticks each",
+        f"{config.name}: one tick of the live loop at {config.nominal_rate_hz:g} Hz, {rounds} runs of {ticks} ticks",
         ("median / p99", *(f"{name} [us]" for name in found)),
         (
             (what, *(f"{rows[what].median_us:.0f} / {rows[what].p99_us:.0f}" for rows in found.values()))

@@ -120,7 +120,7 @@ def _press(robot: Robot, config: Config, slide: PressSlide) -> _Trace:
     contract = Contract(controller, random=np.random.default_rng(0))
     start, data = controller.tool_pose(_ARM), robot.model.createData()
     drive.reset(plant.state())
-    dt = 1.0 / config.loop_rate_hz
+    dt = 1.0 / config.nominal_rate_hz
     touch: float | None = None  # height of the tool when it first touched [m]
     ticks = round(_END / dt)
     force, height, behind, reference_height = (np.zeros(ticks) for _ in range(4))
@@ -159,7 +159,7 @@ def _pressing_force(plant: MujocoPlant) -> float:
 
 
 def _figures(config: Config, slide: PressSlide, bound: float, trace: _Trace) -> PressFigures:
-    dt, force, height = 1.0 / config.loop_rate_hz, trace.force, trace.height
+    dt, force, height = 1.0 / config.nominal_rate_hz, trace.force, trace.height
     first = int(np.flatnonzero(force > 0.0)[0])
     stays = slice(round((_DOWN + _SETTLED) / dt), round(_SLIDING / dt))
     end = round((_SLIDING + _SLIDE_TIME) / dt)

@@ -116,13 +116,13 @@ class Stack:
             max_error_mm=1e3 * float(errors[moving].max()),
             path_error_mm=_rms_mm(late[moving]),
             end_error_mm=1e3 * float(errors[-1].max()),
-            arrival_s=arrival_time(to_goal, 1.0 / self._config.loop_rate_hz) if motion.has_goal else None,
+            arrival_s=arrival_time(to_goal, 1.0 / self._config.nominal_rate_hz) if motion.has_goal else None,
         )
 
     def _with_efforts(self, figures: StackFigures, log: _Log) -> StackFigures:
         a, tau = np.array(log.a), np.array(log.tau)
         limit = self.robot.capped_acceleration(self._config.control.acceleration_limit)
-        tail = a[-round(_TAIL * self._config.loop_rate_hz) :]
+        tail = a[-round(_TAIL * self._config.nominal_rate_hz) :]
         return replace(
             figures,
             fallback_percent=100.0 * float(np.mean(log.fallback)),

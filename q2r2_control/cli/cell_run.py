@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -26,17 +24,18 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, held_to_promises
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
-from q2r2_control.inputs.base import make_input
+from q2r2_control.inputs.base import is_simulated, make_input
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.base import WindowedPlant
+from q2r2_control.plants.base import Plant, WindowedPlant, make_plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.scheduling import real_time
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
+from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
@@ -59,26 +58,24 @@ def check_window(plant: str | None) -> None:
         raise ConfigError(f"--viewer: {which}; allowed: a plant that has one, as --plant mujoco")
 
 
-def show_window(pipeline: Pipeline, *, paced: bool = False) -> None:
-    """Open the window and keep it up to date while ``pipeline`` runs, which closing it ends.
+def show_window(pipeline: Pipeline) -> None:
+    """Open the window and keep it up to date while ``pipeline`` runs; closing the window ends the run.
 
-    ``paced``: simulated time passes no faster than that of the clock on the wall. Raises :class:`PlantError` where
-    there is no display.
+    Raises:
+        PlantError: There is no display.
     """
-    plant, due, began = pipeline.plant, 0.0, -math.inf
+    plant, due = pipeline.plant, 0.0
     if not isinstance(plant, WindowedPlant):
         return
     plant.launch_viewer()
+    if isinstance(plant, MujocoPlant):
+        plant.viewer_say("")
 
     def show(tick: Tick) -> None:
-        nonlocal due, began
+        nonlocal due
         if tick.t < due:
             return
         due = tick.t + _PERIOD
-        if paced:
-            now = time.monotonic()
-            began = now - tick.t if began == -math.inf else began
-            time.sleep(max(began + tick.t - now, 0.0))
         if not plant.viewer_sync([(one.obstacle, obstacle_colour(one)) for one in tick.obstacles.values()]):
             pipeline.stop()
 
@@ -94,7 +91,7 @@ class RunOptions:
     plant: str
     mode: str
     duration: float | None  # [s]; None: until Ctrl-C
-    fast: bool  # simulated time
+    fast: bool  # simulated time as fast as it can, where it is otherwise paced by the clock
     input_options: Mapping[str, object]  # by name, those that the input takes
     table: bool
     window: bool
@@ -105,6 +102,13 @@ class RunOptions:
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
     page: tuple[str, int] | None = None  # address of the page in the browser
+
+    @property
+    def simulated_time(self) -> bool:
+        """True if nothing outside keeps the time: neither a person's hands nor a plant that is real."""
+        inputs = filter(None, (self.input, self.input_options.get("takeover")))
+        is_simulated_plant = bool(getattr(load_class(PLANTS, self.plant), "simulated", False))
+        return self.fast or (is_simulated_plant and all(is_simulated(str(name)) for name in inputs))
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +138,7 @@ def _run_recorded(config: Config, options: RunOptions, page: PageView | None) ->
     if options.record is None:
         return _run_cell(config, options, None, page)
     pictures = bool(config.simulated_cameras) and issubclass(load_class(PLANTS, options.plant), MujocoPlant)
-    recorder = Recorder(options.record, options.name, waits=options.fast, pictures=pictures)
+    recorder = Recorder(options.record, options.name, waits=options.simulated_time, pictures=pictures)
     try:
         with recorder:
             run = _run_cell(config, options, recorder, page)
@@ -146,10 +150,37 @@ def _run_recorded(config: Config, options: RunOptions, page: PageView | None) ->
 
 def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, page: PageView | None) -> CellRun:
     console = Console(stderr=True)
-    with notice_of_compiling():
-        source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
-        pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
-        faults = preflight_faults(pipeline.robot, config.control.without_contact(), pipeline.controller)
+    source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
+    robot = Robot.from_config(config)
+    plant = make_plant(options.plant, robot, config)
+    try:
+        if options.window:
+            _open_window(plant)
+        with notice_of_compiling():
+            pipeline = Pipeline(config, robot, source, plant, options.mode)
+            faults = preflight_faults(robot, config.control.without_contact(), pipeline.controller)
+        return _run_pipeline(pipeline, faults, options, recorder, page, console)
+    finally:
+        plant.close()  # also where no run began: a window that is open brings the process down at its end
+
+
+def _open_window(plant: Plant) -> None:
+    """Show the arms at home before the controller is built, which takes long where its kernels are compiled."""
+    if isinstance(plant, MujocoPlant):
+        plant.launch_viewer()
+        plant.viewer_say("preparing the controller")
+        plant.viewer_sync()
+
+
+def _run_pipeline(
+    pipeline: Pipeline,
+    faults: tuple[str, ...],
+    options: RunOptions,
+    recorder: Recorder | None,
+    page: PageView | None,
+    console: Console,
+) -> CellRun:
+    config, source = pipeline.config, pipeline.input
     if faults and not options.force:
         raise ConfigError(f"{config.name}: {'; '.join(faults)}; --force runs it all the same")
     for fault in faults:
@@ -229,7 +260,8 @@ def _run(
             robot = pipeline.robot
             joints = {arm: [robot.joint_names[joint] for joint in its.joints] for arm, its in robot.arms.items()}
             title = f"{options.name}: Ctrl-C brings the arms to rest and ends"
-            table = LiveTable(title, joints, pipeline.config.teleop.bindings, options.steps, options.duration)
+            bindings, simulated = pipeline.config.teleop.bindings, options.simulated_time
+            table = LiveTable(title, joints, bindings, options.steps, options.duration, simulated_time=simulated)
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         if isinstance(pipeline.plant, MujocoPlant):
@@ -249,13 +281,15 @@ def _run(
                 cameras = ()
             recorder.record_outcome = pipeline.record_outcome
             notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
-            notes |= {name: str(value) for name, value in options.input_options.items()}
-            recorder.begin(About.of(pipeline, not options.fast, notes, cameras), pipeline.robot)
+            given = options.input_options.items()
+            notes |= {name: str(value) for name, value in given if name != "fast"}  # which changes nothing of the run
+            recorder.begin(About.of(pipeline, not options.simulated_time, notes, cameras), pipeline.robot)
             pipeline.listeners.append(recorder)
             if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):
                 judge_now = EpisodeJudge(lambda: recorder.file, pipeline.record_outcome)
                 pipeline.listeners.append(stack.enter_context(judge_now))
-        return pipeline.run(options.duration, realtime=not options.fast)
+        simulated = options.simulated_time
+        return pipeline.run(options.duration, realtime=not simulated, paced=not options.fast)
 
 
 def _lookers(

@@ -127,7 +127,8 @@ def summary_table(summary: RunSummary) -> Table:
 
 
 def _rows(summary: RunSummary) -> Iterator[tuple[str, str]]:
-    yield "duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {summary.loop_rate_hz:.0f} Hz"
+    factor = "" if summary.real_time_factor is None else f", {summary.real_time_factor:.1f} x real time"
+    yield "duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {summary.loop_rate_hz:.0f} Hz{factor}"
     yield "tick", _percentiles(summary.tick_us, "us", 0)
     if summary.lateness_us.max is not None:
         late = _percentiles(summary.lateness_us, "us", 0)
@@ -197,7 +198,7 @@ def late_line(summary: RunSummary, tasks: Iterable[TaskResult]) -> str | None:
     if late is None or not (late >= _LATE or often) or all(task.succeeded for task in tasks):
         return None
     line = f"the loop was late by up to {1e-3 * late:.0f} ms, in {summary.overruns} ticks by more than a period"
-    return f"[yellow]{line}[/]: this computer is too busy or slow to judge by"
+    return f"[yellow]{line}[/]: close other programs, or give it priority with --rt"
 
 
 def recording_line(recording: RecordingSummary) -> str:

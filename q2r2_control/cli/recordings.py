@@ -67,12 +67,12 @@ def replay(
 
         def prepare(pipeline: Pipeline) -> None:
             if viewer:
-                show_window(pipeline, paced=True)
+                show_window(pipeline)
             if playback is not None:
                 say(f"page: {playback.begin(pipeline, Path(file).stem)}")
 
         with notice_of_compiling():
-            result = replay_recording(Path(file), cell, plant, compare=compare, prepare=prepare)
+            result = replay_recording(Path(file), cell, plant, compare=compare, prepare=prepare, paced=viewer)
         if playback is not None:
             playback.wait()
     for note in result.notes:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from q2r2_control.config.arms import (
     ArmConfig,
@@ -41,6 +41,22 @@ from q2r2_control.config.resources import find_resource
 from q2r2_control.config.strict import Network, StrictModel, network_of, validated
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
+
+AUTO: Literal["auto"] = "auto"  # the loop's rate is chosen when a run in real time begins
+HIGHEST_FITTING_RATE_HZ = 1000.0
+
+
+def _only_auto(value: object) -> object:
+    if value != AUTO:
+        raise ValueError(f"allowed: {AUTO}, or 50 to 2000 [Hz]")
+    return value
+
+
+_LoopRate = Annotated[
+    Annotated[float, Field(ge=50, le=2000), Tag("[number]")]
+    | Annotated[Literal["auto"], BeforeValidator(_only_auto), Tag("[word]")],
+    Discriminator(lambda value: "[word]" if isinstance(value, str) else "[number]"),
+]
 
 
 class ObstacleConfig(StrictModel):
@@ -145,7 +161,9 @@ class Config(StrictModel):
         default_factory=dict, description="links of whose meshes each becomes so many capsules at most; others: one"
     )
     supervision: SupervisionSettings = SupervisionSettings()
-    loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
+    loop_rate_hz: _LoopRate = Field(
+        AUTO, description="control loop [Hz]; auto: the highest of 1000, 500 and 250 that this computer can keep"
+    )
     input: str = Field("scripted", min_length=1, description="name of what brings hand samples, where none is given")
     plant: str = Field("mujoco", min_length=1, description="name of what moves, where none is given")
     controller: ControllerKind = Field(ControllerKind.BUILTIN, description="builtin, or external: for q2r2 ros up")
@@ -173,6 +191,11 @@ class Config(StrictModel):
     def simulated_cameras(self) -> dict[str, CameraConfig]:
         """Those of the simulated cell; the others are on ROS topics."""
         return {name: camera for name, camera in self.cameras.items() if camera.topic is None}
+
+    @property
+    def nominal_rate_hz(self) -> float:
+        """Rate of the loop [Hz]; the highest one that may be chosen, as long as it is ``auto``."""
+        return HIGHEST_FITTING_RATE_HZ if self.loop_rate_hz == AUTO else float(self.loop_rate_hz)
 
     @property
     def gripper_delay(self) -> float:

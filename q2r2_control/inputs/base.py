@@ -34,10 +34,11 @@ class Input(Protocol):
     """A source of hand samples, polled once per control tick by the loop's own thread.
 
     Order of use: ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``. An input that is found by
-    its name has a class method ``from_config(config)`` as well. Its class may have three attributes more: ``options``,
+    its name has a class method ``from_config(config)`` as well. Its class may have further attributes: ``options``,
     names of what ``from_config`` takes by keyword, which are options of ``q2r2 run`` and ``say``, a function that
-    prints a line; ``cell``, a function that returns a cell with what this input knows better, as its own axes; and
-    ``executable``, the ROS executable that stands for it instead of ``hand_input``.
+    prints a line; ``cell``, a function that returns a cell with what this input knows better, as its own axes;
+    ``executable``, the ROS executable that stands for it instead of ``hand_input``; and ``simulated``, True if its
+    samples follow from the times of its polls, so that a run may be in simulated time.
     """
 
     controls: DeviceControls  # the buttons and axes that its samples have
@@ -90,6 +91,11 @@ def check_samples(samples: list[HandSample]) -> list[HandSample]:
 def options_of(source: str) -> tuple[str, ...]:
     """The options that the input called ``source`` takes. Raises :class:`ConfigError` for an unknown name."""
     return tuple(getattr(load_class(INPUTS, source), "options", ()))
+
+
+def is_simulated(source: str) -> bool:
+    """True if the input called ``source`` can be polled in simulated time. Raises :class:`ConfigError` for no input."""
+    return bool(getattr(load_class(INPUTS, source), "simulated", False))
 
 
 def adapted(source: str, config: Config) -> Config:

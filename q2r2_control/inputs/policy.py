@@ -67,6 +67,7 @@ class PolicyInput:
     """
 
     options = ("policy", "takeover", "fast", "say")
+    simulated = True  # where no hands take over that are not
 
     def __init__(
         self,

@@ -239,6 +239,7 @@ class ScriptedInput(PlayedInput):
     """
 
     options = ("trajectory", "human", "seed", "fast", "shaky")
+    simulated = True
     executable = "SimulationInput"
 
     def __init__(

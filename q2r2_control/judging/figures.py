@@ -175,7 +175,7 @@ def timing_figures(episode: Episode) -> TimingFigures:
     ticks, count = episode.ticks, len(episode.ticks.t)
     if not count:
         return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended)
-    period = 1.0 / episode.config.loop_rate_hz
+    period = 1.0 / episode.config.nominal_rate_hz
     lost = np.diff(ticks.number, prepend=-1) - 1  # the first tick of a run is number 0
     gaps = np.diff(ticks.t, prepend=0.0) - ticks.dt
     missed = int(np.maximum(np.round(ticks.dt / period) - 1, 0).sum())

@@ -5,20 +5,21 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config.cell import Config
+from q2r2_control.config.cell import AUTO, Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive, permitted
 from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import ROUTINE, Reason, ReasonKind
 from q2r2_control.inputs.base import Input, PolicySource, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
-from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock
+from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock, WallPace
+from q2r2_control.pipeline.loop_rate import FITTING_RATES_HZ, RateFit, largest_usual_time
 from q2r2_control.pipeline.operator_side import OperatorSide
 from q2r2_control.pipeline.requests import RequestedRun
 from q2r2_control.pipeline.run_recorder import RunRecorder
@@ -41,6 +42,10 @@ _STOP_ALLOWANCE = 1.0  # after full braking, for an arm that still recovers into
 _REST = 1e-6  # of the reference [rad/s]
 _ROUNDING = 1e-9  # [s]
 _LONGEST_TORQUE = 0.005  # that one torque may push for: in 0.1 s it drives the arms into each other [s]
+_LATE_LOOP = (
+    "the loop falls behind: of its %.0f ticks a second more than a tenth come late; close other programs, give it "
+    "priority with --rt, or set a lower loop_rate_hz in the cell"
+)
 _logger = logging.getLogger(__name__)
 
 
@@ -70,6 +75,7 @@ class Pipeline(RequestedRun):
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
         self._stopping = False
+        self._pace: WallPace | None = None  # of a run in simulated time that must not be faster than the clock
         self._set_up()
 
     @classmethod
@@ -99,19 +105,29 @@ class Pipeline(RequestedRun):
         """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
         self._stopping = True
 
-    def run(self, duration: float | None = None, realtime: bool = True) -> RunSummary:
-        """Run for ``duration`` [s], or until :meth:`stop`, Ctrl-C or SIGTERM; the arms are brought to rest first.
+    def run(self, duration: float | None = None, realtime: bool = True, *, paced: bool = False) -> RunSummary:
+        """Run until the duration is over, or until :meth:`stop`, Ctrl-C or SIGTERM; the arms come to rest first.
 
-        ``realtime``: the loop follows the clock, and a late tick moves no joint farther than a period allows. Otherwise
-        time is simulated and the run is repeatable. Raises :class:`ConfigError` for a duration that is not positive.
+        Args:
+            duration: Length of the run [s]; None if only a stop ends it.
+            realtime: True if the loop follows the clock, and a late tick moves no joint farther than a period allows.
+                False if time is simulated, which makes the run repeatable.
+            paced: True if simulated time must not pass faster than the clock. On a slow computer it passes more slowly.
+                The result is the same to the bit.
+
+        Raises:
+            ConfigError: The duration is not positive, or the plant cannot go by the time that is asked for.
         """
         number = isinstance(duration, float | int | np.number)
         if duration is not None and not (number and math.isfinite(duration) and duration > 0.0):
             raise ConfigError(f"duration = {shown(duration)}: allowed: a positive number of seconds")
         if isinstance(self.plant, SessionPlant) and self.plant.realtime_only and not realtime:
             raise ConfigError("simulated time: allowed with a plant that is simulated only")
-        self._prepare(realtime)
         try:
+            if realtime:
+                self.fit_rate()
+            self._pace = WallPace() if paced and not realtime else None
+            self._prepare(realtime)
             self._start_input(realtime)
             with stop_on_signals(self.stop), few_garbage_collections():
                 self._begin(realtime)
@@ -127,6 +143,7 @@ class Pipeline(RequestedRun):
         """
         if isinstance(self.plant, SessionPlant):
             raise ConfigError("ticks one by one: allowed with a plant that is simulated only")
+        self._pace = None
         self._prepare(realtime=False)
         self._start_input(realtime=False)
         self._begin(realtime=False)
@@ -166,7 +183,38 @@ class Pipeline(RequestedRun):
 
     def make_clock(self, realtime: bool) -> LoopClock:
         """The clock of a run, which begins now; a replay has one of its own."""
-        return LoopClock(1.0 / self.config.loop_rate_hz, realtime)
+        return LoopClock(1.0 / self.config.nominal_rate_hz, realtime, self._pace)
+
+    def fit_rate(self) -> RateFit | None:
+        """Choose the rate of a loop in real time that leaves it to this computer, as ``loop_rate_hz: auto`` does.
+
+        Ticks are taken in real time while the arms rest at the plant's start, first at the highest rate. The rate that
+        fits replaces ``auto`` in :attr:`config`. Returns None if the cell names a rate, which is taken as it is, or if
+        the plant has sessions, whose cabinets or controllers set the time.
+        """
+        if self.config.loop_rate_hz != AUTO or isinstance(self.plant, SessionPlant):
+            return None
+        listeners, self.listeners = self.listeners, []  # these ticks are no part of the run
+        try:
+            for rate in FITTING_RATES_HZ:
+                self.config = self.config.model_copy(update={"loop_rate_hz": rate})
+                fit = RateFit(rate, largest_usual_time(self._resting_ticks()))
+                if fit.leaves_room:
+                    break
+        finally:
+            self.listeners = listeners
+        _logger.info(str(fit))
+        return fit
+
+    def _resting_ticks(self) -> Iterator[float]:
+        """Take ticks in real time while the arms rest, and yield how long each took without its wait [s]."""
+        self._pace = None
+        self._prepare(realtime=True)
+        self._begin(realtime=True)
+        self._following = False
+        while True:
+            self.tick()
+            yield time.perf_counter() - self._clock.woke
 
     def _prepare(self, realtime: bool) -> None:
         """Nothing of an earlier run may move an arm: every run starts paused and with open grippers, as the plant."""
@@ -181,11 +229,12 @@ class Pipeline(RequestedRun):
         self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
         watch = watch_settings(self.config.supervision, self.drive.yields)
         streams = StreamSettings(linked=self.config.teleop.linked)
-        period, delay = 1.0 / self.config.loop_rate_hz, self.config.gripper_delay
+        period, delay = 1.0 / self.config.nominal_rate_hz, self.config.gripper_delay
         self.loop = ControlLoop(self.controller, self.drive, period, streams, watch, gripper_delay=delay)
 
     def _begin(self, realtime: bool) -> None:
         self._following = True
+        self._told_late = False
         self._targets = {arm: ArmTarget(None, OPEN) for arm in self.robot.arms}
         self._grippers = dict.fromkeys(self.robot.arms, OPEN)  # commanded
         sessions = self._sessions = self.plant if isinstance(self.plant, SessionPlant) else None
@@ -246,6 +295,9 @@ class Pipeline(RequestedRun):
         """The way of the data, once: sample -> target -> reference -> command -> state."""
         gap = self._clock.wait()
         now = self._clock.now
+        if self._clock.falls_behind() and not self._told_late:
+            self._told_late = True
+            _logger.warning(_LATE_LOOP, 1.0 / self._clock.period)
         braked, dt = (0.0, self.loop.pace(gap)) if self._sessions is None else self._sessions.due(now)
         began = time.perf_counter()
         samples = self._operator.poll(now) if self._following else []

@@ -49,6 +49,7 @@ class RunRecorder(RunStatistics):
             raise self._failure
         return replace(
             self.summary(clock.wall_time()),
+            real_time_factor=clock.real_time_factor(),
             lateness_us=clock.lateness.percentiles(1e-6),
             overruns=clock.overruns,
             missed_ticks=pacer.missed_ticks,

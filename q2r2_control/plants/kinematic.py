@@ -14,6 +14,7 @@ class KinematicPlant:
     """Perfect tracking of position and velocity commands; grippers move at their configured speed. No mass."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY)
+    simulated = True
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._robot = robot

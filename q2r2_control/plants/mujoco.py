@@ -54,6 +54,7 @@ class MujocoPlant:
     """
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY, CommandMode.TORQUE)
+    simulated = True
 
     def __init__(self, robot: Robot, config: Config) -> None:
         """``robot`` has to be the one of ``config``. Raises :class:`PlantError` where MuJoCo cannot model it."""
@@ -182,6 +183,11 @@ class MujocoPlant:
         """Open MuJoCo's own window. Raises :class:`PlantError` where there is no display."""
         if self._window is None:
             self._window = open_window(self.model, self.data)
+
+    def viewer_say(self, words: str) -> None:
+        """Write ``words`` into the window, if there is one, in place of those of before."""
+        if self._window is not None:
+            self._window.set_texts((mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos.mjGRID_TOPLEFT, words, ""))
 
     def viewer_sync(self, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]] = ()) -> bool:
         """See :meth:`WindowedPlant.viewer_sync`; False as well when there is no window."""

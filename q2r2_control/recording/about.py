@@ -47,7 +47,12 @@ class About:
 
     @classmethod
     def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str], cameras: Sequence[str] = ()) -> About:
-        """Of a run that is about to begin; ``notes`` are added to those on program and machine."""
+        """Describe a run that is about to begin; ``notes`` are added to those on program and machine.
+
+        In real time the pipeline chooses its rate now, since the recorded cell has to name it for a replay.
+        """
+        if realtime:
+            pipeline.fit_rate()
         return cls(
             arms=tuple(pipeline.robot.arms),
             joints=tuple(pipeline.robot.joint_names),

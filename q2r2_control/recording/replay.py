@@ -16,7 +16,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, Solver
 from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
-from q2r2_control.pipeline.loop_clock import LoopClock
+from q2r2_control.pipeline.loop_clock import LoopClock, WallPace
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.pipeline.requests import REPEATED
 from q2r2_control.plants.base import make_plant
@@ -66,13 +66,15 @@ def replay(
     *,
     compare: bool = True,
     prepare: Callable[[Pipeline], None] = lambda pipeline: None,
+    paced: bool = False,
 ) -> Replay:
     """Run a recording again, with its own cell or another one.
 
     Without a ``plant``, what was measured is measured again, whatever is commanded; with one, it moves and is measured.
     Only one of the recorded kind can do the same to the bit, so ``compare`` is for no other. ``prepare`` gets the
-    pipeline. Raises :class:`RecordingError` for a file that is none or is damaged. Raises :class:`Q2R2Error` for a cell
-    that cannot be built or has other arms or joints, and for a plant without the recorded mode.
+    pipeline. ``paced`` is True if the run must not be faster than it was recorded. Raises :class:`RecordingError` for a
+    file that is none or is damaged. Raises :class:`Q2R2Error` for a cell that cannot be built or has other arms or
+    joints, and for a plant without the recorded mode.
     """
     recording = Recording(path)
     about = recording.about
@@ -98,7 +100,7 @@ def replay(
     prepare(pipeline)
     summary, ended_by = None, None
     try:
-        summary = pipeline.run(realtime=False)
+        summary = pipeline.run(realtime=False, paced=paced)
     except NoMoreTicksError:
         ended_by = "the arms were at rest here when it was recorded, and are not now"
         if ticks.missing:
@@ -125,7 +127,7 @@ class ReplayPipeline(Pipeline):
         self._recorded = ticks
 
     def make_clock(self, realtime: bool) -> LoopClock:
-        return _Clock(1.0 / self.config.loop_rate_hz, self._recorded)
+        return _Clock(1.0 / self.config.nominal_rate_hz, self._recorded, self._pace)
 
     def _ask_again(self, tick: RecordedTick) -> None:
         """Repeat what a program asked of the run at this tick: an event of both arms, and of no change of a state."""
@@ -141,14 +143,15 @@ class ReplayPipeline(Pipeline):
 
 
 class _Clock(LoopClock):
-    def __init__(self, period: float, ticks: RecordedTicks) -> None:
-        super().__init__(period, realtime=False)
+    def __init__(self, period: float, ticks: RecordedTicks, pace: WallPace | None) -> None:
+        super().__init__(period, realtime=False, pace=pace)
         self._recorded = ticks
         self.start = self.now = ticks.start.now
 
     def wait(self) -> float:
         tick = self._recorded.advance()
         self.now = tick.now
+        self.keep_pace()
         return tick.dt
 
     def after(self, duration: float) -> bool:

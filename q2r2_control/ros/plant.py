@@ -50,7 +50,7 @@ class RosPlant:
     realtime_only = True
 
     def __init__(self, robot: Robot, config: Config) -> None:
-        self._robot, self._period = robot, 1.0 / config.loop_rate_hz
+        self._robot, self._period = robot, 1.0 / config.nominal_rate_hz
         self._fingers, self._kind = Fingers(robot, config), TrajectoryOutput(self._period, robot)
         self._openings = dict.fromkeys(self._fingers.arms, 1.0)  # none is measured before a run
         self._context: Context | None = None

@@ -130,6 +130,7 @@ class RunSummary:
     ticks: int
     duration_s: float
     loop_rate_hz: float
+    real_time_factor: float | None  # seconds of simulated time in a second; None in real time
     tick_us: Percentiles  # from polling the input to the command, plant not included
     lateness_us: Percentiles  # of a tick's begin, after it was due; None in simulated time
     input_to_command_ms: Percentiles  # from a sample's receipt to the command it led to
@@ -272,6 +273,7 @@ class RunStatistics:
             ticks=self._ticks,
             duration_s=self._duration,
             loop_rate_hz=self._ticks / wall_time if wall_time > 0 else 0.0,
+            real_time_factor=None,
             tick_us=self._compute_times.percentiles(1e-6),
             lateness_us=NOTHING_MEASURED,
             input_to_command_ms=self._latency.percentiles(1e-3),

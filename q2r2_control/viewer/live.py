@@ -98,10 +98,13 @@ class LiveTable:
         bindings: BindingSettings,
         steps: Sequence[tuple[float, str]] = (),
         duration: float | None = None,
+        *,
+        simulated_time: bool = False,
     ) -> None:
         """``joints``: names of those that move each arm; ``bindings``: what the hands' controls do.
 
         ``steps`` of the work, from when on and in words, of a run that takes ``duration``, both in [s].
+        ``simulated_time`` is True if the table shall say how fast the run is, compared with real time.
         """
         self._title, self._joints, self._bindings = title, joints, bindings
         self._steps, self._duration = steps, duration
@@ -110,7 +113,8 @@ class LiveTable:
         self._count = 0
         self._binding: dict[ActiveLimit, None] = {}
         self._repelled: dict[str, None] = {}
-        self._drawn = (time.monotonic(), 0)
+        self._simulated_time = simulated_time
+        self._drawn = (time.monotonic(), 0, 0.0)  # when, after how many ticks, and the time of the run then [s]
 
     def __call__(self, tick: Tick) -> None:
         """Store one tick."""
@@ -157,9 +161,12 @@ class LiveTable:
 
     def render(self) -> Table:
         """The table at this moment."""
-        tick, (then, counted), now = self._newest, self._drawn, time.monotonic()
-        self._drawn = now, self._count
-        rate = (self._drawn[1] - counted) / max(now - then, 1e-9)
+        tick, (then, counted, reached), now = self._newest, self._drawn, time.monotonic()
+        self._drawn = now, self._count, 0.0 if tick is None else tick.t
+        passed = max(now - then, 1e-9)
+        loop = f"{(self._drawn[1] - counted) / passed:.0f} Hz"
+        if self._simulated_time:
+            loop += f", {(self._drawn[2] - reached) / passed:.1f} x real time"
         table = Table(title=self._title, title_justify="left", min_width=76)
         table.add_column("", style="dim")
         if tick is None:
@@ -188,7 +195,7 @@ class LiveTable:
         more = f" and {len(names) - _LIMITS_SHOWN} more" if len(names) > _LIMITS_SHOWN else ""
         colour = "yellow" if report.margin < _NEAR else "default"
         rows = {
-            "time, loop": (f"{tick.t:.1f} s", f"{rate:.0f} Hz, {1e6 * tick.compute_time:.0f} us a tick"),
+            "time, loop": (f"{tick.t:.1f} s", f"{loop}, {1e6 * tick.compute_time:.0f} us a tick"),
             "nearest pair": (f"{1e3 * report.closest_distance:.1f} mm", " | ".join(report.closest_pair)),
             "tightest pair": (f"[{colour}]{1e3 * report.margin:.1f} mm to spare[/]", " | ".join(report.tightest_pair)),
             "status": (str(report.status), "a stop is certified" if report.certified else "[red]no certified stop[/]"),

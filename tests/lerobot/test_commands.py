@@ -67,7 +67,7 @@ def run(arguments: list[str], folder: Path) -> None:
 
 
 CHANGES = {
-    "loop_rate_hz: 1000.0": "loop_rate_hz: 100.0",  # nothing here needs more
+    "loop_rate_hz: auto": "loop_rate_hz: 100.0",  # nothing here needs more
     "max_substep: 0.002": "max_substep: 0.01",
 }
 
@@ -216,7 +216,7 @@ def test_a_dataset_that_record_makes_has_the_numbers_that_the_export_of_the_same
 
 def test_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) -> None:
     rate = 500  # a slower loop follows a target less closely [Hz]
-    write_cell(folder, {"loop_rate_hz: 1000.0": f"loop_rate_hz: {rate}.0"})
+    write_cell(folder, {"loop_rate_hz: auto": f"loop_rate_hz: {rate}.0"})
     options = ("--dataset.repo_id=q2r2/circle", f"--dataset.root={exported}", "--dataset.episode=0")
     run(command("lerobot-replay", folder, *options, "--play_sounds=false"), folder)
     dataset = LeRobotDataset("q2r2/circle", root=exported)

@@ -69,7 +69,7 @@ class FreezingClock(LoopClock):
 
 class FreezingLoop(Pipeline):
     def make_clock(self, realtime: bool) -> LoopClock:
-        return FreezingClock(1.0 / self.config.loop_rate_hz, realtime)
+        return FreezingClock(1.0 / self.config.nominal_rate_hz, realtime)
 
     def freeze(self, duration: float) -> None:
         assert isinstance(self._clock, FreezingClock)

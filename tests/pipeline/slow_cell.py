@@ -64,7 +64,7 @@ def slow_run(
 
     def plant(robot: Robot, slow: Config) -> PendantCabinets:
         settings = {side: settings_of(robot, side, CommandKind.POSITION, 2, 0.01) for side in robot.arms}
-        period, longest = 1.0 / slow.loop_rate_hz, slow.control.max_substep
+        period, longest = 1.0 / slow.nominal_rate_hz, slow.control.max_substep
         made = PendantCabinets(robot, settings, robot.home, period, longest, jitter=_LATE)
         for side, cabinet in made.cabinets.items():
             cabinet.arm = arm(truth or robot, side)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.pipeline import loop_clock
-from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock
+from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock, WallPace
 from q2r2_control.types import RobotState
 
 PERIOD = 0.01
@@ -23,6 +23,9 @@ class LateSleeper:
 
     def perf_counter(self) -> float:
         return self._now
+
+    def advance(self, duration: float) -> None:
+        self._now += duration
 
     def sleep(self, duration: float) -> None:
         self._now += duration + (self._delays.pop(0) if self._delays else 0.0)
@@ -62,6 +65,58 @@ def test_simulated_time_takes_no_time_and_is_never_late() -> None:
     assert loop.after(3 * PERIOD)
     assert not loop.after(4 * PERIOD)
     assert (loop.overruns, loop.lateness.percentiles(1e-3).max) == (0, None), "it is never late"
+
+
+def paced_run(monkeypatch: pytest.MonkeyPatch, ticks: int, busy_s: float) -> tuple[LoopClock, float]:
+    """A paced clock after its ticks, each of which keeps the computer busy, and the time they took [s]."""
+    computer = LateSleeper([])
+    monkeypatch.setattr(loop_clock, "time", computer)
+    loop, began = LoopClock(PERIOD, realtime=False, pace=WallPace()), computer.monotonic()
+    for tick in range(1, ticks + 1):
+        assert loop.wait() == PERIOD
+        assert loop.now == tick * PERIOD
+        computer.advance(busy_s)
+    return loop, computer.monotonic() - began
+
+
+def test_paced_time_passes_as_fast_as_the_clock_on_a_fast_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop, took = paced_run(monkeypatch, 1000, busy_s=0.3 * PERIOD)
+    assert took == pytest.approx(1000 * PERIOD, abs=2 * PERIOD)
+    assert loop.real_time_factor() == pytest.approx(1.0, rel=0.01)
+    assert (loop.overruns, loop.falls_behind()) == (0, False)
+
+
+def test_paced_time_goes_on_in_slow_motion_on_a_slow_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop, took = paced_run(monkeypatch, 1000, busy_s=2.5 * PERIOD)
+    assert took == pytest.approx(2500 * PERIOD)
+    assert loop.real_time_factor() == pytest.approx(0.4, rel=0.01)
+    assert (loop.overruns, loop.falls_behind()) == (0, False)
+
+
+def test_a_long_stall_of_the_computer_is_not_caught_up_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    computer = LateSleeper([])
+    monkeypatch.setattr(loop_clock, "time", computer)
+    loop = LoopClock(PERIOD, realtime=False, pace=WallPace())
+    loop.wait()
+    computer.advance(10.0)
+    began = computer.monotonic()
+    for _ in range(100):
+        loop.wait()
+    assert computer.monotonic() - began >= 100 * PERIOD - 0.1 - 2 * PERIOD
+
+
+def test_a_loop_that_is_late_in_more_than_a_tenth_of_a_second_s_ticks_falls_behind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    often, seldom = ([2.5 * PERIOD if tick % every == 0 else 0.0 for tick in range(400)] for every in (5, 40))
+    for delays, falls_behind in ((often, True), (seldom, False)):
+        monkeypatch.setattr(loop_clock, "time", LateSleeper(delays))
+        loop, found = LoopClock(PERIOD, realtime=True), []
+        for _ in range(300):
+            loop.wait()
+            found.append(loop.falls_behind())
+        assert any(found) == falls_behind
+        assert sum(found) <= 4, "it is asked about once a second"
 
 
 def test_lateness_and_overruns_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:

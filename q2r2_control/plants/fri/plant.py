@@ -43,7 +43,7 @@ class FriPlant:
             if len(its.joints) != JOINTS:
                 raise ConfigError(f"fri.{arm}: the arm has {len(its.joints)} joints; allowed: {JOINTS}")
         self._robot, self._cabinets = robot, {str(arm): cabinet for arm, cabinet in config.fri.items()}
-        self._period, self._longest = 1.0 / config.loop_rate_hz, config.control.max_substep
+        self._period, self._longest = 1.0 / config.nominal_rate_hz, config.control.max_substep
         if self._longest < 2.0 * self._period:
             allowed = "allowed with cabinets: two ticks of loop_rate_hz or more, such as 0.01"
             raise ConfigError(f"control.max_substep = {self._longest:g}: {allowed}")

@@ -198,7 +198,7 @@ class Panel:
         ]
         plots: list[str] = []
         if not self._setup.replayed:
-            rate, top = self._rates[-1], self._setup.config.loop_rate_hz
+            rate, top = self._rates[-1], self._setup.config.nominal_rate_hz
             plots.append(_plot(f"loop, {rate:.0f} Hz", self._rates, 1.2 * top))
             plots.append(_plot(f"slowest tick, {self._times[-1]:.0f} us", self._times, 1e6 / top))
         if self._driving is not None:

@@ -92,7 +92,7 @@ def make_loop(
     start = robot.home if start is None else start
     if mode is CommandMode.TORQUE:
         network.setdefault("arms", SimulatedArms(robot, config))
-    plant = VirtualCabinets(robot, settings, start, 1.0 / config.loop_rate_hz, config.control.max_substep, **network)
+    plant = VirtualCabinets(robot, settings, start, 1.0 / config.nominal_rate_hz, config.control.max_substep, **network)
     hands.pipeline = made = FreezingLoop(config, robot, hands, plant, mode)
     return made
 

@@ -147,7 +147,7 @@ def test_before_a_session_is_known_to_follow_each_tick_moves_the_reference_by_it
 
 def test_a_command_that_answers_have_passed_is_withdrawn_and_the_arms_go_on(config: Config) -> None:
     pipeline = make_loop(config, jitter=0.0005)
-    plant, random, period = started(pipeline), np.random.default_rng(0), 1.0 / config.loop_rate_hz
+    plant, random, period = started(pipeline), np.random.default_rng(0), 1.0 / config.nominal_rate_hz
     withdrawn: list[bool] = []
     pieces: list[tuple[float, np.ndarray, np.ndarray]] = []
 
@@ -247,7 +247,7 @@ def test_arms_with_a_state_that_is_not_believed_are_braked_at_every_tick(config:
     for speeds in brakings[:-1]:
         assert max(speeds) < speeds[0] + 0.2, "a jump of what is measured is hardly a push"
         later = np.array(speeds[20:])  # after periods of both cabinets, and of the filter of the jump
-        assert (np.diff(later) < 0.01 * later[:-1] + 1.0 / config.loop_rate_hz).all(), "no arm gets faster"
+        assert (np.diff(later) < 0.01 * later[:-1] + 1.0 / config.nominal_rate_hz).all(), "no arm gets faster"
         assert later[-1] < 0.02, "and both rest before they are believed again"
 
 

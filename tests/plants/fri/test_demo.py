@@ -28,7 +28,7 @@ def test_both_tasks_succeed_through_cabinets_whose_network_jitters(period: float
         robot,
         settings,
         robot.home,
-        1.0 / config.loop_rate_hz,
+        1.0 / config.nominal_rate_hz,
         config.control.max_substep,
         jitter=0.0005,
         arms=arms,

@@ -1,0 +1,41 @@
+"""How often a second a loop in real time should tick on this computer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+
+from q2r2_control.config.cell import HIGHEST_FITTING_RATE_HZ
+
+# The highest one that leaves room is taken. At the lowest, torques of the impedance are shown to be stable, too.
+FITTING_RATES_HZ = (HIGHEST_FITTING_RATE_HZ, 500.0, 250.0)
+_ROOM = 0.4  # share of the period that 99 of 100 ticks leave for other programs
+_WARM_UP, _LOOKED_AT = 50, 250  # ticks
+
+
+@dataclass(frozen=True, slots=True)
+class RateFit:
+    """A rate of the loop, and how long its ticks take on this computer."""
+
+    rate_hz: float
+    p99_s: float  # duration that 99 of 100 ticks do not exceed
+
+    @property
+    def leaves_room(self) -> bool:
+        """True if 99 of 100 ticks leave 40 % of the period."""
+        return self.p99_s * self.rate_hz <= 1.0 - _ROOM
+
+    def __str__(self) -> str:
+        used = f"99 of 100 ticks take at most {1e6 * self.p99_s:.0f} us, {100 * self.p99_s * self.rate_hz:.0f} %"
+        if self.leaves_room:
+            return f"loop rate {self.rate_hz:.0f} Hz: {used} of the period (loop_rate_hz: auto)"
+        most = f"more than {100 * (1.0 - _ROOM):.0f} %"
+        return f"loop rate {self.rate_hz:.0f} Hz, the lowest: {used} of the period, {most}; close other programs"
+
+
+def largest_usual_time(durations_s: Iterator[float]) -> float:
+    """Duration that 99 of 100 ticks do not exceed [s], of those that come after the first ones."""
+    return float(np.percentile(list(islice(durations_s, _WARM_UP, _WARM_UP + _LOOKED_AT)), 99))

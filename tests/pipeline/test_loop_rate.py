@@ -1,0 +1,158 @@
+"""Loops that fit the computer: simulated time that is paced by it, and a rate that it can keep."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from itertools import repeat
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config.cell import AUTO
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline import pipeline as pipeline_module
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.robot.robot import Robot
+from q2r2_control.summary.tick import Tick
+from q2r2_control.verification.contract import Contract
+from tests.pipeline.loops import pipeline
+
+_MEASURED = {"compute_time", "solve_time"}  # how long the computer took, which is no result
+
+
+def flat(value: object) -> object:
+    """All that a tick holds, as nested tuples that compare to the bit, without the times that the computer took."""
+    if isinstance(value, np.ndarray):
+        return value.tobytes()
+    if isinstance(value, pin.SE3):
+        return value.homogeneous.tobytes()
+    if isinstance(value, dict):
+        return tuple((key, flat(each)) for key, each in value.items())
+    if isinstance(value, list | tuple):
+        return tuple(map(flat, value))
+    if is_dataclass(value):
+        return tuple((one.name, flat(getattr(value, one.name))) for one in fields(value) if one.name not in _MEASURED)
+    return repr(value)
+
+
+def ticks_of(duration: float, *, paced: bool, busy_s: float = 0.0) -> list[object]:
+    """Everything in every tick of a run in torque mode, whose listener keeps the computer busy after each of them."""
+    loop = pipeline(ScriptedInput("circle", human=True, seed=3), plant="mujoco", mode="torque")
+    seen: list[object] = []
+
+    def keep(tick: Tick) -> None:
+        seen.append(flat(tick))
+        time.sleep(busy_s)
+
+    loop.listeners.append(keep)
+    summary = loop.run(duration, realtime=False, paced=paced)
+    assert summary.real_time_factor is not None
+    assert not busy_s or summary.real_time_factor < 1.0
+    return seen
+
+
+def test_a_paced_run_is_the_same_to_the_bit_as_a_fast_one_and_as_one_on_a_slow_computer() -> None:
+    fast = ticks_of(0.9, paced=False)
+    assert len(fast) >= 450
+    assert ticks_of(0.9, paced=True) == fast
+    assert ticks_of(0.9, paced=True, busy_s=0.003) == fast
+
+
+@pytest.mark.parametrize(
+    ("tick_s", "rate", "words"),
+    [
+        (0.0005, 1000.0, "loop rate 1000 Hz: 99 of 100 ticks take at most 500 us, 50 % of the period"),
+        (0.0007, 500.0, "loop rate 500 Hz: 99 of 100 ticks take at most 700 us, 35 %"),
+        (0.0013, 250.0, "loop rate 250 Hz: 99 of 100 ticks take at most 1300 us, 32 %"),
+        (0.0030, 250.0, "loop rate 250 Hz, the lowest: 99 of 100 ticks take at most 3000 us, 75 %"),
+    ],
+)
+def test_the_highest_rate_whose_ticks_leave_room_is_chosen_and_said(
+    tick_s: float, rate: float, words: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(Pipeline, "_resting_ticks", lambda self: repeat(tick_s))
+    loop = pipeline(loop_rate_hz=AUTO)
+    with caplog.at_level(logging.INFO):
+        fit = loop.fit_rate()
+    assert fit is not None
+    assert (fit.rate_hz, loop.config.loop_rate_hz) == (rate, rate)
+    assert words in caplog.text
+
+
+def test_ticks_that_measure_the_computer_move_no_arm_and_reach_no_listener() -> None:
+    loop = pipeline(loop_rate_hz=AUTO)
+    heard: list[Tick] = []
+    loop.listeners.append(heard.append)
+    fit = loop.fit_rate()
+    assert fit is not None
+    assert loop.config.loop_rate_hz in (1000.0, 500.0, 250.0)
+    np.testing.assert_array_equal(loop.plant.state().q, loop.robot.home)
+    assert not heard
+    assert len(loop.listeners) == 1
+
+
+def test_a_rate_in_the_cell_is_taken_as_it_is_and_simulated_time_asks_no_computer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(self: Pipeline) -> Iterator[float]:
+        raise AssertionError("no ticks are measured")
+
+    monkeypatch.setattr(Pipeline, "_resting_ticks", fail)
+    assert pipeline(loop_rate_hz=400.0).fit_rate() is None
+    summary = pipeline(loop_rate_hz=AUTO).run(0.1, realtime=False)
+    assert summary.ticks == pytest.approx(101, abs=2), "1000 Hz"
+
+
+def test_a_loop_that_falls_behind_says_so_once_and_names_the_cure(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(pipeline_module.LoopClock, "falls_behind", lambda self: True)
+    pipeline().run(0.1, realtime=False)
+    (line,) = (record.getMessage() for record in caplog.records if "falls behind" in record.getMessage())
+    for cure in ("close other programs", "--rt", "loop_rate_hz"):
+        assert cure in line
+
+
+def error_in_free_air(rate: float, mode: str) -> float:
+    """RMS error of the worse tool on a circle [mm], while the contract is checked at every tick."""
+    source = ScriptedInput("circle", frequency_hz=0.5)
+    loop = pipeline(source, plant="mujoco" if mode == "torque" else "kinematic", mode=mode, loop_rate_hz=rate)
+    contract = Contract(loop.controller)
+
+    def look(tick: Tick) -> None:
+        if tick.following:
+            contract.check(tick.reference, tick.step)
+
+    loop.listeners.append(look)
+    summary = loop.run(2.5, realtime=False)
+    assert summary.uncertified_ticks == 0
+    assert summary.at_rest
+    errors = [arm.position_error_mm_rms for arm in summary.arms.values()]
+    return max(error for error in errors if error is not None)
+
+
+@pytest.mark.parametrize("mode", ["position", "torque"])
+def test_tools_are_followed_at_250_hz_as_at_1000_hz_and_the_contract_holds(mode: str) -> None:
+    assert error_in_free_air(250.0, mode) <= 1.5 * error_in_free_air(1000.0, mode)
+
+
+def test_arms_that_block_each_other_come_to_rest_at_250_hz(robot: Robot) -> None:
+    controller = CartesianController(robot, ControllerSettings(acceleration_limit=10.0))
+    controller.reset(robot.home)
+    contract, dt = Contract(controller), 0.004
+    tools = {arm: controller.tool_pose(arm) for arm in robot.arms}
+    between = 0.5 * sum(tool.translation for tool in tools.values())
+    targets = {arm: pin.SE3(tool.rotation, between) for arm, tool in tools.items()}
+    accelerations = []
+    for _ in range(1500):
+        reference = controller.step(targets, dt)
+        contract.check(reference, dt)
+        accelerations.append(reference.a)
+    assert reference.report.closest_distance < 0.03, "the arms block each other"
+    assert np.sqrt(np.square(accelerations[-125:]).mean(axis=0)).max() < 0.1
