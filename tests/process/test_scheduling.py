@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import gc
 import os
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 
 import pytest
 
-from q2r2_control.process.scheduling import real_time, schedule_process_as_others, schedule_process_first
+from q2r2_control.process.scheduling import (
+    few_garbage_collections,
+    real_time,
+    schedule_process_as_others,
+    schedule_process_first,
+)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only asked for on Linux")
 
@@ -130,3 +137,29 @@ print(stop.asked, len(sent) > 0)
 def test_a_signal_in_the_middle_of_another_one_s_handler_does_not_wait_for_it() -> None:
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=60)
     assert done.stdout.split() == ["True", "True"], done.stderr
+
+
+@pytest.fixture
+def _nothing_frozen() -> Iterator[None]:
+    """The tests themselves freeze what they import."""
+    gc.unfreeze()
+    yield
+    gc.freeze()
+
+
+@pytest.mark.usefixtures("_nothing_frozen")
+def test_garbage_collection_leaves_existing_objects_alone_until_the_block_ends_or_fails() -> None:
+    with pytest.raises(RuntimeError, match="the run failed"), few_garbage_collections():
+        assert gc.isenabled()
+        assert gc.get_freeze_count() > 1000
+        raise RuntimeError("the run failed")
+    assert gc.get_freeze_count() == 0
+
+
+@pytest.mark.usefixtures("_nothing_frozen")
+def test_objects_that_a_program_has_frozen_itself_stay_frozen() -> None:
+    gc.freeze()
+    frozen = gc.get_freeze_count()
+    with few_garbage_collections():
+        assert gc.get_freeze_count() == frozen
+    assert gc.get_freeze_count() == frozen
