@@ -149,10 +149,17 @@ def _nothing_frozen() -> Iterator[None]:
 
 @pytest.mark.usefixtures("_nothing_frozen")
 def test_garbage_collection_leaves_existing_objects_alone_until_the_block_ends_or_fails() -> None:
-    with pytest.raises(RuntimeError, match="the run failed"), few_garbage_collections():
-        assert gc.isenabled()
-        assert gc.get_freeze_count() > 1000
-        raise RuntimeError("the run failed")
+    frozen = []
+
+    def fail() -> None:
+        with few_garbage_collections():
+            frozen.append(gc.get_freeze_count())
+            raise RuntimeError("the run failed")
+
+    with pytest.raises(RuntimeError, match="the run failed"):
+        fail()
+    assert frozen[0] > 1000
+    assert gc.isenabled()
     assert gc.get_freeze_count() == 0
 
 
