@@ -24,7 +24,7 @@ def make_solver(
     Args:
         name: ``daqp`` and ``osqp`` are called directly, any other of ``qpsolvers.available_solvers`` through qpsolvers.
         nv: number of joints.
-        time_limit: DAQP gives up after this time [s]; None: never.
+        time_limit: DAQP and OSQP give up after this time [s]; None: never.
         options: keyword arguments of the solver.
 
     Returns:
@@ -53,6 +53,10 @@ def solver_of(settings: ControllerSettings, nv: int) -> Solver:
 def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any]) -> Solver:
     if name == DAQP:
         return DaqpSolver(nv, time_limit, **options)
+    if name == OSQP:
+        from q2r2_control.control.solvers.osqp import OsqpSolver
+
+        return OsqpSolver(nv, time_limit, **options)
     # Imported only when asked for: qpsolvers loads every solver that is installed, which takes a second.
     from q2r2_control.control.solvers.qpsolvers import QpSolversSolver
 
