@@ -12,10 +12,12 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.jit import bound
 from q2r2_control.control.kernel_model import kernel_model_of
-from q2r2_control.control.qp import DaqpSolver, QpProblem, Solver, assemble, find_minimum
+from q2r2_control.control.qp import QpProblem, Solver, assemble, find_minimum
 from q2r2_control.control.reference import move_reference, start_reference
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
+from q2r2_control.control.solvers.guard import Guard
+from q2r2_control.control.solvers.registry import solver_of
 from q2r2_control.control.step_report import StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.control.tasks.external import add_costs, load_tasks
@@ -38,20 +40,26 @@ class CartesianController(WatchedPairs):
 
     One tick is three calls. :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost. A
     solver solves it where that is not the solution. :func:`move_reference` takes the part of the solution that can be
-    certified, and moves the reference. A ``solver`` that is given in place of DAQP is asked at every tick.
+    certified, and moves the reference.
+
+    ``solver`` is a name, in place of ``control.solver``, or an object that is asked at every tick. Nothing that it
+    answers, raises or writes into breaks the contract: it gets copies (guard.py).
     """
 
     def __init__(
-        self, robot: Robot, settings: ControllerSettings | None = None, *, solver: Solver | None = None
+        self, robot: Robot, settings: ControllerSettings | None = None, *, solver: Solver | str | None = None
     ) -> None:
         check_kind("robot", robot, Robot, "a Robot, as Robot.from_config and Robot.from_urdf return")
         settings = ControllerSettings() if settings is None else settings
         check_kind("settings", settings, ControllerSettings, "ControllerSettings, which a Config has as config.control")
-        if solver is not None and not callable(getattr(solver, "solve", None)):
-            raise ConfigError(f"solver = {shown(solver)}: allowed: a Solver, or None for DAQP")
+        if isinstance(solver, str):
+            settings = settings.model_copy(update={"solver": solver})
+        elif solver is not None and not callable(getattr(solver, "solve", None)):
+            raise ConfigError(f"solver = {shown(solver)}: allowed: a solver's name, a Solver, or None: control.solver")
         super().__init__(robot, settings)
         self._nv = robot.model.nv
-        self._solver = DaqpSolver(self._nv, settings.solve_time_limit) if solver is None else solver
+        own = None if isinstance(solver, str) else solver
+        self._solver = solver_of(settings, self._nv) if own is None else Guard(own, self._nv)
         model, data = self._model_pointer.value, self._data_pointer.value
         self._rows, self._tasks = data.safety.rows, data.tasks
         self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step
@@ -213,6 +221,11 @@ class CartesianController(WatchedPairs):
         """World pose of an arm's tool at the reference. Raises :class:`RobotError` for an arm that does not exist."""
         i = self._arms.index(self.robot.arm(arm).name)
         return pose_of(self._tasks.rotation[i], self._tasks.translation[i])
+
+    @property
+    def solver_failure(self) -> str | None:
+        """Why the solver's last answer was no solution; None if it was one, and with DAQP, which only says so."""
+        return getattr(self._solver, "failure", None)
 
     @property
     def stop_deceleration(self) -> Array:
