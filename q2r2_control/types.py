@@ -248,6 +248,7 @@ class StepReport:
     tightest_pair: tuple[str, str] = ("", "")  # geometry names of the pair with the least margin
     margin: float = math.inf  # its distance less the one that it keeps [m]
     unsolved: int = 0  # bit i: the QP of substep i had no solution, or too late, and the stop went on
+    faults: tuple[str, ...] = ()  # tasks of a program's own whose answer was not used, each with the reason
 
 
 @dataclass(slots=True)

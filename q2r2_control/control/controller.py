@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
 from q2r2_control.control.step_report import StepSummary
 from q2r2_control.control.targets import TargetTracker
-from q2r2_control.control.tasks.external import add_costs, load_tasks
+from q2r2_control.control.tasks.external import ExternalTasks, Task
 from q2r2_control.control.watched_pairs import WatchedPairs
 from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.robot import Robot
@@ -41,7 +41,12 @@ class CartesianController(WatchedPairs):
     """
 
     def __init__(
-        self, robot: Robot, settings: ControllerSettings | None = None, *, solver: Solver | None = None
+        self,
+        robot: Robot,
+        settings: ControllerSettings | None = None,
+        *,
+        solver: Solver | None = None,
+        tasks: Sequence[Task] = (),
     ) -> None:
         check_kind("robot", robot, Robot, "a Robot, as Robot.from_config and Robot.from_urdf return")
         settings = ControllerSettings() if settings is None else settings
@@ -64,7 +69,7 @@ class CartesianController(WatchedPairs):
             rows_lower=self._rows.lower[:0],
         )
         self._targets = TargetTracker(model.tasks, self._arms, settings)
-        self._external_tasks = load_tasks(robot, settings.tasks)
+        self._external_tasks = ExternalTasks(robot, settings.tasks, tasks)
         self._compile()
         self.reset(robot.home)
 
@@ -164,6 +169,7 @@ class CartesianController(WatchedPairs):
             tightest_pair=self._names.pair(tightest),
             margin=margin,
             unsolved=summary.unsolved,
+            faults=tuple(dict.fromkeys(summary.faults)),
         )
         state = self._state
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
@@ -227,7 +233,8 @@ class CartesianController(WatchedPairs):
         self._obstacles.keep_clear(h)
         usable, inside, free = self._assemble(self._model_pointer, self._targets.pointer, self._data_pointer, h, tick)
         if self._external_tasks:
-            add_costs(self._external_tasks, self._tasks.H, self._tasks.g, self._state.q, self._state.v)
+            state = self._state
+            summary.faults += self._external_tasks.add_costs(self._tasks.H, self._tasks.g, state.q, state.v)
             free = self._find_minimum(self._data_pointer)
         summary.targets_usable &= usable
         summary.inside &= inside
