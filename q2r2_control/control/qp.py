@@ -29,6 +29,7 @@ from q2r2_control.types import Array
 
 SOFTNESS = 1e-5  # part of its correction by which a row gives way
 _UNBOUNDED = 1e30
+_HARD, _SOFT = 0, 8  # how DAQP marks a row
 
 
 @dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
@@ -42,6 +43,7 @@ class QpProblem:
     rows: Array  # (m, nv), unit rows
     rows_lower: Array  # (m,) [rad/s]
     minimum: Array | None = None  # (nv,) of the cost alone, if that keeps box and rows and so is the solution [rad/s]
+    hard: int = 0  # how many of the last rows may not give way
 
 
 @dataclass(slots=True)
@@ -79,12 +81,14 @@ class DaqpSolver:
         if m > len(self._upper):
             self._upper = np.full(m, _UNBOUNDED)
             self._lower = np.empty(m)
-            self._sense = np.full(m, 8, dtype=np.int32)  # soft
-            self._sense[:nv] = 0
+            self._sense = np.full(m, _SOFT, dtype=np.int32)
+            self._sense[:nv] = _HARD
         self._upper[:nv] = problem.upper
         self._lower[:nv] = problem.lower
         if m > nv:
             self._lower[nv:m] = problem.rows_lower
+        if problem.hard:
+            self._sense[m - problem.hard : m] = _HARD
         v, _, flag, info = daqp.solve(
             problem.H,
             problem.g,
@@ -95,6 +99,8 @@ class DaqpSolver:
             rho_soft=SOFTNESS,
             time_limit=self._time_limit,
         )
+        if problem.hard:
+            self._sense[m - problem.hard : m] = _SOFT
         return QpSolution(v if flag in self._OPTIMAL else None, info["setup_time"] + info["solve_time"])
 
 
