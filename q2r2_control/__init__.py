@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # "as" says to type checkers that a name is public
     from q2r2_control.config.cell import load_config as load_config
     from q2r2_control.config.control import ControllerSettings as ControllerSettings
     from q2r2_control.config.moving_obstacle import MovingObstacle as MovingObstacle
+    from q2r2_control.control.constraints import Constraint as Constraint
     from q2r2_control.control.controller import CartesianController as CartesianController
     from q2r2_control.control.qp import QpProblem as QpProblem
     from q2r2_control.control.qp import QpSolution as QpSolution
@@ -53,6 +54,7 @@ _MODULES = {
     "CommandMode": "types",
     "Config": "config.cell",
     "ConfigError": "errors",
+    "Constraint": "control.constraints",
     "ControllerSettings": "config.control",
     "DeviceControls": "types",
     "ElbowSwivel": "control.tasks.elbow",
