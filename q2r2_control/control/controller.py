@@ -189,7 +189,7 @@ class CartesianController(WatchedPairs):
         """Take a step with a solution of :meth:`problem` that somebody else found, certified as every step.
 
         The result is that of :meth:`step` with a solver that finds the same. Nothing about ``x`` raises an exception
-        or is trusted: it is cut to the box, and taken as far as it can be certified. What is no solution is a failed
+        or is trusted: it is cut to the box, and taken as far as it can be certified. Anything else is a failed
         solve: None, fewer than nv numbers, numbers that are not finite, another shape. The certified stop is then
         executed, and ``report.unsolved`` says so.
 
