@@ -13,12 +13,13 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.constraints import Constraint
 from q2r2_control.control.jit import bound
-from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, Solver
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.control.reference import move_reference, start_reference
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.control.safety.safety_filter import FOLLOWED, REDUCED, STOPPED
-from q2r2_control.control.slack_form import with_slacks
 from q2r2_control.control.snapshot import put_back
+from q2r2_control.control.solvers.guard import Guard
+from q2r2_control.control.solvers.registry import solver_of
 from q2r2_control.control.step_problem import GivenSolution, StepProblem
 from q2r2_control.control.step_report import StepSummary
 from q2r2_control.control.targets import TargetTracker
@@ -53,7 +54,8 @@ class CartesianController(WatchedPairs):
     Args:
         robot: Whose arms are controlled.
         settings: None: the defaults.
-        solver: Asked at every tick in place of DAQP.
+        solver: A name, in place of ``control.solver``, or an object that is asked at every tick. Nothing that it
+            answers, raises or writes into breaks the contract: it gets copies (guard.py).
         tasks: Costs of a program's own, beside those of ``settings.tasks``.
         constraints: Rows of a program's own, soft or hard.
 
@@ -67,18 +69,21 @@ class CartesianController(WatchedPairs):
         robot: Robot,
         settings: ControllerSettings | None = None,
         *,
-        solver: Solver | None = None,
+        solver: Solver | str | None = None,
         tasks: Sequence[Task] = (),
         constraints: Sequence[Constraint] = (),
     ) -> None:
         check_kind("robot", robot, Robot, "a Robot, as Robot.from_config and Robot.from_urdf return")
         settings = ControllerSettings() if settings is None else settings
         check_kind("settings", settings, ControllerSettings, "ControllerSettings, which a Config has as config.control")
-        if solver is not None and not callable(getattr(solver, "solve", None)):
-            raise ConfigError(f"solver = {shown(solver)}: allowed: a Solver, or None for DAQP")
+        if isinstance(solver, str):
+            settings = settings.model_copy(update={"solver": solver})
+        elif solver is not None and not callable(getattr(solver, "solve", None)):
+            raise ConfigError(f"solver = {shown(solver)}: allowed: a solver's name, a Solver, or None: control.solver")
         super().__init__(robot, settings)
         self._nv = robot.model.nv
-        self._solver = DaqpSolver(self._nv, settings.solve_time_limit) if solver is None else solver
+        own = None if isinstance(solver, str) else solver
+        self._solver = solver_of(settings, self._nv) if own is None else Guard(own, self._nv)
         self._qp = StepProblem(robot, settings, tasks, constraints)
         self._tools: TaskData = self._data_pointer.value.tasks
         self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step
@@ -174,6 +179,8 @@ class CartesianController(WatchedPairs):
         Raises:
             RobotError: For ``targets`` that are no mapping, and another ``dt``.
         """
+        from q2r2_control.control.solvers.qpsolvers import slack_problem  # which imports every solver that there is
+
         check_kind("targets", targets, Mapping, _TARGETS, RobotError)
         if not _passes(dt) or dt > LONGEST_DT:
             raise RobotError(f"dt = {shown(dt)}: allowed: a number above 0, up to {LONGEST_DT:g} s")
@@ -181,7 +188,7 @@ class CartesianController(WatchedPairs):
             self._targets.aim_posture(posture)
             self._targets.offer(targets)
             self._write_problem(float(dt) / self._parts_of(float(dt)), float(dt), StepSummary())
-            return with_slacks(self._qp.problem)
+            return slack_problem(self._qp.problem)
 
     def advance(
         self, x: npt.ArrayLike | None, targets: Mapping[str, pin.SE3 | None], dt: float, posture: Array | None = None
@@ -302,6 +309,11 @@ class CartesianController(WatchedPairs):
         """World pose of an arm's tool at the reference. Raises :class:`RobotError` for an arm that does not exist."""
         i = self._arms.index(self.robot.arm(arm).name)
         return pose_of(self._tools.rotation[i], self._tools.translation[i])
+
+    @property
+    def solver_failure(self) -> str | None:
+        """Why the solver's last answer was no solution; None if it was one, and with DAQP, which only says so."""
+        return getattr(self._solver, "failure", None)
 
     @property
     def stop_deceleration(self) -> Array:

@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import daqp
 import numpy as np
 
 from q2r2_control.control.cholesky import factorise, substitute
@@ -28,8 +27,6 @@ from q2r2_control.control.tasks.built_in import write_task_cost
 from q2r2_control.types import Array
 
 SOFTNESS = 1e-5  # part of its correction by which a row gives way
-_UNBOUNDED = 1e30
-_HARD, _SOFT = 0, 8  # how DAQP marks a row
 
 
 @dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
@@ -55,53 +52,15 @@ class QpSolution:
 
 
 class Solver(Protocol):
-    """Solves a :class:`QpProblem`; never raises for a numerical reason."""
+    """Solves a :class:`QpProblem`. Whatever it raises is a failed solve."""
 
     def solve(self, problem: QpProblem) -> QpSolution: ...
 
 
-class DaqpSolver:
-    """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022): dual active set, soft rows; ``time_limit`` [s] or None."""
-
-    _OPTIMAL = (1, 2)  # 2: optimal with a soft row violated
-
-    def __init__(self, nv: int, time_limit: float | None = None) -> None:
-        self._nv = nv
-        self._time_limit = time_limit or 0.0  # 0: none
-        self._upper = np.full(nv, _UNBOUNDED)
-        self._lower = np.full(nv, -_UNBOUNDED)
-        self._sense = np.zeros(nv, dtype=np.int32)
-
-    def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`; DAQP is asked only where a bound holds the cost's own minimum back."""
-        if problem.minimum is not None:
-            return QpSolution(problem.minimum, 0.0)
-        nv = self._nv
-        m = nv + len(problem.rows_lower)
-        if m > len(self._upper):
-            self._upper = np.full(m, _UNBOUNDED)
-            self._lower = np.empty(m)
-            self._sense = np.full(m, _SOFT, dtype=np.int32)
-            self._sense[:nv] = _HARD
-        self._upper[:nv] = problem.upper
-        self._lower[:nv] = problem.lower
-        if m > nv:
-            self._lower[nv:m] = problem.rows_lower
-        if problem.hard:
-            self._sense[m - problem.hard : m] = _HARD
-        v, _, flag, info = daqp.solve(
-            problem.H,
-            problem.g,
-            problem.rows,
-            self._upper[:m],
-            self._lower[:m],
-            self._sense[:m],
-            rho_soft=SOFTNESS,
-            time_limit=self._time_limit,
-        )
-        if problem.hard:
-            self._sense[m - problem.hard : m] = _SOFT
-        return QpSolution(v if flag in self._OPTIMAL else None, info["setup_time"] + info["solve_time"])
+def row_softness(H: Array, rows: Array) -> Array:
+    """rho_i = SOFTNESS a_i' H^-1 a_i of each of the ``rows`` (m, nv), (m,)."""
+    compliance: Array = np.sum(rows * np.linalg.solve(H, rows.T).T, axis=1)
+    return SOFTNESS * compliance
 
 
 @kernel

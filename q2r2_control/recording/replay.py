@@ -13,7 +13,8 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, Solver
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver
+from q2r2_control.control.solvers.registry import solver_of
 from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.pipeline.loop_clock import LoopClock
@@ -135,7 +136,7 @@ class ReplayPipeline(Pipeline):
 
     def _prepare(self, realtime: bool) -> None:
         settings = permitted(self.config.control.model_copy(update={"solve_time_limit": None}), self.drive)
-        inner = DaqpSolver(self.robot.model.nv)
+        inner = solver_of(settings, self.robot.model.nv)
         self.controller = CartesianController(self.robot, settings, solver=_Solver(inner, self._recorded))
         super()._prepare(realtime)
 

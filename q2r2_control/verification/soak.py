@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.qp import DaqpSolver
+from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

@@ -14,8 +14,8 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.qp import DaqpSolver
 from q2r2_control.control.safety.safety_data import ROUNDING
+from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.robot.kept_distances import kept_by_obstacles
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

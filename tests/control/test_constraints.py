@@ -142,6 +142,13 @@ def test_other_solvers_keep_a_hard_row_too(robot: Robot, name: str) -> None:
     assert abs(reference.v[3]) < 1e-4
 
 
+def test_osqp_keeps_a_hard_row_in_the_loop_too(robot: Robot) -> None:
+    controller = CartesianController(robot, solver="osqp", constraints=[StillJoint(3, hard=True)])
+    reports = [controller.step(crossing(robot, tick), DT).report for tick in range(200)]
+    assert sum(report.fallback for report in reports) < 2
+    assert abs(controller.step(crossing(robot), DT).v[3]) < 1e-4
+
+
 @pytest.mark.parametrize("hard", [False, True], ids=["soft", "hard"])
 @pytest.mark.parametrize("name", NONSENSE)
 def test_a_constraint_that_answers_nonsense_raises_nothing_and_is_named(robot: Robot, name: str, hard: bool) -> None:

@@ -14,7 +14,8 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.cholesky import factorise, substitute
 from q2r2_control.control.jit import pointer_to
 from q2r2_control.control.kernel_model import KernelData
-from q2r2_control.control.qp import SOFTNESS, DaqpSolver, QpProblem, QpSolution, find_minimum
+from q2r2_control.control.qp import SOFTNESS, QpProblem, QpSolution, find_minimum
+from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.types import Array
 from tests.control.cells import cell, kernel_data
 

@@ -67,7 +67,7 @@ def test_a_stranger_adds_a_task_and_a_constraint_and_solves_the_qp_by_a_solver_o
     forwards = NotBackwards(robot)
     constraints: list[Constraint] = [forwards]
     settings = ControllerSettings(rotation_weights=(0.1, 0.1, 0.1))
-    controller = CartesianController(robot, settings, tasks=tasks, constraints=constraints)
+    controller = CartesianController(robot, settings, solver="osqp", tasks=tasks, constraints=constraints)
     goals = {arm: controller.tool_pose(arm) for arm in robot.arms}
     for pose in goals.values():
         pose.translation = pose.translation + np.array([-0.1, 0.0, 0.1])
@@ -83,6 +83,7 @@ def test_a_stranger_adds_a_task_and_a_constraint_and_solves_the_qp_by_a_solver_o
         assert A @ reference.v >= -1e-4 * np.linalg.norm(A)
         q = reference.q
     assert solved > 140
+    assert not controller.step(goals, 0.002).report.unsolved, "the named solver goes on where the program ends"
     assert controller.tool_pose("left").translation[0] > start - 1e-3, "where it was sent 100 mm back"
     assert controller.tool_pose("right").translation[0] < goals["right"].translation[0] + 0.08
     assert controller.tool_pose("left").translation[2] > goals["left"].translation[2] - 0.08

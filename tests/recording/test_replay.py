@@ -11,7 +11,8 @@ import pytest
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, Solver
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver
+from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.errors import PlantError, RecordingError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.judge import judge

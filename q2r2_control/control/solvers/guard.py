@@ -1,0 +1,72 @@
+"""Keeps a solver that is not ours from the controller's arrays, and its failures from a step.
+
+The safety filter clamps the answer to the very box that a solver is handed. A solver that wrote into that box would
+move the limits, and the certificate would be about the moved ones. So a solver gets copies.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver
+from q2r2_control.errors import shown
+
+_REAL = "fiu"  # kinds of dtype that are real numbers
+_FAILED = QpSolution(None, 0.0)
+
+
+class Guard:
+    """Asks a ``solver`` and returns a solution of our own arrays, or none. It raises nothing.
+
+    Args:
+        solver: an object with ``solve``, from anywhere.
+        nv: number of joints.
+
+    Attributes:
+        failure: why the last answer was not a solution; None if it was one.
+    """
+
+    def __init__(self, solver: Solver, nv: int) -> None:
+        self._solver, self._nv = solver, nv
+        self.failure: str | None = None
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        """See :class:`Solver`.
+
+        The answer must have a real array ``v`` of shape (nv,), all finite, and a finite ``solve_time`` of at least 0.
+        An exception, and any other answer, is a failed solve. ``v = None`` is one by the solver's own word.
+        """
+        try:
+            answer: Any = self._solver.solve(_copy_of(problem))
+            v, solve_time = answer.v, answer.solve_time
+            self.failure = "no solution" if v is None else self._fault(v, solve_time)
+            if self.failure is None:
+                return QpSolution(np.array(v, dtype=float), float(solve_time))
+        except Exception as error:  # whatever a stranger's code raises is one tick without a solution
+            self.failure = f"{type(error).__name__}: {shown(str(error), 200)}"
+        return _FAILED
+
+    def _fault(self, v: Any, solve_time: Any) -> str | None:
+        if not isinstance(v, np.ndarray) or v.dtype.kind not in _REAL or v.shape != (self._nv,):
+            return f"v = {shown(v)}: allowed: an array of shape ({self._nv},), or None"
+        if not np.isfinite(v).all():
+            return f"v = {shown(v)}: allowed: finite numbers"
+        if not isinstance(solve_time, float | int | np.floating) or not 0.0 <= float(solve_time) < math.inf:
+            return f"solve_time = {shown(solve_time)}: allowed: seconds, 0 or more"
+        return None
+
+
+def _copy_of(problem: QpProblem) -> QpProblem:
+    return QpProblem(
+        H=problem.H.copy(),
+        g=problem.g.copy(),
+        lower=problem.lower.copy(),
+        upper=problem.upper.copy(),
+        rows=problem.rows.copy(),
+        rows_lower=problem.rows_lower.copy(),
+        minimum=None if problem.minimum is None else problem.minimum.copy(),
+        hard=problem.hard,
+    )

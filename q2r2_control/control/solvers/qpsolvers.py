@@ -1,0 +1,72 @@
+"""Any solver of the package qpsolvers, which knows some twenty by their names.
+
+Such a solver has no soft rows, so every row gets a slack of its own: x = [v; s],
+
+    minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = SOFTNESS a_i' H^-1 a_i
+    subject to  lower <= v <= upper,    s >= 0,    rows v + s >= rows_lower,    s_i = 0 for a hard row
+
+Source: https://github.com/qpsolvers/qpsolvers, whose form is P, q, G x <= h, lb <= x <= ub.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import qpsolvers
+import scipy.sparse
+
+from q2r2_control.control.qp import QpProblem, QpSolution, row_softness
+
+
+def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem:
+    """The problem with a slack for each row.
+
+    Args:
+        problem: of nv joints and m rows.
+        sparse: whether matrices are ``scipy.sparse.csc_matrix``, as some solvers need.
+
+    Returns:
+        A ``qpsolvers.Problem`` in x = [v; s], (nv + m,) [rad/s], which shares no memory with ``problem``.
+    """
+    nv, m = len(problem.g), len(problem.rows_lower)
+    P = np.zeros((nv + m, nv + m))
+    P[:nv, :nv] = problem.H
+    P[range(nv, nv + m), range(nv, nv + m)] = 1.0 / row_softness(problem.H, problem.rows)
+    G = np.hstack([-problem.rows, -np.eye(m)]) if m else None
+    most = np.full(m, np.inf)
+    most[m - problem.hard :] = 0.0
+    return qpsolvers.Problem(
+        P=scipy.sparse.csc_matrix(P) if sparse else P,
+        q=np.concatenate([problem.g, np.zeros(m)]),
+        G=scipy.sparse.csc_matrix(G) if sparse and m else G,
+        h=-problem.rows_lower if m else None,
+        lb=np.concatenate([problem.lower, np.zeros(m)]),
+        ub=np.concatenate([problem.upper, most]),
+    )
+
+
+class QpSolversSolver:
+    """A solver of qpsolvers by its name.
+
+    Args:
+        name: one of ``qpsolvers.available_solvers``.
+        options: keyword arguments of that solver, see qpsolvers' documentation.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        self._name, self._options = name, options
+        self._sparse = name not in qpsolvers.dense_solvers
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        """See :class:`Solver`; the solver is asked only where a bound holds the cost's own minimum back.
+
+        Raises what qpsolvers and its solver raise.
+        """
+        if problem.minimum is not None:
+            return QpSolution(problem.minimum, 0.0)
+        solution = qpsolvers.solve_problem(slack_problem(problem, self._sparse), self._name, **self._options)
+        time = (solution.build_time or 0.0) + (solution.solve_time or 0.0)
+        if not solution.found or solution.x is None:
+            return QpSolution(None, time)
+        return QpSolution(solution.x[: len(problem.g)], time)

@@ -1,0 +1,82 @@
+"""The solver of a name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.qp import QpProblem, Solver
+from q2r2_control.control.solvers.daqp import DaqpSolver
+from q2r2_control.control.solvers.guard import Guard
+from q2r2_control.errors import ConfigError, shown
+
+DAQP, OSQP = OURS = ("daqp", "osqp")
+
+
+def make_solver(
+    name: str, nv: int, time_limit: float | None = None, options: Mapping[str, Any] | None = None
+) -> Solver:
+    """The solver called ``name``.
+
+    Args:
+        name: ``daqp`` and ``osqp`` are called directly, any other of ``qpsolvers.available_solvers`` through qpsolvers.
+        nv: number of joints.
+        time_limit: DAQP and OSQP give up after this time [s]; None: never.
+        options: keyword arguments of the solver.
+
+    Returns:
+        DAQP as it is; any other one behind a :class:`Guard`.
+
+    Raises:
+        ConfigError: There is no such solver, it is not installed, or it does not take the ``options``.
+    """
+    given = dict(options or {})
+    if name not in OURS:
+        _check_installed(name)
+    try:
+        solver = _made(name, nv, time_limit, given)
+        solver.solve(_smallest_problem(nv))  # an option that is unknown shows here, and not in motion
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"control.solver_options = {shown(given)}: {name} refuses: {reason:.120}") from error
+    return solver if name == DAQP else Guard(solver, nv)
+
+
+def solver_of(settings: ControllerSettings, nv: int) -> Solver:
+    """The solver that ``settings`` ask for; see :func:`make_solver`."""
+    return make_solver(settings.solver, nv, settings.solve_time_limit, settings.solver_options)
+
+
+def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any]) -> Solver:
+    if name == DAQP:
+        return DaqpSolver(nv, time_limit, **options)
+    if name == OSQP:
+        from q2r2_control.control.solvers.osqp import OsqpSolver
+
+        return OsqpSolver(nv, time_limit, **options)
+    # Imported only when asked for: qpsolvers loads every solver that is installed, which takes a second.
+    from q2r2_control.control.solvers.qpsolvers import QpSolversSolver
+
+    return QpSolversSolver(name, **options)
+
+
+def _check_installed(name: str) -> None:
+    import qpsolvers  # see _made
+
+    if name not in qpsolvers.available_solvers:
+        installed = ", ".join(sorted({*OURS, *qpsolvers.available_solvers}))
+        extra = name if hasattr(qpsolvers, f"{name}_solve_qp") else "open-source-solvers"
+        raise ConfigError(
+            f"control.solver = {shown(name)}: installed: {installed}; the rest: pip install 'qpsolvers[{extra}]'"
+        )
+
+
+def _smallest_problem(nv: int) -> QpProblem:
+    """A problem in which a row and the box hold the cost's minimum back."""
+    row = np.zeros((1, nv))
+    row[0, 0] = 1.0
+    one = np.ones(nv)
+    return QpProblem(np.eye(nv), -2.0 * one, -one, one, row, 0.5 * np.ones(1))

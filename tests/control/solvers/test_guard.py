@@ -1,0 +1,111 @@
+"""No solver reaches the controller's arrays, and none makes a step raise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control import CartesianController
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.qp import QpProblem, QpSolution
+from q2r2_control.control.solvers.guard import Guard
+from q2r2_control.types import StepStatus
+from tests.control.cells import cell
+from tests.control.scenarios import crossing
+
+DT = 0.002
+ROBOT = cell("dual_iiwa7").robot
+NV = ROBOT.model.nv
+
+
+class Answering:
+    """Returns, or raises, what it was made with."""
+
+    def __init__(self, answer: Any) -> None:
+        self.answer = answer
+
+    def solve(self, problem: QpProblem) -> Any:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+class Unreadable:
+    """An answer whose velocities cannot be read."""
+
+    solve_time = 0.0
+
+    @property
+    def v(self) -> Any:
+        raise RuntimeError("not now")
+
+
+ZEROS = np.zeros(NV)
+NO_SOLUTIONS: dict[str, Any] = {
+    "None in place of an answer": None,
+    "None as velocities": QpSolution(None, 0.0),
+    "one velocity too few": QpSolution(np.zeros(NV - 1), 0.0),
+    "a column": QpSolution(np.zeros((NV, 1)), 0.0),
+    "one number": QpSolution(np.float64(0.0), 0.0),  # type: ignore[arg-type]
+    "a text": QpSolution("fast", 0.0),  # type: ignore[arg-type]
+    "objects": QpSolution(np.array([None] * NV), 0.0),
+    "complex numbers": QpSolution(np.zeros(NV, dtype=complex), 0.0),
+    "NaN": QpSolution(np.full(NV, np.nan), 0.0),
+    "one infinite velocity": QpSolution(np.r_[np.inf, np.zeros(NV - 1)], 0.0),
+    "no solve time": QpSolution(ZEROS, None),  # type: ignore[arg-type]
+    "a solve time that is NaN": QpSolution(ZEROS, float("nan")),
+    "a text as solve time": QpSolution(ZEROS, "soon"),  # type: ignore[arg-type]
+    "a solve time below zero": QpSolution(ZEROS, -1.0),
+    "an exception": ValueError("not today"),
+    "velocities that raise": Unreadable(),
+}
+
+
+@pytest.mark.parametrize("answer", NO_SOLUTIONS.values(), ids=NO_SOLUTIONS)
+def test_what_is_no_solution_is_a_failed_solve_and_the_arms_stop(answer: Any) -> None:
+    controller = CartesianController(ROBOT, ControllerSettings(), solver=Answering(answer))
+    reference = controller.step({arm: controller.tool_pose(arm) for arm in ROBOT.arms}, DT)
+    assert reference.report.unsolved == 1
+    assert reference.report.status is StepStatus.FALLBACK
+    assert reference.report.certified
+    assert controller.solver_failure
+    np.testing.assert_array_equal(reference.v, 0.0)
+
+
+class Writer:
+    """Opens every limit that it is handed, and answers what those would allow."""
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        problem.lower[:], problem.upper[:] = -1e6, 1e6
+        problem.rows[:], problem.rows_lower[:] = 0.0, -1e6
+        problem.H[:], problem.g[:] = np.nan, np.nan
+        return QpSolution(np.full(NV, 1e6), 0.0)
+
+
+def test_a_solver_that_writes_into_the_limits_moves_none_of_them() -> None:
+    controller = CartesianController(ROBOT, ControllerSettings(), solver=Writer())
+    home = {arm: controller.tool_pose(arm) for arm in ROBOT.arms}
+    v = np.zeros(NV)
+    for tick in range(200):
+        reference = controller.step(crossing(tick * DT, home), DT)
+        assert (np.abs(reference.v - v) <= 10.0 * DT + 1e-12).all(), "the acceleration limit"
+        assert (np.abs(reference.v) <= ROBOT.velocity_limit + 1e-12).all()
+        assert (ROBOT.position_lower <= reference.q).all()
+        assert (reference.q <= ROBOT.position_upper).all()
+        v = reference.v
+    assert np.abs(v).max() > 0.0, "it moves the arms"
+
+
+def test_an_answer_that_a_solver_changes_later_is_not_changed() -> None:
+    kept = np.full(NV, 0.001)
+
+    class Late:
+        def solve(self, problem: QpProblem) -> QpSolution:
+            return QpSolution(kept, 0.0)
+
+    wide = np.ones(NV)
+    answer = Guard(Late(), NV).solve(QpProblem(np.eye(NV), ZEROS, -wide, wide, np.empty((0, NV)), np.empty(0)))
+    kept[:] = 5.0
+    np.testing.assert_array_equal(answer.v, 0.001)

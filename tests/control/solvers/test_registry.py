@@ -1,0 +1,46 @@
+"""Solvers are found by their names, in settings and in Python, and one that is not there is told in one line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import qpsolvers
+
+from q2r2_control import CartesianController, ConfigError
+from q2r2_control.config.control import ControllerSettings
+from tests.control.cells import cell
+
+ROBOT = cell("dual_iiwa7").robot
+
+
+def test_an_unknown_solver_is_one_line_with_those_that_are_there_and_the_way_to_the_rest() -> None:
+    with pytest.raises(ConfigError) as caught:
+        CartesianController(ROBOT, ControllerSettings(solver="osqb"))
+    line = str(caught.value)
+    assert "\n" not in line
+    assert line.startswith("control.solver = 'osqb': installed: ")
+    assert all(name in line for name in ("daqp", "osqp", *qpsolvers.available_solvers))
+    assert line.endswith("pip install 'qpsolvers[open-source-solvers]'")
+
+
+def test_a_solver_that_is_known_and_not_installed_is_told_with_its_own_pip_line() -> None:
+    missing = next(name for name in ("gurobi", "mosek", "cvxopt") if name not in qpsolvers.available_solvers)
+    with pytest.raises(ConfigError, match=rf"pip install 'qpsolvers\[{missing}\]'$"):
+        CartesianController(ROBOT, solver=missing)
+
+
+@pytest.mark.parametrize("name", ["daqp", "osqp"])
+def test_an_option_that_a_solver_does_not_have_is_refused_at_the_start(name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"control\.solver_options = \{{'colour': 1\}}: {name} refuses: "):
+        CartesianController(ROBOT, ControllerSettings(solver=name, solver_options={"colour": 1}))
+
+
+def test_a_name_in_python_takes_the_place_of_the_settings() -> None:
+    assert CartesianController(ROBOT, ControllerSettings(), solver="osqp").settings.solver == "osqp"
+
+
+@pytest.mark.parametrize("solver", [object(), 3, ["osqp"]], ids=str)
+def test_what_is_neither_a_name_nor_a_solver_is_refused(solver: Any) -> None:
+    with pytest.raises(ConfigError, match="allowed: a solver's name, a Solver, or None"):
+        CartesianController(ROBOT, ControllerSettings(), solver=solver)
