@@ -1,12 +1,8 @@
 """Your own task of the QP: the left arm's elbow turns towards an angle while both tools keep their pose."""
 
-import sys
-import tempfile
-from pathlib import Path
-
 import numpy as np
 
-from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
+from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.types import Array
 
 
@@ -23,16 +19,7 @@ class ElbowTask:
 
 
 robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
-settings = ControllerSettings(tasks={"elbow": {"joint": "left_A3", "angle": robot.home[2] + 0.3}})
-with tempfile.TemporaryDirectory() as folder:
-    # This stands for an installed package whose pyproject.toml names the task, as in docs/extending.md.
-    information = Path(folder, "my_package-1.0.dist-info")
-    information.mkdir()
-    (information / "entry_points.txt").write_text("[q2r2_control.tasks]\nelbow = __main__:ElbowTask\n")
-    sys.path.insert(0, folder)
-    controller = CartesianController(robot, settings)
-
-controller.reset(robot.home)
+controller = CartesianController(robot, tasks=[ElbowTask(robot, "left_A3", robot.home[2] + 0.3)])
 goals = {arm: controller.tool_pose(arm) for arm in robot.arms}
 for _ in range(2000):
     reference = controller.step(goals, 0.001)

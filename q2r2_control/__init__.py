@@ -11,11 +11,23 @@ from typing import TYPE_CHECKING
 from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:  # "as" says to type checkers that a name is public
+    from q2r2_control.config.cell import Config as Config
     from q2r2_control.config.cell import load_config as load_config
     from q2r2_control.config.control import ControllerSettings as ControllerSettings
     from q2r2_control.config.moving_obstacle import MovingObstacle as MovingObstacle
+    from q2r2_control.control.constraints import Constraint as Constraint
     from q2r2_control.control.controller import CartesianController as CartesianController
+    from q2r2_control.control.qp import QpProblem as QpProblem
+    from q2r2_control.control.qp import QpSolution as QpSolution
+    from q2r2_control.control.qp import Solver as Solver
+    from q2r2_control.control.tasks.elbow import ElbowSwivel as ElbowSwivel
+    from q2r2_control.control.tasks.external import Task as Task
+    from q2r2_control.control.tasks.named_tasks import JointTarget as JointTarget
+    from q2r2_control.control.tasks.named_tasks import LookAt as LookAt
+    from q2r2_control.control.tasks.named_tasks import RelativePose as RelativePose
+    from q2r2_control.control.tasks.named_tasks import Upright as Upright
     from q2r2_control.errors import ConfigError as ConfigError
+    from q2r2_control.errors import PlantError as PlantError
     from q2r2_control.errors import Q2R2Error as Q2R2Error
     from q2r2_control.errors import RobotError as RobotError
     from q2r2_control.inputs.base import Input as Input
@@ -40,26 +52,38 @@ _MODULES = {
     "CartesianController": "control.controller",
     "Command": "types",
     "CommandMode": "types",
+    "Config": "config.cell",
     "ConfigError": "errors",
+    "Constraint": "control.constraints",
     "ControllerSettings": "config.control",
     "DeviceControls": "types",
+    "ElbowSwivel": "control.tasks.elbow",
     "HandInputs": "types",
     "HandSample": "types",
     "HapticFeedback": "types",
     "Input": "inputs.base",
+    "JointTarget": "control.tasks.named_tasks",
+    "LookAt": "control.tasks.named_tasks",
     "MovingObstacle": "config.moving_obstacle",
     "Observation": "types",
     "Pipeline": "pipeline.pipeline",
     "Plant": "plants.base",
+    "PlantError": "errors",
     "PolicyInput": "inputs.policy",
     "Q2R2Error": "errors",
+    "QpProblem": "control.qp",
+    "QpSolution": "control.qp",
     "Reference": "types",
     "RelativeMotion": "teleop.relative",
+    "RelativePose": "control.tasks.named_tasks",
     "Robot": "robot.robot",
     "RobotError": "errors",
     "RobotState": "types",
     "RunSummary": "summary.run_summary",
+    "Solver": "control.qp",
     "StepReport": "types",
+    "Task": "control.tasks.external",
+    "Upright": "control.tasks.named_tasks",
     "load_config": "config.cell",
 }
 __all__ = list(_MODULES)

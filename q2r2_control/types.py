@@ -223,13 +223,14 @@ class LimitKind(StrEnum):
     VELOCITY = "velocity"
     ACCELERATION = "acceleration"
     SEPARATION = "separation"
+    CONSTRAINT = "constraint"  # of a program's own
 
 
 class ActiveLimit(NamedTuple):
     """A limit that was active at a step's solution."""
 
     kind: LimitKind
-    names: tuple[str, ...]  # of the joint, or of both geometries of a pair
+    names: tuple[str, ...]  # of the joint, of both geometries of a pair, or of a constraint's class
 
 
 @dataclass(slots=True)
@@ -243,11 +244,12 @@ class StepReport:
     closest_distance: float  # [m]
     certified: bool  # a stopping motion that keeps limits and separation is known
     fallback: bool
-    slack: float  # largest violation of a separation row of unit norm [rad/s]
+    slack: float  # largest violation of a row of unit norm [rad/s]
     solve_time: float  # solver's own time, 0 where none had to be asked [s]
     tightest_pair: tuple[str, str] = ("", "")  # geometry names of the pair with the least margin
     margin: float = math.inf  # its distance less the one that it keeps [m]
     unsolved: int = 0  # bit i: the QP of substep i had no solution, or too late, and the stop went on
+    faults: tuple[str, ...] = ()  # a program's own tasks and constraints whose answer was not used, and why
 
 
 @dataclass(slots=True)

@@ -9,7 +9,12 @@ from typing import Any
 from q2r2_control.events import Event, Reason
 from q2r2_control.types import ActiveLimit, LimitKind
 
-_LIMITS = {LimitKind.POSITION: "position", LimitKind.VELOCITY: "velocity", LimitKind.ACCELERATION: "acceleration"}
+_LIMITS = {
+    LimitKind.POSITION: "position",
+    LimitKind.VELOCITY: "velocity",
+    LimitKind.ACCELERATION: "acceleration",
+    LimitKind.CONSTRAINT: "constraint",
+}
 
 
 def sentence(reason: Reason) -> str:

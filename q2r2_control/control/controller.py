@@ -3,30 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.constraints import Constraint
 from q2r2_control.control.jit import bound
 from q2r2_control.control.kernel_model import kernel_model_of
-from q2r2_control.control.qp import QpProblem, Solver, assemble, find_minimum
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.control.reference import move_reference, start_reference
 from q2r2_control.control.safety.safety_data import ROUNDING
-from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
+from q2r2_control.control.safety.safety_filter import FOLLOWED, REDUCED, STOPPED
+from q2r2_control.control.snapshot import put_back
 from q2r2_control.control.solvers.guard import Guard
 from q2r2_control.control.solvers.registry import solver_of
+from q2r2_control.control.step_problem import GivenSolution, StepProblem
 from q2r2_control.control.step_report import StepSummary
 from q2r2_control.control.targets import TargetTracker
-from q2r2_control.control.tasks.external import add_costs, load_tasks
+from q2r2_control.control.tasks.built_in import TaskData
+from q2r2_control.control.tasks.external import Task, load_tasks
 from q2r2_control.control.watched_pairs import WatchedPairs
 from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Reference, StepReport, pose_of
 
+if TYPE_CHECKING:
+    import qpsolvers
+
 _NUMBER = (float, int, np.floating)
+_TARGETS = "a pin.SE3 or None by arm, such as {'left': pose}"
 
 
 class CartesianController(WatchedPairs):
@@ -40,14 +49,30 @@ class CartesianController(WatchedPairs):
 
     One tick is three calls. :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost. A
     solver solves it where that is not the solution. :func:`move_reference` takes the part of the solution that can be
-    certified, and moves the reference.
+    certified, and moves the reference. :meth:`problem` and :meth:`advance` put a program of your own in the solver's
+    place.
 
-    ``solver`` is a name, in place of ``control.solver``, or an object that is asked at every tick. Nothing that it
-    answers, raises or writes into breaks the contract: it gets copies (guard.py).
+    Args:
+        robot: Whose arms are controlled.
+        settings: None: the defaults.
+        solver: A name, in place of ``control.solver``, or an object that is asked at every tick. Nothing that it
+            answers, raises or writes into breaks the contract: it gets copies (guard.py).
+        tasks: Costs of a program's own, beside those of ``settings.tasks``.
+        constraints: Rows of a program's own, soft or hard.
+
+    Raises:
+        ConfigError: For an argument of another kind, a task or a constraint without a usable answer at home, and for
+            settings that do not fit the robot.
     """
 
     def __init__(
-        self, robot: Robot, settings: ControllerSettings | None = None, *, solver: Solver | str | None = None
+        self,
+        robot: Robot,
+        settings: ControllerSettings | None = None,
+        *,
+        solver: Solver | str | None = None,
+        tasks: Sequence[Task] = (),
+        constraints: Sequence[Constraint] = (),
     ) -> None:
         check_kind("robot", robot, Robot, "a Robot, as Robot.from_config and Robot.from_urdf return")
         settings = ControllerSettings() if settings is None else settings
@@ -60,20 +85,11 @@ class CartesianController(WatchedPairs):
         self._nv = robot.model.nv
         own = None if isinstance(solver, str) else solver
         self._solver = solver_of(settings, self._nv) if own is None else Guard(own, self._nv)
-        model, data = self._model_pointer.value, self._data_pointer.value
-        self._rows, self._tasks = data.safety.rows, data.tasks
+        self._qp = StepProblem(robot, settings, tasks, constraints)
+        self._tools: TaskData = self._data_pointer.value.tasks
         self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step
         self._solution = np.zeros(self._nv)  # of the QP, whatever array has it
-        self._problem = QpProblem(
-            H=data.tasks.H,
-            g=data.tasks.g,
-            lower=data.safety.box.lower,
-            upper=data.safety.box.upper,
-            rows=self._rows.matrix[:0],
-            rows_lower=self._rows.lower[:0],
-        )
-        self._targets = TargetTracker(model.tasks, self._arms, settings)
-        self._external_tasks = load_tasks(robot, settings.tasks)
+        self._targets = TargetTracker(self._model_pointer.value.tasks, self._arms, settings)
         self._compile()
         self.reset(robot.home)
 
@@ -98,15 +114,14 @@ class CartesianController(WatchedPairs):
 
     def _compile(self) -> None:
         """Run every kernel and the solver once, so that none is compiled or set up in mid-motion."""
-        model, data, targets = self._model_pointer, self._data_pointer, self._targets.pointer
+        model, data = self._model_pointer, self._data_pointer
         self.reset(self.robot.home)
-        self._assemble = bound(assemble, model, targets, data, self.settings.max_substep, -1.0)
+        self._qp.connect(model, self._targets.pointer, data)
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
-        if self._external_tasks:
-            self._find_minimum = bound(find_minimum, data)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
-        self._problem.minimum = None  # a solver is set up at its first problem, and at home there may be none for it
-        self._solver.solve(self._problem)
+        problem = self._qp.problem
+        problem.minimum = None  # a solver is set up at its first problem, and at home there may be none for it
+        self._solver.solve(problem)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
         """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each.
@@ -138,7 +153,77 @@ class CartesianController(WatchedPairs):
         Joints that the tools leave free go to ``posture`` (nv,) [rad], or home; one that is not finite is not used.
         Raises :class:`RobotError` for ``targets`` that are no mapping.
         """
-        check_kind("targets", targets, Mapping, "a pin.SE3 or None by arm, such as {'left': pose}", RobotError)
+        return self._tick(targets, dt, posture, self._solver.solve)
+
+    def problem(
+        self, targets: Mapping[str, pin.SE3 | None], dt: float, posture: Array | None = None
+    ) -> qpsolvers.Problem:
+        """The QP that :meth:`step` would solve now, and nothing changes by asking for it.
+
+            minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = 1e-5 a_i' H^-1 a_i,  a_i the i-th row
+            subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
+
+        The variables are x = [v; s]: the next joint velocities (nv,) and a slack for each row (m,) [rad/s]. Rows have
+        unit norm. Those of separation come first, then the soft and the hard ones of ``constraints``; the slack of a
+        hard row has the upper bound 0. ``qpsolvers.solve_problem(problem, solver=NAME)`` solves it, and
+        :meth:`advance` goes on with what it finds.
+
+        Args:
+            targets: Tool poses by arm, as of :meth:`step`.
+            dt: Of the step, above 0 and up to 0.1 [s]. One above ``max_substep`` is split, and the QP is the first
+                part's.
+            posture: As of :meth:`step`.
+
+        Returns:
+            The problem, in arrays of its own.
+
+        Raises:
+            RobotError: For ``targets`` that are no mapping, and another ``dt``.
+        """
+        from q2r2_control.control.solvers.qpsolvers import slack_problem  # which imports every solver that there is
+
+        check_kind("targets", targets, Mapping, _TARGETS, RobotError)
+        if not _passes(dt) or dt > LONGEST_DT:
+            raise RobotError(f"dt = {shown(dt)}: allowed: a number above 0, up to {LONGEST_DT:g} s")
+        with put_back((*self._kernel_values, self._targets.pointer.value), (self._live, self._objects)):
+            self._targets.aim_posture(posture)
+            self._targets.offer(targets)
+            self._write_problem(float(dt) / self._parts_of(float(dt)), float(dt), StepSummary())
+            return slack_problem(self._qp.problem)
+
+    def advance(
+        self, x: npt.ArrayLike | None, targets: Mapping[str, pin.SE3 | None], dt: float, posture: Array | None = None
+    ) -> Reference:
+        """Take a step with a solution of :meth:`problem` that somebody else found, certified as every step.
+
+        The result is that of :meth:`step` with a solver that finds the same. Nothing about ``x`` raises an exception
+        or is trusted: it is cut to the box, and taken as far as it can be certified. Anything else is a failed
+        solve: None, fewer than nv numbers, numbers that are not finite, another shape. The certified stop is then
+        executed, and ``report.unsolved`` says so.
+
+        Args:
+            x: Next joint velocities (nv,) [rad/s]. Slacks may follow them, as in a solution of the whole problem. The
+                parts of a dt above ``max_substep`` all go on with the same velocities.
+            targets: Tool poses by arm, as of :meth:`step`; give those that the problem was asked with.
+            dt: As of :meth:`step` [s].
+            posture: As of :meth:`step`.
+
+        Returns:
+            The reference, as :meth:`step` does.
+
+        Raises:
+            RobotError: For ``targets`` that are no mapping.
+        """
+        return self._tick(targets, dt, posture, GivenSolution(x, self._nv).solve)
+
+    def _tick(
+        self,
+        targets: Mapping[str, pin.SE3 | None],
+        dt: float,
+        posture: Array | None,
+        solve: Callable[[QpProblem], QpSolution],
+    ) -> Reference:
+        check_kind("targets", targets, Mapping, _TARGETS, RobotError)
         usable = _passes(dt)
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         self._remember()
@@ -146,24 +231,27 @@ class CartesianController(WatchedPairs):
         summary = StepSummary()
         if usable and dt > time:
             self._obstacles.pass_time(float(dt) - time)
-        known, longest = self._targets.offer(targets), self.settings.max_substep
+        known = self._targets.offer(targets)
         if time > 0.0:
-            substeps = max(math.ceil(time / longest - 1e-9), 1)
-            for index in range(substeps):
-                if not self._advance(time / substeps, 1.0 / substeps, -1.0 if index else time, summary):
+            parts = self._parts_of(time)
+            for index in range(parts):
+                if not self._take_part(time / parts, 1.0 / parts, -1.0 if index else time, summary, solve):
                     summary.unsolved |= 1 << index
         else:  # takes the targets, and moves nothing
-            pointers = self._model_pointer, self._targets.pointer, self._data_pointer
-            summary.targets_usable, _, _ = self._assemble(*pointers, longest, 0.0)
+            self._qp.take_targets(summary)
         rejected = () if known and summary.targets_usable else self._targets.rejected(targets)
         return self._reference(summary, usable and dt <= LONGEST_DT, rejected)
+
+    def _parts_of(self, time: float) -> int:
+        """Into how many steps of at most ``max_substep`` a ``time`` [s] is split."""
+        return max(math.ceil(time / self.settings.max_substep - 1e-9), 1)
 
     def _reference(self, summary: StepSummary, dt_usable: bool, rejected: tuple[str, ...] = ()) -> Reference:
         closest, distance, tightest, margin = self._observed
         report = StepReport(
             status=summary.status(self._apart, dt_usable, rejected),
             rejected=rejected,
-            binding=self._names.of(self._active),
+            binding=self._names.of(self._active) + summary.constraints,
             closest_pair=self._names.pair(closest),
             closest_distance=distance,
             certified=self._certified,
@@ -173,6 +261,7 @@ class CartesianController(WatchedPairs):
             tightest_pair=self._names.pair(tightest),
             margin=margin,
             unsolved=summary.unsolved,
+            faults=tuple(dict.fromkeys(summary.faults)),
         )
         state = self._state
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
@@ -220,7 +309,7 @@ class CartesianController(WatchedPairs):
     def tool_pose(self, arm: str) -> pin.SE3:
         """World pose of an arm's tool at the reference. Raises :class:`RobotError` for an arm that does not exist."""
         i = self._arms.index(self.robot.arm(arm).name)
-        return pose_of(self._tasks.rotation[i], self._tasks.translation[i])
+        return pose_of(self._tools.rotation[i], self._tools.translation[i])
 
     @property
     def solver_failure(self) -> str | None:
@@ -232,30 +321,28 @@ class CartesianController(WatchedPairs):
         """Of each joint in the full stop from the reference that is known, (nv,) [rad/s^2]."""
         return self._stop.copy()
 
-    def _advance(self, h: float, share: float, tick: float, summary: StepSummary) -> bool:
-        """One substep, which is a ``share`` of the tick: build, solve, certify and move; whether it was solved.
-
-        ``tick``: see :func:`assemble`.
-        """
+    def _write_problem(self, h: float, tick: float, summary: StepSummary) -> None:
+        """Write the QP of a step of ``h`` [s]; ``tick``: see :func:`assemble`."""
         self._live.step(h)
         self._obstacles.keep_clear(h)
-        usable, inside, free = self._assemble(self._model_pointer, self._targets.pointer, self._data_pointer, h, tick)
-        if self._external_tasks:
-            add_costs(self._external_tasks, self._tasks.H, self._tasks.g, self._state.q, self._state.v)
-            free = self._find_minimum(self._data_pointer)
-        summary.targets_usable &= usable
-        summary.inside &= inside
-        count = int(self._rows.used[0])
-        self._problem.rows, self._problem.rows_lower = self._rows.matrix[:count], self._rows.lower[:count]
-        self._problem.minimum = self._tasks.minimum if free else None
-        solution = self._solver.solve(self._problem)
+        self._qp.write(h, tick, summary)
+
+    def _take_part(
+        self, h: float, share: float, tick: float, summary: StepSummary, solve: Callable[[QpProblem], QpSolution]
+    ) -> bool:
+        """One step, which is a ``share`` of the tick: build, solve, certify and move; whether it was solved."""
+        self._write_problem(h, tick, summary)
+        solution = solve(self._qp.problem)
         limit = self.settings.solve_time_limit
         solved = solution.v is not None and (limit is None or solution.solve_time <= limit)
         if solved:
             self._solution[:] = solution.v
-        self._observed, outcome, slack = self._move(
-            self._model_pointer, self._data_pointer, self._solution, solved, h, share
-        )
+        if self._qp.constraints:
+            outcome, slack = self._move_as_permitted(solved, h, share, summary)
+        else:
+            self._observed, outcome, slack = self._move(
+                self._model_pointer, self._data_pointer, self._solution, solved, h, share
+            )
         summary.fallback |= outcome != FOLLOWED
         summary.slack = max(summary.slack, slack)
         summary.solve_time += solution.solve_time
@@ -263,6 +350,25 @@ class CartesianController(WatchedPairs):
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
+
+    def _move_as_permitted(self, solved: bool, h: float, share: float, summary: StepSummary) -> tuple[int, float]:
+        """Move where the hard constraints permit it, and along the stop elsewhere.
+
+        A solution that the certificate has moved towards the stop is looked at once more, and undone if need be.
+        """
+        own, problem, state = self._qp.constraints, self._qp.problem, self._state
+        usable = solved and own.permit(np.clip(self._solution, problem.lower, problem.upper))
+        arrays = state.q, state.v, state.a, self._stop
+        before = [array.copy() for array in arrays]
+        pointers = self._model_pointer, self._data_pointer
+        self._observed, outcome, slack = self._move(*pointers, self._solution, usable, h, share)
+        if outcome == REDUCED and not own.permit(state.v):
+            for array, kept in zip(arrays, before, strict=True):
+                array[:] = kept
+            self._observe_again(self._unchanged)
+            self._observed, outcome, slack = self._move(*pointers, self._solution, False, h, share)
+        summary.constraints, own_slack = own.active(state.v)
+        return outcome, max(slack, own_slack)
 
 
 def check_settings(robot: Robot, settings: ControllerSettings) -> None:

@@ -40,7 +40,7 @@ class MovingObstacles:
         pairs = list(geometry.collisionPairs)[last - len(goal) :]
         self._holders = [hulls.get(names[pair.first]) for pair in pairs]  # arm that has to hold for a pair to count
         self._limits = limits
-        self._data = ObstacleData(
+        self.data = ObstacleData(
             first=(len(goal) // max(count, 1)) * np.arange(count + 1),
             speed=np.zeros(count),
             slower=np.zeros(count),
@@ -55,7 +55,7 @@ class MovingObstacles:
         self.still: dict[str, MovingObstacle] = {}  # those among them that stay; another mapping at each report
         self._holding: frozenset[str] = frozenset()
         if count:
-            pointers = *pointers, pointer_to(self._data)
+            pointers = *pointers, pointer_to(self.data)
             self._keep_while_stopping = partial(bound(keep_while_stopping, *pointers), *pointers)
             self._keep_clear = partial(bound(keep_clear, *pointers, 0.0), *pointers)
         self.change(settings)
@@ -63,7 +63,7 @@ class MovingObstacles:
     @property
     def reports(self) -> dict[str, ObstacleReport]:
         """Those that are there, as reported last."""
-        ages = zip(self._number, self._data.age.tolist(), strict=True)
+        ages = zip(self._number, self.data.age.tolist(), strict=True)
         return {name: ObstacleReport(self.there[name], age) for name, age in ages if name in self.there}
 
     def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
@@ -81,7 +81,7 @@ class MovingObstacles:
             self.there[name] = obstacle
             changed[number] = 1
             write_body(self._bodies, number, obstacle)
-            data = self._data
+            data = self.data
             data.speed[index], data.slower[index], data.rise[index] = obstacle.speed, obstacle.slower, obstacle.rise
             data.age[index] = obstacle.age
         self.still = {name: one for name, one in self.there.items() if one.speed == 0.0}
@@ -96,13 +96,13 @@ class MovingObstacles:
     def change(self, settings: ControllerSettings) -> None:
         """Let pairs keep what ``settings`` say."""
         self._goal = kept_by_obstacles(self._robot, settings).values
-        self._data.buffer[:] = stop_buffer(self._goal, settings)
+        self.data.buffer[:] = stop_buffer(self._goal, settings)
         self._count()
 
     def kept_from(self, stop: float) -> Array:
         """Distances that pairs keep from where these were reported, if arms stop in ``stop`` [s]."""
-        kept = self._data.kept.reshape(len(self._number), -1) if self._number else np.zeros((0, 0))
-        way = self._data.speed * (np.maximum(self._data.age, REPORT_AGE) + stop)
+        kept = self.data.kept.reshape(len(self._number), -1) if self._number else np.zeros((0, 0))
+        way = self.data.speed * (np.maximum(self.data.age, REPORT_AGE) + stop)
         return np.ravel((kept + way[:, None])[[name in self.there for name in self._number]])
 
     def keep_clear(self, h: float) -> None:
@@ -112,7 +112,7 @@ class MovingObstacles:
 
     def pass_time(self, time: float) -> None:
         """Let reports get older by a ``time`` [s] for which no step is taken."""
-        self._data.age[:] += time
+        self.data.age[:] += time
 
     def _count(self) -> None:
         """Let pairs count whose obstacle is there and whose object is held."""
@@ -120,11 +120,11 @@ class MovingObstacles:
             return
         there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))
         held = np.array([arm is None or arm in self._holding for arm in self._holders])
-        self._data.kept[:] = np.where(there & held, self._goal, -np.inf)
+        self.data.kept[:] = np.where(there & held, self._goal, -np.inf)
         self._keep_while_stopping()
         if not self.there:
-            self._limits.velocity[:] = self._data.velocity
-            self._data.stop_time[:] = (self._data.velocity / self._limits.acceleration).max()
+            self._limits.velocity[:] = self.data.velocity
+            self.data.stop_time[:] = (self.data.velocity / self._limits.acceleration).max()
 
 
 def write_body(bodies: CollisionBodies, number: int, obstacle: MovingObstacle) -> None:

@@ -40,6 +40,7 @@ class QpProblem:
     rows: Array  # (m, nv), unit rows
     rows_lower: Array  # (m,) [rad/s]
     minimum: Array | None = None  # (nv,) of the cost alone, if that keeps box and rows and so is the solution [rad/s]
+    hard: int = 0  # how many of the last rows may not give way
 
 
 @dataclass(slots=True)

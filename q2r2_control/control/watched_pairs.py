@@ -11,10 +11,11 @@ from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import bound, pointer_to
-from q2r2_control.control.kernel_model import KernelData, kernel_model_of
+from q2r2_control.control.kernel_model import KernelData, KernelModel, kernel_model_of
 from q2r2_control.control.live_settings import LiveSettings, ObjectPairs
 from q2r2_control.control.moving_obstacles import MovingObstacles
 from q2r2_control.control.reference import observe_bodies, spare_distance
+from q2r2_control.control.safety.protective_distance import ObstacleData
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.control.step_report import LimitNames
 from q2r2_control.robot.obstacle_bodies import distances_with, roles_with_obstacles, with_obstacle_bodies
@@ -155,6 +156,11 @@ class WatchedPairs:
     def still_obstacles(self) -> Mapping[str, MovingObstacle]:
         """Those of :attr:`moving_obstacles` that stay; another mapping, not a changed one, when that changes."""
         return self._obstacles.still
+
+    @property
+    def _kernel_values(self) -> tuple[KernelModel, KernelData, ObstacleData]:
+        """All arrays that kernels read and write beside the targets."""
+        return self._model_pointer.value, self._data_pointer.value, self._obstacles.data
 
     def _observe_again(self, grown: IntArray) -> int:
         """Observe what has changed; returns the pair in the way of bodies that have ``grown``, or -1."""

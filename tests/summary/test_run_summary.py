@@ -24,8 +24,8 @@ from tests.viewer.conftest import tick_at
 
 # Scripts and dashboards rely on these.
 KEYS = (
-    "ticks duration_s loop_rate_hz real_time_factor tick_us lateness_us input_to_command_ms arms min_distance_mm closest_pair "
-    "max_velocity_ratio max_acceleration_ratio min_position_margin_rad fallback_ticks uncertified_ticks "
+    "ticks duration_s loop_rate_hz real_time_factor tick_us lateness_us input_to_command_ms arms min_distance_mm "
+    "closest_pair max_velocity_ratio max_acceleration_ratio min_position_margin_rad fallback_ticks uncertified_ticks "
     "rejected_targets overruns missed_ticks stretched_s at_rest torque events"
 )
 ARM_KEYS = (

@@ -10,6 +10,7 @@ import numpy as np
 from q2r2_control.control.qp import SOFTNESS, QpProblem, QpSolution
 
 _UNBOUNDED = 1e30
+_HARD, _SOFT = 0, 8  # how DAQP marks a row
 
 
 class DaqpSolver:
@@ -39,12 +40,14 @@ class DaqpSolver:
         if m > len(self._upper):
             self._upper = np.full(m, _UNBOUNDED)
             self._lower = np.empty(m)
-            self._sense = np.full(m, 8, dtype=np.int32)  # soft
-            self._sense[:nv] = 0
+            self._sense = np.full(m, _SOFT, dtype=np.int32)
+            self._sense[:nv] = _HARD
         self._upper[:nv] = problem.upper
         self._lower[:nv] = problem.lower
         if m > nv:
             self._lower[nv:m] = problem.rows_lower
+        if problem.hard:
+            self._sense[m - problem.hard : m] = _HARD
         v, _, flag, info = daqp.solve(
             problem.H,
             problem.g,
@@ -54,4 +57,6 @@ class DaqpSolver:
             self._sense[:m],
             **self._options,
         )
+        if problem.hard:
+            self._sense[m - problem.hard : m] = _SOFT
         return QpSolution(v if flag in self._OPTIMAL else None, info["setup_time"] + info["solve_time"])

@@ -68,4 +68,5 @@ def _copy_of(problem: QpProblem) -> QpProblem:
         rows=problem.rows.copy(),
         rows_lower=problem.rows_lower.copy(),
         minimum=None if problem.minimum is None else problem.minimum.copy(),
+        hard=problem.hard,
     )

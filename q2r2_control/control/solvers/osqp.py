@@ -102,4 +102,7 @@ class OsqpSolver:
         self._lower[nv : nv + m] = problem.rows_lower / norms[nv:]
         self._cost[:nv] = scipy.linalg.solve_triangular(factor, problem.g, lower=True, check_finite=False)
         self._entries[: self._matrix.size] = self._matrix.T.ravel()
+        slacks = self._entries[self._matrix.size :]
+        slacks[:] = math.sqrt(SOFTNESS)
+        slacks[m - problem.hard : m] = 0.0  # a hard row has none
         self._solver.update(q=self._cost, l=self._lower, u=self._upper, Ax=self._entries)

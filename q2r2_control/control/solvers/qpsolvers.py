@@ -3,7 +3,7 @@
 Such a solver has no soft rows, so every row gets a slack of its own: x = [v; s],
 
     minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = SOFTNESS a_i' H^-1 a_i
-    subject to  lower <= v <= upper,    s >= 0,    rows v + s >= rows_lower
+    subject to  lower <= v <= upper,    s >= 0,    rows v + s >= rows_lower,    s_i = 0 for a hard row
 
 Source: https://github.com/qpsolvers/qpsolvers, whose form is P, q, G x <= h, lb <= x <= ub.
 """
@@ -34,13 +34,15 @@ def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem
     P[:nv, :nv] = problem.H
     P[range(nv, nv + m), range(nv, nv + m)] = 1.0 / row_softness(problem.H, problem.rows)
     G = np.hstack([-problem.rows, -np.eye(m)]) if m else None
+    most = np.full(m, np.inf)
+    most[m - problem.hard :] = 0.0
     return qpsolvers.Problem(
         P=scipy.sparse.csc_matrix(P) if sparse else P,
         q=np.concatenate([problem.g, np.zeros(m)]),
         G=scipy.sparse.csc_matrix(G) if sparse and m else G,
         h=-problem.rows_lower if m else None,
         lb=np.concatenate([problem.lower, np.zeros(m)]),
-        ub=np.concatenate([problem.upper, np.full(m, np.inf)]),
+        ub=np.concatenate([problem.upper, most]),
     )
 
 

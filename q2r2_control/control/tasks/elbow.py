@@ -21,6 +21,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.control.tasks.arguments import check_robot, positive
+from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -32,7 +34,22 @@ _DAMPING = 1e-6  # of the projection into the nullspace of the tool's motion
 
 
 class ElbowSwivel:
-    """Turns elbows towards their angles, in the nullspace of the tools: a tool pays nothing for its elbow."""
+    """Turns elbows towards their angles, in the nullspace of the tools: a tool pays nothing for its elbow.
+
+    The cost of each arm is  s w (n' v - k (psi* - psi))^2.  psi is the swivel angle above, n its gradient projected
+    into the nullspace of the tool's motion, and s falls from 1 to 0 where psi ceases to be defined. A YAML names the
+    task ``swivel``. Source: Kreutz-Delgado, Long, Seraji, Int. J. Robotics Research 11(5), 1992.
+
+    Args:
+        robot: Whose arms they are.
+        angles: Wanted angle psi* of each arm that has the task, 0: elbow up; None: as at home [rad].
+        joints: At shoulder, elbow and wrist, without the arm's prefix.
+        gain: k, swivel speed per angle [1/s].
+        weight: w, against 1 of a tool's error in metres.
+
+    Raises:
+        ConfigError: For an arm or a joint that does not exist, and for numbers that are not allowed.
+    """
 
     def __init__(
         self,
@@ -42,27 +59,20 @@ class ElbowSwivel:
         gain: float = 2.0,
         weight: float = 0.1,
     ) -> None:
-        """``angles`` [rad]: of each arm that has the task, 0: elbow up; None: as at home.
-
-        ``joints``: at shoulder, elbow and wrist, without the arm's prefix. ``gain``: swivel speed per radian [1/s].
-        Raises :class:`ValueError` for an arm or a joint that is not there, and for numbers that are not allowed.
-        """
-        for key, value in (("gain", gain), ("weight", weight)):
-            if not isinstance(value, float | int) or not 0.0 < value < math.inf:
-                raise ValueError(f"{key} = {value!r:.40}: allowed: a number above 0")
+        check_robot(robot)
+        self._robot, self._gain, self._weight = robot, positive("gain", gain), positive("weight", weight)
         if not isinstance(joints, list | tuple) or len(joints) != 3:
-            raise ValueError(f"joints = {joints!r:.60}: allowed: three, at shoulder, elbow and wrist")
+            raise ConfigError(f"joints = {joints!r:.60}: allowed: three, at shoulder, elbow and wrist")
         if not isinstance(angles, Mapping) or not angles:
-            raise ValueError(f"angles = {angles!r:.60}: allowed: an angle or null by arm, such as {{left: 0.3}}")
+            raise ConfigError(f"angles = {angles!r:.60}: allowed: an angle or null by arm, such as {{left: 0.3}}")
         for arm, angle in angles.items():
             if angle is not None and not (isinstance(angle, float | int) and abs(angle) <= math.tau):
-                raise ValueError(f"angles.{arm!s:.40} = {angle!r:.40}: allowed: -6.28 .. 6.28 rad, or null")
-        self._robot, self._gain, self._weight = robot, gain, weight
+                raise ConfigError(f"angles.{arm!s:.40} = {angle!r:.40}: allowed: -6.28 .. 6.28 rad, or null")
         self._data = robot.model.createData()
         self._joints = {arm: [_joint(robot, arm, name) for name in joints] for arm in angles}
         for arm, found in self._joints.items():
             if not found[0] < found[1] < found[2]:
-                raise ValueError(f"joints = {list(joints)!s:.60}: allowed: three of {arm} from base to tip")
+                raise ConfigError(f"joints = {list(joints)!s:.60}: allowed: three of {arm} from base to tip")
         self._angles = {
             arm: self.angle(arm, robot.home) if angle is None else float(angle) for arm, angle in angles.items()
         }
@@ -73,7 +83,7 @@ class ElbowSwivel:
         return self._swivel(arm)[0]
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """See :class:`Task`."""
+        """See :meth:`Task.cost`."""
         nv = self._robot.model.nv
         H, g = np.zeros((nv, nv)), np.zeros(nv)
         pin.computeJointJacobians(self._robot.model, self._data, q)
@@ -109,10 +119,10 @@ class ElbowSwivel:
 
 
 def _joint(robot: Robot, arm: str, name: str) -> int:
-    """Number of an arm's joint in the model. Raises :class:`ValueError`."""
+    """Number of an arm's joint in the model. Raises :class:`ConfigError`."""
     if arm not in robot.arms:
-        raise ValueError(f"angles: no arm {arm!r:.40}; allowed: {', '.join(robot.arms)}")
+        raise ConfigError(f"angles: no arm {arm!r:.40}; allowed: {', '.join(robot.arms)}")
     own = {robot.joint_names[j].removeprefix(f"{arm}_"): int(j) + 1 for j in robot.arms[arm].joints}
     if name not in [*own]:
-        raise ValueError(f"joints: {arm} has no joint {name!r:.40}; allowed: {', '.join(own)}")
+        raise ConfigError(f"joints: {arm} has no joint {name!r:.40}; allowed: {', '.join(own)}")
     return own[name]

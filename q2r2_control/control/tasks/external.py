@@ -1,8 +1,9 @@
-"""Tasks of other packages: costs on the next joint velocities, written in NumPy and found by their name.
+"""Tasks of a program's own and of other packages: costs on the next joint velocities, written in NumPy.
 
-A package names its task as an entry point of the group ``q2r2_control.tasks``; a cell's YAML asks for it, with its
-settings, under ``control.tasks``. Its cost is added to those of the built-in tasks before the QP is solved. Limits,
-separation and the certificate do not depend on costs, so no task can break them.
+A program hands its tasks to the controller as objects. A package names its task as an entry point of the group
+``q2r2_control.tasks``; a cell's YAML asks for it, with its settings, under ``control.tasks``. Their costs are added to
+those of the built-in tasks before the QP is solved. Limits, separation and the certificate do not depend on costs, so
+no task can break them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from q2r2_control.control.answers import Answer, answer_of
 from q2r2_control.errors import ConfigError, shown
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -22,32 +24,44 @@ GROUP = "q2r2_control.tasks"
 
 
 class Task(Protocol):
-    """Made of the robot and the task's settings: ``make(robot, **settings)``."""
+    """A cost on the next joint velocities: any object with this method.
+
+    ``CartesianController(robot, settings, tasks=[MyTask()])`` adds it to the tools' own. A task that a YAML names is
+    made as ``make(robot, **settings)``.
+    """
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """H (nv, nv), symmetric and positive semidefinite, and g (nv,) of the cost 1/2 v+' H v+ + g' v+.
+        """The cost 1/2 v+' H v+ + g' v+ of the next joint velocities v+.
 
-        ``v+`` are the next joint velocities, ``q`` [rad] and ``v`` [rad/s] the reference's posture and velocities now,
-        (nv,) each. The weight of a tool's error is 1 [s^2/m^2], that of the posture 1e-3. Called at every substep: keep
-        it under 20 us. A cost with a number that is not finite is not used.
+        A task that wants J v+ = u with a weight w returns H = w J'J and g = -w J'u. A tool's own error has the weight
+        1 for metres and 0.09 for radians, the posture 1e-3. The method is asked at every substep and by
+        :meth:`CartesianController.problem`, so its answer may depend on q and v alone. It should take less than 20 us.
+
+        Args:
+            q: Joint positions of the reference (nv,) [rad].
+            v: Joint velocities of the reference (nv,) [rad/s].
+
+        Returns:
+            H (nv, nv), symmetric and positive semidefinite, and g (nv,). An answer that has another shape or a number
+            that is not finite is not used, and neither is an exception. The step's report says so in ``faults``.
         """
 
 
-def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> tuple[Task, ...]:
-    """The tasks that the settings ask for. Raises :class:`ConfigError` for an unknown one and for bad settings."""
+def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> dict[str, Task]:
+    """The tasks that the settings ask for, by key. Raises :class:`ConfigError` for an unknown one and bad settings."""
     if not wanted:
-        return ()
+        return {}
     installed = {entry.name: entry for entry in entry_points(group=GROUP)}
-    tasks: list[Task] = []
+    tasks: dict[str, Task] = {}
     for name, settings in wanted.items():
         if name not in installed:
             raise ConfigError(f"control.tasks.{name}: installed tasks: {', '.join(sorted(installed)) or 'none'}")
         made = installed[name].load()
         try:
-            tasks.append(made(robot, **settings))
-        except (TypeError, ValueError) as error:
+            tasks[f"control.tasks.{name}"] = made(robot, **settings)
+        except (TypeError, ValueError, ConfigError) as error:
             raise ConfigError(f"control.tasks.{name}{_fault(made, settings, error)}") from error
-    return tuple(tasks)
+    return tasks
 
 
 def _fault(made: Any, settings: Mapping[str, Any], error: Exception) -> str:
@@ -64,10 +78,41 @@ def _fault(made: Any, settings: Mapping[str, Any], error: Exception) -> str:
     return f": {error}{allowed}"
 
 
-def add_costs(tasks: Sequence[Task], H: Array, g: Array, q: Array, v: Array) -> None:
-    """Add to the cost H (nv, nv), g (nv,) that of each task at ``q`` and ``v``, unless it is not finite."""
-    for task in tasks:
-        own_H, own_g = task.cost(q.copy(), v.copy())
-        if np.isfinite(own_H).all() and np.isfinite(own_g).all():
-            H += own_H
-            g += own_g
+class ExternalTasks:
+    """The tasks of one controller that are asked at every substep, those of its settings first."""
+
+    def __init__(self, robot: Robot, settings: Mapping[str, Mapping[str, Any]], own: Sequence[Task]) -> None:
+        """Raises :class:`ConfigError` for what is no task, and for one that has no usable cost at home."""
+        if not isinstance(own, list | tuple):
+            raise ConfigError(f"tasks = {shown(own)}: allowed: a list of objects with a method cost(q, v)")
+        self._tasks = load_tasks(robot, settings)
+        for i, task in enumerate(own):
+            key = f"tasks[{i}]"
+            if isinstance(task, type) or not callable(getattr(task, "cost", None)):
+                raise ConfigError(f"{key} = {shown(task)}: allowed: an object with a method cost(q, v)")
+            cost = _cost_of(task, np.array(robot.home), np.zeros(robot.model.nv))
+            if isinstance(cost, str):
+                raise ConfigError(f"{key}: {type(task).__name__}.cost {cost}")
+            self._tasks[f"{key} {type(task).__name__}"] = task
+
+    def __bool__(self) -> bool:
+        return bool(self._tasks)
+
+    def add_costs(self, H: Array, g: Array, q: Array, v: Array) -> list[str]:
+        """Add the cost of each task at ``q`` and ``v`` to H (nv, nv) and g (nv,); returns why some were not used."""
+        faults = []
+        for key, task in self._tasks.items():
+            cost = _cost_of(task, q, v)
+            if isinstance(cost, str):
+                faults.append(f"{key}: cost {cost}")
+            else:
+                H += cost[0]
+                g += cost[1]
+        return faults
+
+
+def _cost_of(task: Task, q: Array, v: Array) -> Answer | str:
+    cost = answer_of(task.cost, q, v)
+    if not isinstance(cost, str) and len(cost[1]) != len(q):
+        return f"returned shapes {cost[0].shape} and {cost[1].shape}; allowed: {(len(q), len(q))} and {(len(q),)}"
+    return cost

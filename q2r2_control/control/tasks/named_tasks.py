@@ -14,8 +14,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.control.tasks.arguments import check_robot, chosen_arms, direction, positive, vector
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
-from q2r2_control.errors import shown
+from q2r2_control.errors import ConfigError, shown
 from q2r2_control.robot.cell_parts import check_position
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -41,10 +42,9 @@ class _Tools:
     """Poses and Jacobians of some tools, in world axes."""
 
     def __init__(self, robot: Robot, arms: Sequence[str] | None) -> None:
-        """Of all arms without ``arms``. Raises :class:`ValueError` for one that is not there."""
-        names = list(robot.arms) if arms is None else arms
-        if not isinstance(names, list | tuple) or not names or any(name not in [*robot.arms] for name in names):
-            raise ValueError(f"arms = {shown(arms)}: allowed: a list of some of {', '.join(robot.arms)}")
+        """Of ``arms``, or of all where that is None. Raises as :func:`chosen_arms` and :func:`check_robot` do."""
+        check_robot(robot)
+        names = chosen_arms(robot, arms)
         self._model, self._data = robot.model, robot.model.createData()
         self._frames = [robot.arms[name].frame_id for name in names]
 
@@ -61,31 +61,60 @@ class _Tools:
 
 
 class JointTarget:
-    """Joints go to positions of their own within their limits, such as ``{left_A3: 0.3}`` [rad]."""
+    """Joints go to positions of their own within their limits: w |v_j - k (q*_j - q_j)|^2 of each.
+
+    A YAML names it ``joints``.
+
+    Args:
+        robot: Whose joints they are.
+        positions: Wanted position q* by the joint's name, such as ``{"left_A3": 0.3}`` [rad, or m of a sliding joint].
+        gain: k, speed per distance [1/s].
+        weight: w, against 1 of a tool's error in metres.
+
+    Raises:
+        ConfigError: For a joint that does not exist, a position outside of its limits, and what is no number above 0.
+    """
 
     def __init__(self, robot: Robot, positions: Mapping[str, float], gain: float = 2.0, weight: float = 0.1) -> None:
-        self._gain, self._weight = _positive("gain", gain), _positive("weight", weight)
+        check_robot(robot)
+        self._gain, self._weight = positive("gain", gain), positive("weight", weight)
         if not isinstance(positions, Mapping) or not positions:
-            raise ValueError(f"positions = {shown(positions)}: allowed: positions by joint, such as {{left_A3: 0.3}}")
+            raise ConfigError(f"positions = {shown(positions)}: allowed: positions by joint, such as {{left_A3: 0.3}}")
         joints = {joint.get("name", ""): joint for joint in ET.fromstring(robot.urdf).findall("joint")}
         for name, value in positions.items():
             if name not in robot.joint_names:
-                raise ValueError(f"positions.{name!s:.40}: no such joint; allowed: {', '.join(robot.joint_names)}")
+                raise ConfigError(f"positions.{name!s:.40}: no such joint; allowed: {', '.join(robot.joint_names)}")
             if isinstance(value, bool) or not isinstance(value, float | int):
-                raise ValueError(f"positions.{name} = {shown(value)}: allowed: a number [rad or m]")
-            check_position(joints[name], value, f"control.tasks.joints: positions.{name}")
+                raise ConfigError(f"positions.{name} = {shown(value)}: allowed: a number [rad or m]")
+            check_position(joints[name], value, f"positions.{name}")
         self._joints = [robot.joint_names.index(name) for name in positions]
         self._wanted = np.array([float(value) for value in positions.values()])
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """See :class:`Task`."""
+        """See :meth:`Task.cost`."""
         cost = _Cost(len(q))
         cost.add(np.eye(len(q))[self._joints], self._gain * (self._wanted - q[self._joints]), self._weight)
         return cost.H, cost.g
 
 
 class LookAt:
-    """An axis of the tool points at a ``point`` (3,) of the world [m]; the turn about that axis is left free."""
+    """An axis of the tool points at a point of the world; the turn about that axis is left free.
+
+    With the axis a, the unit vector d from the tool to the point, at the distance r, and their angle t about the unit
+    vector n = a x d / sin t, the cost is  w |(I - a a') (omega - dd) - k t n|^2.  The tool turns with omega, and
+    dd = -d x v / r  is how fast d turns where the tool moves across it with v. A YAML names the task ``look_at``.
+
+    Args:
+        robot: Whose tools they are.
+        point: In the world (3,) [m].
+        arms: Names of the arms that have the task; None: all.
+        axis: a in the tool's frame (3,), of any length.
+        gain: k, angular speed per angle [1/s].
+        weight: w, against 0.09 of a tool's own rotation.
+
+    Raises:
+        ConfigError: For an arm that does not exist, and for numbers that are not allowed.
+    """
 
     def __init__(
         self,
@@ -96,11 +125,11 @@ class LookAt:
         gain: float = 4.0,
         weight: float = 0.1,
     ) -> None:
-        self._tools, self._axis, self._point = _Tools(robot, arms), _direction("axis", axis), _vector("point", point)
-        self._gain, self._weight = _positive("gain", gain), _positive("weight", weight)
+        self._tools, self._axis, self._point = _Tools(robot, arms), direction("axis", axis), vector("point", point)
+        self._gain, self._weight = positive("gain", gain), positive("weight", weight)
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """See :class:`Task`."""
+        """See :meth:`Task.cost`."""
         cost = _Cost(len(q))
         for pose, J in self._tools.at(q):
             pointing, way = pose.rotation @ self._axis, self._point - pose.translation
@@ -114,7 +143,24 @@ class LookAt:
 
 
 class Upright:
-    """An axis of the tool stays within ``angle`` [rad] of the direction ``up`` (3,) of the world."""
+    """An axis of the tool stays within a cone about a direction of the world.
+
+    Within the cone the task costs nothing. At an angle t beyond its edge the cost is  w(t) (n' omega - k t)^2,  with n
+    the axis of the shortest turn back and omega how fast the tool turns. The weight grows to w over the first 0.05 rad.
+    A YAML names the task ``upright``.
+
+    Args:
+        robot: Whose tools they are.
+        angle: Of the cone, from its middle to its edge, up to pi [rad].
+        arms: Names of the arms that have the task; None: all.
+        axis: In the tool's frame (3,), of any length.
+        up: The middle of the cone in the world (3,), of any length.
+        gain: k, angular speed per angle [1/s].
+        weight: w, against 0.09 of a tool's own rotation.
+
+    Raises:
+        ConfigError: For an arm that does not exist, and for numbers that are not allowed.
+    """
 
     def __init__(
         self,
@@ -126,12 +172,12 @@ class Upright:
         gain: float = 4.0,
         weight: float = 10.0,
     ) -> None:
-        self._tools, self._axis, self._up = _Tools(robot, arms), _direction("axis", axis), _direction("up", up)
-        self._angle, self._gain, self._weight = _positive("angle", angle, math.pi), _positive("gain", gain), weight
-        _positive("weight", weight)
+        self._tools, self._axis, self._up = _Tools(robot, arms), direction("axis", axis), direction("up", up)
+        self._angle, self._gain, self._weight = positive("angle", angle, math.pi), positive("gain", gain), weight
+        positive("weight", weight)
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """See :class:`Task`."""
+        """See :meth:`Task.cost`."""
         cost = _Cost(len(q))
         for pose, J in self._tools.at(q):
             back = _turn(pose.rotation @ self._axis, self._up)
@@ -144,7 +190,22 @@ class Upright:
 
 
 class RelativePose:
-    """The right tool stays where it is at home in the left tool's frame, or at ``position`` and ``rpy`` there."""
+    """The right tool keeps its pose in the left tool's frame.
+
+    The cost is  w |J_r v - J_c v - k e|^2  with the pose error e of the right tool (6,), the Jacobian J_r of that tool,
+    and the Jacobian J_c of a body that the left tool would carry at the wanted pose. Rotations count 0.09 as much as
+    metres. A YAML names the task ``relative``.
+
+    Args:
+        robot: With the arms ``left`` and ``right``.
+        position: Of the right tool in the left tool's frame (3,) [m]; None: as at home.
+        rpy: Its roll, pitch and yaw there (3,) [rad]; None: as at home.
+        gain: k, speed per distance [1/s].
+        weight: w, against 1 of a tool's error in metres.
+
+    Raises:
+        ConfigError: For a robot without both arms, and for numbers that are not allowed.
+    """
 
     def __init__(
         self,
@@ -154,18 +215,17 @@ class RelativePose:
         gain: float = 4.0,
         weight: float = 10.0,
     ) -> None:
-        """``position`` (3,) [m], ``rpy`` (3,) [rad]. Raises :class:`ValueError` for a cell of one arm too."""
         self._tools = _Tools(robot, ("left", "right"))
-        self._gain, self._weight = _positive("gain", gain), _positive("weight", weight)
+        self._gain, self._weight = positive("gain", gain), positive("weight", weight)
         self._wanted = robot.tool_pose(robot.home, "left").actInv(robot.tool_pose(robot.home, "right"))
         if position is not None:
-            self._wanted.translation = _vector("position", position)
+            self._wanted.translation = vector("position", position)
         if rpy is not None:
-            self._wanted.rotation = pin.rpy.rpyToMatrix(*_vector("rpy", rpy))
+            self._wanted.rotation = pin.rpy.rpyToMatrix(*vector("rpy", rpy))
         self._weights = self._weight * np.array([1.0] * 3 + [ROTATION_LENGTH**2] * 3)
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """See :class:`Task`."""
+        """See :meth:`Task.cost`."""
         cost = _Cost(len(q))
         (left, J_left), (right, J_right) = self._tools.at(q)
         wanted, arm = left * self._wanted, left.rotation @ self._wanted.translation
@@ -183,27 +243,3 @@ def _turn(of: Array, to: Array) -> Array:
     if sine < _TINY:
         return np.zeros(3) if of @ to > 0.0 else math.pi * np.eye(3)[np.argmin(np.abs(of))]
     return math.atan2(sine, float(of @ to)) / sine * across
-
-
-def _positive(key: str, value: float, most: float = math.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, float | int) or not (0.0 < value <= most and value < math.inf):
-        up_to = "" if most == math.inf else f", at most {most:.2f} rad"
-        raise ValueError(f"{key} = {value!r:.40}: allowed: a number above 0{up_to}")
-    return float(value)
-
-
-def _vector(key: str, value: Sequence[float]) -> Array:
-    try:
-        vector = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ValueError(f"{key} = {value!s:.60}: allowed: three numbers")
-    return vector
-
-
-def _direction(key: str, value: Sequence[float]) -> Array:
-    vector = _vector(key, value)
-    if (length := float(np.linalg.norm(vector))) < _TINY:
-        raise ValueError(f"{key} = {value!s:.60}: allowed: three numbers, not all 0")
-    return vector / length

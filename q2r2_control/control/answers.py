@@ -1,0 +1,41 @@
+"""Matrices and vectors that a program's own tasks and constraints answer with, checked.
+
+A step raises nothing, so an answer that cannot be used becomes a line that says what is wrong with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from q2r2_control.types import Array
+
+Answer = tuple[Array, Array]
+_LENGTH = 120  # of a line, at most
+
+
+def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array) -> Answer | str:
+    """Ask for a matrix and a vector at a state.
+
+    Args:
+        ask: Gets copies of ``q`` and ``v``, and may do anything.
+        q: Joint positions (nv,) [rad].
+        v: Joint velocities (nv,) [rad/s].
+
+    Returns:
+        A finite matrix (k, nv) and vector (k,), or one line that says why there are none.
+    """
+    try:
+        answer = ask(q.copy(), v.copy())
+        if not isinstance(answer, tuple | list) or len(answer) != 2:
+            return f"returned {type(answer).__name__}; allowed: a matrix and a vector"
+        matrix, vector = (np.asarray(part, dtype=np.float64) for part in answer)
+    except Exception as error:
+        return f"raised {type(error).__name__}: {' '.join(str(error).split())[:_LENGTH]}"
+    nv = len(q)
+    if matrix.ndim != 2 or matrix.shape[1] != nv or vector.shape != matrix.shape[:1]:
+        return f"returned shapes {matrix.shape} and {vector.shape}; allowed: (k, {nv}) and (k,)"
+    if not (np.isfinite(matrix).all() and np.isfinite(vector).all()):
+        return "returned a number that is not finite"
+    return matrix, vector

@@ -1,0 +1,92 @@
+"""The QP of each step of one controller, with the tasks and constraints of a program's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.constraints import Constraint, OwnConstraints
+from q2r2_control.control.jit import KernelPointer, bound
+from q2r2_control.control.kernel_model import KernelData
+from q2r2_control.control.qp import QpProblem, QpSolution, assemble, find_minimum
+from q2r2_control.control.step_report import StepSummary
+from q2r2_control.control.tasks.external import ExternalTasks, Task
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+
+class StepProblem:
+    """Writes the ``problem`` of a step from the kernels' model, targets and data."""
+
+    def __init__(
+        self, robot: Robot, settings: ControllerSettings, tasks: Sequence[Task], constraints: Sequence[Constraint]
+    ) -> None:
+        """Raises :class:`ConfigError` as :class:`ExternalTasks` and :class:`OwnConstraints` do."""
+        self._longest = settings.max_substep
+        self._external = ExternalTasks(robot, settings.tasks, tasks)
+        self.constraints = OwnConstraints(robot, constraints)
+
+    def connect(self, model: KernelPointer, targets: KernelPointer, data: KernelPointer) -> None:
+        """Compile for these, which have been written by a reset."""
+        self._pointers, arrays = (model, targets, data), data.value
+        self._arrays: KernelData = arrays
+        self.problem = QpProblem(
+            H=arrays.tasks.H,
+            g=arrays.tasks.g,
+            lower=arrays.safety.box.lower,
+            upper=arrays.safety.box.upper,
+            rows=arrays.safety.rows.matrix[:0],
+            rows_lower=arrays.safety.rows.lower[:0],
+        )
+        self._assemble = bound(assemble, *self._pointers, self._longest, -1.0)
+        if self._external:
+            self._find_minimum = bound(find_minimum, data)
+
+    def take_targets(self, summary: StepSummary) -> None:
+        """Take the targets that were offered at a tick that moves nothing."""
+        summary.targets_usable, _, _ = self._assemble(*self._pointers, self._longest, 0.0)
+
+    def write(self, h: float, tick: float, summary: StepSummary) -> None:
+        """Write the problem of a step of ``h`` [s]; ``tick``: see :func:`assemble`."""
+        usable, inside, free = self._assemble(*self._pointers, h, tick)
+        summary.targets_usable &= usable
+        summary.inside &= inside
+        rows, tasks, state, problem = (
+            self._arrays.safety.rows,
+            self._arrays.tasks,
+            self._arrays.safety.state,
+            self.problem,
+        )
+        if self._external:
+            summary.faults += self._external.add_costs(tasks.H, tasks.g, state.q, state.v)
+            free = self._find_minimum(self._pointers[-1])
+        count = int(rows.used[0])
+        problem.rows, problem.rows_lower = rows.matrix[:count], rows.lower[:count]
+        if self.constraints:
+            own = self.constraints
+            summary.faults += own.write(state.q, state.v)
+            problem.rows = np.concatenate([problem.rows, own.matrix])
+            problem.rows_lower = np.concatenate([problem.rows_lower, own.lower])
+            problem.hard = own.hard
+            free = free and own.allow(tasks.minimum)
+        problem.minimum = tasks.minimum if free else None
+
+
+class GivenSolution:
+    """A solver whose answer to every problem was given from outside."""
+
+    def __init__(self, x: object, nv: int) -> None:
+        """``x``: the velocities (nv,) [rad/s], and whatever follows them; anything else is no solution."""
+        self._v: Array | None = None
+        try:
+            numbers = np.array(x, dtype=np.float64)
+        except Exception:  # of any kind that a stranger's object raises
+            return
+        if numbers.ndim == 1 and len(numbers) >= nv and np.isfinite(numbers[:nv]).all():
+            self._v = numbers[:nv]
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        """The given answer, whatever the problem is."""
+        return QpSolution(self._v, 0.0)

@@ -1,0 +1,197 @@
+"""Constraints of a program's own are rows of the QP, or a condition of each step; no promise depends on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import qpsolvers
+
+from q2r2_control import CartesianController, ConfigError, Robot
+from q2r2_control.types import Array, LimitKind
+from q2r2_control.verification.contract import Contract
+from tests.control.test_problem import DT, crossing, solved_by
+
+
+class StillJoint:
+    """The joint's next velocity is 0."""
+
+    def __init__(self, joint: int, hard: bool = False) -> None:
+        self.joint, self.hard = joint, hard
+
+    def rows(self, q: Array, v: Array) -> tuple[Array, Array]:
+        A = np.zeros((2, len(q)))
+        A[0, self.joint], A[1, self.joint] = 3.0, -3.0  # of any norm
+        return A, np.zeros(2)
+
+
+class Answers:
+    """Returns whatever ``answer`` does, once it is told to."""
+
+    def __init__(self, answer: Callable[[int], Any], hard: bool = False) -> None:
+        self.answer, self.hard, self.asked = answer, hard, False
+
+    def rows(self, q: Array, v: Array) -> Any:
+        return self.answer(len(q)) if self.asked else (np.zeros((0, len(q))), np.zeros(0))
+
+
+def raising(nv: int) -> Any:
+    raise RuntimeError("two\nlines")
+
+
+NONSENSE: dict[str, Callable[[int], Any]] = {
+    "an exception": raising,
+    "None": lambda nv: None,
+    "one array": lambda nv: np.zeros((1, nv)),
+    "another width": lambda nv: (np.zeros((1, nv + 1)), np.zeros(1)),
+    "another length": lambda nv: (np.ones((1, nv)), np.zeros(2)),
+    "text": lambda nv: ("a", "b"),
+    "NaN": lambda nv: (np.full((1, nv), np.nan), np.zeros(1)),
+    "too large": lambda nv: (np.full((1, nv), 1e300), np.zeros(1)),
+    "zeros above 0": lambda nv: (np.zeros((1, nv)), np.ones(1)),
+}
+
+
+def driven(controller: CartesianController, ticks: int) -> tuple[Array, Array]:
+    """Velocities and postures of a run towards crossing targets, in which the contract holds."""
+    contract = Contract(controller, controller.robot.home)
+    v, q = [], []
+    for tick in range(ticks):
+        reference = controller.step(crossing(controller.robot, tick), DT)
+        contract.check(reference, DT)
+        v.append(reference.v)
+        q.append(reference.q)
+    return np.array(v), np.array(q)
+
+
+@pytest.mark.parametrize(("hard", "most"), [(False, 1e-3), (True, 1e-6)], ids=["soft", "hard"])
+def test_a_joint_that_may_not_turn_rests_while_the_others_move(robot: Robot, hard: bool, most: float) -> None:
+    free, _ = driven(CartesianController(robot), 400)
+    held, _ = driven(CartesianController(robot, constraints=[StillJoint(3, hard)]), 400)
+    assert np.abs(free[:, 3]).max() > 0.1
+    assert np.abs(held[:, 3]).max() < most
+    assert np.abs(held[:, 4]).max() > 0.1
+
+
+class Plane:
+    """The left elbow stays above a height [m]: J v+ >= -gain (z - height)."""
+
+    hard = True
+
+    def __init__(self, robot: Robot, height: float) -> None:
+        self.model, self.data, self.height = robot.model, robot.model.createData(), height
+
+    def elbow(self, q: Array) -> float:
+        pin.computeJointJacobians(self.model, self.data, q)
+        return float(self.data.oMi[4].translation[2])
+
+    def rows(self, q: Array, v: Array) -> tuple[Array, Array]:
+        room = self.elbow(q) - self.height
+        J = pin.getJointJacobian(self.model, self.data, 4, pin.LOCAL_WORLD_ALIGNED)[2:3]
+        return J, np.array([-5.0 * room])
+
+
+def test_an_elbow_does_not_cross_a_plane_that_it_would_cross(robot: Robot) -> None:
+    _, q = driven(CartesianController(robot), 600)
+    plane = Plane(robot, 0.0)
+    heights = [plane.elbow(at) for at in q]
+    plane.height = 0.5 * (heights[0] + min(heights))
+    assert min(heights) < plane.height - 0.005
+    _, q = driven(CartesianController(robot, constraints=[plane]), 600)
+    assert min(plane.elbow(at) for at in q) > plane.height - 1e-4
+
+
+def test_a_hard_row_that_no_step_satisfies_brakes_the_arms_and_is_named(robot: Robot) -> None:
+    fast = Answers(lambda nv: (np.eye(nv)[:1], np.full(1, 100.0)), hard=True)
+    controller = CartesianController(robot, constraints=[fast])
+    moving, _ = driven(controller, 100)
+    fast.asked = True
+    for tick in range(400):
+        reference = controller.step(crossing(robot, tick), DT)
+        assert reference.report.fallback
+        assert reference.report.certified
+    assert np.abs(moving[-1]).max() > 0.1
+    assert not reference.v.any()
+    assert (LimitKind.CONSTRAINT, ("Answers",)) in reference.report.binding
+
+
+def test_a_given_solution_that_breaks_a_hard_row_is_not_executed(robot: Robot) -> None:
+    controller = CartesianController(robot, constraints=[StillJoint(3, hard=True)])
+    for tick in range(100):
+        targets = crossing(robot, tick)
+        x = solved_by("daqp", controller.problem(targets, DT))
+        assert x is not None
+        assert not controller.advance(x, targets, DT).report.unsolved
+        x[3] = 0.01
+        report = controller.advance(x, targets, DT).report
+        assert report.fallback
+
+
+@pytest.mark.parametrize("name", [name for name in ("clarabel", "quadprog") if name in qpsolvers.available_solvers])
+def test_other_solvers_keep_a_hard_row_too(robot: Robot, name: str) -> None:
+    controller = CartesianController(robot, constraints=[StillJoint(3, hard=True)])
+    stops = 0
+    for tick in range(100):
+        targets = crossing(robot, tick)
+        reference = controller.advance(solved_by(name, controller.problem(targets, DT)), targets, DT)
+        stops += reference.report.fallback
+    assert stops == 0
+    assert abs(reference.v[3]) < 1e-4
+
+
+def test_osqp_keeps_a_hard_row_in_the_loop_too(robot: Robot) -> None:
+    controller = CartesianController(robot, solver="osqp", constraints=[StillJoint(3, hard=True)])
+    reports = [controller.step(crossing(robot, tick), DT).report for tick in range(200)]
+    assert sum(report.fallback for report in reports) < 2
+    assert abs(controller.step(crossing(robot), DT).v[3]) < 1e-4
+
+
+@pytest.mark.parametrize("hard", [False, True], ids=["soft", "hard"])
+@pytest.mark.parametrize("name", NONSENSE)
+def test_a_constraint_that_answers_nonsense_raises_nothing_and_is_named(robot: Robot, name: str, hard: bool) -> None:
+    broken = Answers(NONSENSE[name], hard)
+    controller = CartesianController(robot, constraints=[broken])
+    driven(controller, 50)
+    broken.asked = True
+    reference = controller.step(crossing(robot), DT)
+    (fault,) = reference.report.faults
+    assert fault.startswith("constraints[0] Answers: rows r")
+    assert "\n" not in fault
+    assert reference.report.fallback is hard, "a hard one brakes, a soft one asks for nothing"
+
+
+class BrokenTask:
+    asked = False
+
+    def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
+        if self.asked:
+            raise ZeroDivisionError
+        return np.zeros((len(q), len(q))), np.zeros(len(q))
+
+
+def test_a_task_that_raises_in_a_step_changes_nothing_and_is_named(robot: Robot) -> None:
+    task = BrokenTask()
+    controllers = CartesianController(robot, tasks=[task]), CartesianController(robot)
+    task.asked = True
+    broken, usual = (controller.step(crossing(robot), DT) for controller in controllers)
+    np.testing.assert_array_equal(broken.v, usual.v)
+    assert broken.report.faults == ("tasks[0] BrokenTask: cost raised ZeroDivisionError: ",)
+
+
+@pytest.mark.parametrize(
+    ("parts", "told"),
+    [
+        ({"tasks": 5}, "tasks = 5: allowed: a list of objects with a method cost"),
+        ({"tasks": [StillJoint(0)]}, r"tasks\[0\] = .*: allowed: an object with a method cost"),
+        ({"tasks": [BrokenTask]}, r"tasks\[0\] = .*: allowed: an object with a method cost"),
+        ({"constraints": [BrokenTask()]}, r"constraints\[0\] = .*: allowed: an object with a method rows"),
+        ({"constraints": [StillJoint(0, hard=2)]}, "hard = True or False"),  # type: ignore[arg-type]
+        ({"constraints": [StillJoint(99)]}, r"constraints\[0\]: StillJoint.rows raised IndexError"),
+    ],
+)
+def test_a_task_or_constraint_without_an_answer_at_home_is_refused(robot: Robot, parts: Any, told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        CartesianController(robot, **parts)
