@@ -312,8 +312,9 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
     # Nothing calls a kernel through its C wrapper, which would be compiled beside the one for Python.
     compiled: Any = numba.njit(function, error_model="numpy", nogil=True, no_cfunc_wrapper=True, **options)
     if isinstance(compiled, Dispatcher):  # and not with NUMBA_DISABLE_JIT
-        compiled._cache = _KernelCache(function)
-        _kernels.append(compiled)
+        dispatcher: Any = compiled
+        dispatcher._cache = _KernelCache(function)
+        _kernels.append(dispatcher)
     found: Callable[..., Any] = compiled
     return found
 
