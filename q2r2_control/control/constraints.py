@@ -82,7 +82,7 @@ class OwnConstraints:
     def __bool__(self) -> bool:
         return bool(self._soft or self._hard)
 
-    def write(self, q: Array, v: Array) -> list[str]:
+    def write(self, q: Array, v: Array) -> tuple[str, ...]:
         """Ask every constraint at ``q`` and ``v`` for its rows; returns why some were not used."""
         faults: list[str] = []
         found = [self._rows_of(kind, q, v, faults) for kind in (self._soft, self._hard)]
@@ -92,7 +92,7 @@ class OwnConstraints:
         self._names = [name for kind in found for name, (_, lower) in kind for _ in lower]
         self.hard = sum(len(lower) for _, (_, lower) in found[1])
         self._unknown = len(found[1]) < len(self._hard)
-        return faults
+        return tuple(faults)
 
     @staticmethod
     def _rows_of(kind: list[tuple[str, Constraint]], q: Array, v: Array, faults: list[str]) -> list[tuple[str, Answer]]:

@@ -261,7 +261,7 @@ class CartesianController(WatchedPairs):
             tightest_pair=self._names.pair(tightest),
             margin=margin,
             unsolved=summary.unsolved,
-            faults=tuple(dict.fromkeys(summary.faults)),
+            faults=tuple(dict.fromkeys(summary.faults)) if summary.faults else (),
         )
         state = self._state
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)

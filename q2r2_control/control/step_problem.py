@@ -30,8 +30,9 @@ class StepProblem:
 
     def connect(self, model: KernelPointer, targets: KernelPointer, data: KernelPointer) -> None:
         """Compile for these, which have been written by a reset."""
-        self._pointers, arrays = (model, targets, data), data.value
-        self._arrays: KernelData = arrays
+        self._pointers = model, targets, data
+        arrays: KernelData = data.value
+        self._rows, self._tasks, self._state = arrays.safety.rows, arrays.tasks, arrays.safety.state
         self.problem = QpProblem(
             H=arrays.tasks.H,
             g=arrays.tasks.g,
@@ -53,12 +54,7 @@ class StepProblem:
         usable, inside, free = self._assemble(*self._pointers, h, tick)
         summary.targets_usable &= usable
         summary.inside &= inside
-        rows, tasks, state, problem = (
-            self._arrays.safety.rows,
-            self._arrays.tasks,
-            self._arrays.safety.state,
-            self.problem,
-        )
+        tasks, state, rows, problem = self._tasks, self._state, self._rows, self.problem
         if self._external:
             summary.faults += self._external.add_costs(tasks.H, tasks.g, state.q, state.v)
             free = self._find_minimum(self._pointers[-1])

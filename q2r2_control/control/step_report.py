@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import pinocchio as pin
 
@@ -62,7 +62,7 @@ class StepSummary:
     unsolved: int = 0  # bit by bit, which substeps had no solution
     slack: float = 0.0
     solve_time: float = 0.0
-    faults: list[str] = field(default_factory=list)  # of tasks and constraints of a program's own
+    faults: tuple[str, ...] = ()  # of tasks and constraints of a program's own
     constraints: tuple[ActiveLimit, ...] = ()  # of a program's own that the last substep met
 
     def status(self, apart: bool, dt_usable: bool, rejected: tuple[str, ...]) -> StepStatus:

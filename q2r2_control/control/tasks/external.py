@@ -98,7 +98,7 @@ class ExternalTasks:
     def __bool__(self) -> bool:
         return bool(self._tasks)
 
-    def add_costs(self, H: Array, g: Array, q: Array, v: Array) -> list[str]:
+    def add_costs(self, H: Array, g: Array, q: Array, v: Array) -> tuple[str, ...]:
         """Add the cost of each task at ``q`` and ``v`` to H (nv, nv) and g (nv,); returns why some were not used."""
         faults = []
         for key, task in self._tasks.items():
@@ -108,7 +108,7 @@ class ExternalTasks:
             else:
                 H += cost[0]
                 g += cost[1]
-        return faults
+        return tuple(faults)
 
 
 def _cost_of(task: Task, q: Array, v: Array) -> Answer | str:
