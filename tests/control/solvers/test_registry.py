@@ -40,7 +40,7 @@ def test_a_name_in_python_takes_the_place_of_the_settings() -> None:
     assert CartesianController(ROBOT, ControllerSettings(), solver="osqp").settings.solver == "osqp"
 
 
-@pytest.mark.parametrize("solver", [object(), 3, ["osqp"]], ids=str)
+@pytest.mark.parametrize("solver", [object(), 3, ["osqp"]], ids=["object", "number", "list"])
 def test_what_is_neither_a_name_nor_a_solver_is_refused(solver: Any) -> None:
     with pytest.raises(ConfigError, match="allowed: a solver's name, a Solver, or None"):
         CartesianController(ROBOT, ControllerSettings(), solver=solver)
