@@ -181,8 +181,8 @@ def _unbox(kind: _Pointer, boxed: Any, context: Any) -> Any:
 def pointee(typing_context: Any, pointer: Any) -> Any:
     """The tuple behind ``pointer``, in a kernel. No reference is counted: the caller keeps the pointer.
 
-    A named tuple stays behind its pointer, and each attribute is read where it is used. So kernels hand one address to
-    each other instead of the hundreds of numbers that a model's arrays consist of, which halves the time to compile.
+    A named tuple stays behind its pointer, and each attribute is read where it is used. Kernels hand one address to
+    each other instead of the hundreds of numbers that a model's arrays consist of, which makes less code to compile.
     """
     if isinstance(pointer.pointee, types.BaseNamedTuple):
         return pointer(pointer), lambda context, builder, signature, arguments: arguments[0]

@@ -52,7 +52,7 @@ class QpSolution:
 
 
 class Solver(Protocol):
-    """Solves a :class:`QpProblem`. Whatever it raises is a failed solve."""
+    """Solves a :class:`QpProblem`. An exception of it is a failed solve."""
 
     def solve(self, problem: QpProblem) -> QpSolution: ...
 

@@ -1,7 +1,7 @@
 """Keeps a solver that is not ours from the controller's arrays, and its failures from a step.
 
 The safety filter clamps the answer to the very box that a solver is handed. A solver that wrote into that box would
-move the limits, and the certificate would be about the moved ones. So a solver gets copies.
+move the limits, and the certificate would be about the moved ones. A solver therefore gets copies.
 """
 
 from __future__ import annotations
