@@ -39,7 +39,8 @@ from q2r2_control.compliance.impedance_law import (
 from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
 from q2r2_control.config.strict import validated
 from q2r2_control.control.geometry.kinematics import chain_of
-from q2r2_control.control.jit import bound, pointer_to
+from q2r2_control.control.jit import bound
+from q2r2_control.control.kernel_pointers import pointer_to
 from q2r2_control.control.tasks.frame import tools_of
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot

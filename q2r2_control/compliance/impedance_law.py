@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.control.geometry.kinematics import Chain, Placements, place
-from q2r2_control.control.jit import KernelPointer, numpy_kernel, pointee
+from q2r2_control.control.jit import numpy_kernel
+from q2r2_control.control.kernel_pointers import KernelPointer, pointee
 from q2r2_control.control.tasks.frame import Tools, rotation_vector, tool_jacobian, tool_pose
 from q2r2_control.types import Array
 

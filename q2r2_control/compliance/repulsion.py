@@ -55,7 +55,8 @@ from q2r2_control.control.geometry.collision import CollisionData, CollisionMode
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_smooth
-from q2r2_control.control.jit import KernelPointer, bound, kernel, pointee, pointer_to
+from q2r2_control.control.jit import bound, kernel
+from q2r2_control.control.kernel_pointers import KernelPointer, pointee, pointer_to
 from q2r2_control.control.moving_obstacles import write_body
 from q2r2_control.robot.kept_distances import kept_by_obstacles, kept_distances
 from q2r2_control.robot.obstacle_bodies import with_obstacle_bodies

@@ -11,8 +11,9 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport, check_obstacle
 from q2r2_control.control.geometry.collision import CollisionBodies, bodies_of
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.jit import KernelPointer, bound, pointer_to
+from q2r2_control.control.jit import bound
 from q2r2_control.control.kernel_model import KernelModel, stop_buffer
+from q2r2_control.control.kernel_pointers import KernelPointer, pointer_to
 from q2r2_control.control.safety.protective_distance import REPORT_AGE, ObstacleData, keep_clear, keep_while_stopping
 from q2r2_control.robot.kept_distances import kept_by_obstacles
 from q2r2_control.robot.obstacle_bodies import HULL, body_of

@@ -18,8 +18,9 @@ import numpy as np
 
 from q2r2_control.control.cholesky import factorise, substitute
 from q2r2_control.control.geometry.closest_points import dot
-from q2r2_control.control.jit import KernelPointer, kernel, pointee
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.kernel_model import KernelData
+from q2r2_control.control.kernel_pointers import KernelPointer, pointee
 from q2r2_control.control.safety.joint_limits import next_velocity_box
 from q2r2_control.control.safety.separation_rows import write_separation_rows
 from q2r2_control.control.targets import update_targets

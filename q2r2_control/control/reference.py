@@ -7,8 +7,9 @@ import numpy as np
 from q2r2_control.control.geometry.collision import update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, measure
-from q2r2_control.control.jit import KernelPointer, kernel, pointee
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.kernel_model import KernelData, KernelModel
+from q2r2_control.control.kernel_pointers import KernelPointer, pointee
 from q2r2_control.control.safety.safety_filter import apply_safety_filter, certify_bodies, certify_start, measure_pairs
 from q2r2_control.control.safety.speed_bound import update_body_velocities
 from q2r2_control.control.tasks.frame import tool_pose

@@ -8,8 +8,9 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.constraints import Constraint, OwnConstraints
-from q2r2_control.control.jit import KernelPointer, bound
+from q2r2_control.control.jit import bound
 from q2r2_control.control.kernel_model import KernelData
+from q2r2_control.control.kernel_pointers import KernelPointer
 from q2r2_control.control.qp import QpProblem, QpSolution, assemble, find_minimum
 from q2r2_control.control.step_report import StepSummary
 from q2r2_control.control.tasks.external import ExternalTasks, Task

@@ -12,7 +12,8 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.closest_points import dot, size_of
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.jit import kernel, pointer_to
+from q2r2_control.control.jit import kernel
+from q2r2_control.control.kernel_pointers import pointer_to
 from q2r2_control.control.tasks.built_in import TaskModel
 from q2r2_control.control.tasks.frame import rotation_vector, times_transposed
 from q2r2_control.types import Array

@@ -10,8 +10,9 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.jit import bound, pointer_to
+from q2r2_control.control.jit import bound
 from q2r2_control.control.kernel_model import KernelData, KernelModel, kernel_model_of
+from q2r2_control.control.kernel_pointers import pointer_to
 from q2r2_control.control.live_settings import LiveSettings, ObjectPairs
 from q2r2_control.control.moving_obstacles import MovingObstacles
 from q2r2_control.control.reference import observe_bodies, spare_distance

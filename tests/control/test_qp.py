@@ -12,8 +12,8 @@ import pytest
 from q2r2_control import CartesianController
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.cholesky import factorise, substitute
-from q2r2_control.control.jit import pointer_to
 from q2r2_control.control.kernel_model import KernelData
+from q2r2_control.control.kernel_pointers import pointer_to
 from q2r2_control.control.qp import SOFTNESS, QpProblem, QpSolution, find_minimum
 from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.types import Array

@@ -27,7 +27,8 @@ import numpy as np
 
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import measure
-from q2r2_control.control.jit import KernelPointer, inlined_kernel, kernel, pointee
+from q2r2_control.control.jit import inlined_kernel, kernel
+from q2r2_control.control.kernel_pointers import KernelPointer, pointee
 from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 from q2r2_control.types import Array
 

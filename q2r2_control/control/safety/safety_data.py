@@ -8,7 +8,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.jit import KernelPointers, pointers_to
+from q2r2_control.control.kernel_pointers import KernelPointers, pointers_to
 from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox
 from q2r2_control.control.safety.speed_bound import BodyVelocities
 from q2r2_control.types import Array

@@ -6,7 +6,8 @@ The instants are spaced evenly in time, so that samples which one pair needs ser
 from __future__ import annotations
 
 from q2r2_control.control.geometry.collision import CollisionData, update_placements
-from q2r2_control.control.jit import inlined_kernel, kernel, pointee_at
+from q2r2_control.control.jit import inlined_kernel, kernel
+from q2r2_control.control.kernel_pointers import pointee_at
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData, SafetyModel
 from q2r2_control.types import Array

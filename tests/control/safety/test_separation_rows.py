@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.control.jit import pointer_to
+from q2r2_control.control.kernel_pointers import pointer_to
 from q2r2_control.control.safety.safety_filter import measure_pairs
 from q2r2_control.control.safety.separation_rows import write_separation_rows
 from q2r2_control.control.safety.speed_bound import update_body_velocities

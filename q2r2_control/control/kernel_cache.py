@@ -1,0 +1,118 @@
+"""Keep the machine code of kernels between runs.
+
+Numba's own cache looks only at the path and the time of the compiled function's file. A kernel that calls another
+module's kernel would go on running that module's old code after an edit, and a second checkout would compile everything
+again. The cache folder is therefore named by a hash of every source file of this package that machine code is made
+from, and each kernel in it is found by its module's name and its file's content.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+
+_ROOMS = ("control", "compliance")
+_COMPILED = re.compile(r"^@(inlined_|numpy_)?kernel|\bNamedTuple\b|^(from|import) numba\b", re.MULTILINE)
+_VERSION = re.compile("[0-9a-f]{16}")
+
+
+def compiled_sources() -> list[Path]:
+    """Files of kernels, of the types of their arguments, and of how they are compiled; kernels use no other file."""
+    package = Path(__file__).parents[1]
+    sources = sorted(source for room in _ROOMS for source in (package / room).rglob("*.py"))
+    return [source for source in sources if _COMPILED.search(source.read_text(encoding="utf-8"))]
+
+
+def _cache_folder() -> Path:
+    """The folder of this version's machine code; makes it the newest and deletes all but the two newest.
+
+    A folder that another process has loaded from may be deleted: its machine code is in memory, and what that process
+    still compiles is written anew. Where the cache cannot be written, what it holds is still used.
+    """
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in compiled_sources())).hexdigest()[:16]
+    try:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "q2r2_control"
+        folder = root / digest
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError:
+            if any(folder.rglob("*.nbi")):
+                return folder  # compiled before, and only to be read
+            raise
+        os.utime(folder)
+        _delete_old_versions(root)
+        return folder
+    except (OSError, RuntimeError) as error:
+        # Numba loads what it finds there as code, so a folder that others could have made will not do.
+        warnings.warn(
+            f"compiled kernels cannot be kept: {error}. Every start compiles them anew; set XDG_CACHE_HOME to a folder "
+            "that can be written",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return Path(tempfile.mkdtemp(prefix="q2r2_control-")) / digest
+
+
+def _delete_old_versions(root: Path) -> None:
+    """Delete all but the two versions that were used last."""
+    used = []
+    for folder in root.iterdir():
+        try:
+            if _VERSION.fullmatch(folder.name) and not folder.is_symlink():
+                used.append((folder.stat().st_mtime_ns, folder))
+        except FileNotFoundError:
+            continue  # another process deleted it
+    for _, folder in sorted(used)[:-2]:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+_FOLDER = str(_cache_folder())
+
+
+class _ContentLocator(_CacheLocator):
+    """Finds a function's machine code by the name of its module and the content of its file, wherever that is."""
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._py_file = file  # which the cache names in a warning
+        self._folder = str(Path(_FOLDER) / re.sub(r"\W", "_", function.__module__))
+        self._line = function.__code__.co_firstlineno
+        self._stamp = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+    def get_cache_path(self) -> str:
+        return self._folder
+
+    def get_source_stamp(self) -> str:
+        return self._stamp
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _ContentLocator:
+        return cls(py_func, py_file)
+
+
+class _KernelCacheImpl(CompileResultCacheImpl):
+    _locator_classes = (_ContentLocator,)
+
+
+class KernelCache(FunctionCache):
+    """Numba's cache, with another way to find a file; it is only read where it cannot be written."""
+
+    _impl_class = _KernelCacheImpl
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):  # the kernel works all the same, and the next start compiles it again
+            super().save_overload(sig, data)

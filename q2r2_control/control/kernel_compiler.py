@@ -1,0 +1,119 @@
+"""Compile each kernel once, however many other kernels call it.
+
+Numba optimises a function together with all that it calls, and translates it to machine code, each time that one of its
+callers is compiled: a chain of eleven calls would be optimised eleven times. Here, a kernel that is compiled on behalf
+of another one stays as it was written. Only a kernel that Python calls is linked with all its parts, optimised and
+translated as one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.event import trigger_event
+from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
+
+
+class _PartLibrary(JITCodeLibrary):
+    """Code of a kernel that is compiled on behalf of another one: only linked into that one, and not run by itself."""
+
+    def finalize(self) -> None:
+        """Leave the code as it is; what it calls is linked by the whole kernel."""
+        self._raise_if_finalized()
+        self._finalized = True
+
+    def _get_module_for_linking(self) -> Any:
+        for function in self._final_module.functions:
+            if not function.is_declaration and function.linkage.name == "external":
+                function.linkage = "linkonce_odr"  # several whole kernels may link it
+        return self._final_module
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Returns no address, since there is no machine code."""
+        return 0
+
+    @property
+    def codegen(self) -> Any:
+        """What Numba hands the function's Python objects to; kernels have none."""
+        return self
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Keep no Python objects, which no kernel reads."""
+
+
+class _WholeLibrary(JITCodeLibrary):
+    """Code of a kernel that Python calls, with all the parts that it consists of."""
+
+    _linking_libraries: list[Any]
+
+    def finalize(self) -> None:
+        """Link, optimise and translate all of it."""
+        libraries: dict[Any, None] = {}
+        waiting = list(self._linking_libraries)
+        while waiting:
+            library = waiting.pop()
+            if library not in libraries:
+                libraries[library] = None
+                if isinstance(library, _PartLibrary):
+                    waiting += library._linking_libraries
+        self._linking_libraries = list(libraries)
+        super().finalize()
+
+    def _optimize_final_module(self) -> None:
+        # Numba optimises twice, since some code that counts references is found to be superfluous only after that.
+        manager, builder = self._codegen._module_pass_manager()
+        manager.run(self._final_module, builder)
+
+
+class _WholeCompiler(Compiler):
+    library_class: Any = _WholeLibrary
+
+    def define_pipelines(self) -> Any:
+        """Numba's passes, which write into a library of our class."""
+        state = self.state
+        state.library = self.library_class(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library.enable_object_caching()
+        return super().define_pipelines()
+
+
+class _PartCompiler(_WholeCompiler):
+    library_class = _PartLibrary
+
+
+class Kernel(CPUDispatcher):
+    """A function that is compiled for each combination of types that it is called with."""
+
+    _being_compiled = 0  # how many kernels, each on behalf of the one before
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=options, pipeline_class=_WholeCompiler)
+        part_options = options | {"no_cpython_wrapper": True}
+        numba_compiler = type(self._compiler)
+        self._part_compiler = numba_compiler(function, self.targetdescr, part_options, {}, _PartCompiler)
+
+    def compile(self, sig: Any) -> Any:
+        """Compile for one signature, as a part where another kernel is being compiled."""
+        with global_compiler_lock:
+            arguments, result = normalize_signature(sig)
+            known = self.overloads.get(tuple(arguments))
+            if Kernel._being_compiled:
+                return (known or self._compile_part(arguments, result)).entry_point
+            if known is not None and isinstance(known.library, _PartLibrary):
+                del self.overloads[tuple(arguments)]  # Python calls it, too: now it is needed as a whole
+            Kernel._being_compiled += 1
+            try:
+                return super().compile(sig)
+            finally:
+                Kernel._being_compiled -= 1
+
+    def _compile_part(self, arguments: Any, result: Any) -> Any:
+        details = {"dispatcher": self, "args": arguments, "return_type": result}
+        with trigger_event("numba:compile", data=details):
+            part = self._part_compiler.compile(arguments, result)
+            self.overloads[tuple(arguments)] = part
+        return part

@@ -1,0 +1,197 @@
+"""Hand a model or its data to kernels by one address.
+
+A named tuple of arrays is laid out in memory once, as Numba's own struct of it. Kernels hand its address to each other
+and read each attribute where they use it, instead of the hundreds of numbers that a model's arrays consist of. That
+makes less code to compile.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numba.extending
+import numpy as np
+import numpy.typing as npt
+from numba import types
+from numba.core import cgutils
+from numba.core.imputils import lower_getattr_generic
+from numba.core.registry import cpu_target
+from numba.core.typing.templates import AttributeTemplate, infer_getattr
+
+# No type checker knows what Numba sets at run time.
+extending: Any = numba.extending
+
+
+class _Pointer(types.Type):
+    """Kernels' type of a :class:`KernelPointer`."""
+
+    def __init__(self, pointee: Any) -> None:
+        self.pointee = pointee
+        super().__init__(name=f"KernelPointer({pointee})")
+
+    @property
+    def key(self) -> Any:
+        return self.pointee  # whose name does not tell of its fields
+
+
+class _Pointers(types.Type):
+    """Kernels' type of :class:`KernelPointers`."""
+
+    def __init__(self, pointee: Any) -> None:
+        self.pointee = pointee
+        super().__init__(name=f"KernelPointers({pointee})")
+
+    @property
+    def key(self) -> Any:
+        return self.pointee
+
+
+for _kind in (_Pointer, _Pointers):
+    extending.register_model(_kind)(extending.models.OpaqueModel)
+
+
+class KernelPointer:
+    """A named tuple of arrays behind one pointer: made by :func:`pointer_to`, read in a kernel by :func:`pointee`."""
+
+    __slots__ = ("address", "kind", "memory", "value")
+
+    def __init__(self, value: Any, memory: npt.NDArray[np.int64]) -> None:
+        self.value = value  # whose arrays have to stay
+        self.memory = memory
+        self.address = memory.ctypes.data
+        self.kind = _Pointer(numba.typeof(value))
+
+    def __reduce__(self) -> Any:
+        return pointer_to, (self.value,)  # a copy has an address of its own
+
+
+class KernelPointers:
+    """Named tuples of one type behind one pointer: made by :func:`pointers_to`, read by :func:`pointee_at`."""
+
+    __slots__ = ("address", "kind", "memory", "pointers")
+
+    def __init__(self, pointers: list[KernelPointer]) -> None:
+        self.pointers = pointers
+        self.memory = np.array([pointer.address for pointer in pointers], dtype=np.intp)
+        self.address = self.memory.ctypes.data
+        self.kind = _Pointers(pointers[0].kind.pointee)
+
+    def __reduce__(self) -> Any:
+        return pointers_to, ([pointer.value for pointer in self.pointers],)  # a copy has addresses of its own
+
+
+@extending.typeof_impl.register(KernelPointer)
+@extending.typeof_impl.register(KernelPointers)
+def _kind_of(pointer: KernelPointer | KernelPointers, context: Any) -> _Pointer | _Pointers:
+    return pointer.kind
+
+
+@extending.unbox(_Pointer)
+@extending.unbox(_Pointers)
+def _unbox(kind: _Pointer, boxed: Any, context: Any) -> Any:
+    builder, python = context.builder, context.pyapi
+    pointer = cgutils.alloca_once_value(builder, context.context.get_constant_null(kind))
+    address = python.object_getattr_string(boxed, "address")
+    with builder.if_then(cgutils.is_not_null(builder, address)):
+        builder.store(python.long_as_voidptr(address), pointer)
+        python.decref(address)
+    return extending.NativeValue(builder.load(pointer), is_error=python.c_api_error())
+
+
+@extending.intrinsic
+def pointee(typing_context: Any, pointer: Any) -> Any:
+    """The tuple behind ``pointer``, in a kernel. No reference is counted: the caller keeps the pointer.
+
+    A named tuple stays behind its pointer, and each attribute is read where it is used. Kernels hand one address to
+    each other instead of the hundreds of numbers that a model's arrays consist of, which makes less code to compile.
+    """
+    if isinstance(pointer.pointee, types.BaseNamedTuple):
+        return pointer(pointer), lambda context, builder, signature, arguments: arguments[0]
+
+    def read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = context.get_data_type(pointer.pointee)
+        return context.unpack_value(builder, pointer.pointee, builder.bitcast(arguments[0], kind.as_pointer()))
+
+    return pointer.pointee(pointer), read
+
+
+@extending.intrinsic
+def pointee_at(typing_context: Any, pointers: Any, index: Any) -> Any:
+    """The named tuple of ``index`` among :class:`KernelPointers`, in a kernel; as :func:`pointee` gives it."""
+
+    def read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        addresses = builder.bitcast(arguments[0], cgutils.voidptr_t.as_pointer())
+        return _invariant(builder, builder.load(builder.gep(addresses, [arguments[1]])))
+
+    return _Pointer(pointers.pointee)(pointers, types.intp), read
+
+
+def _invariant(builder: Any, loaded: Any) -> Any:
+    """Tell LLVM that a loaded value never changes: what is behind a pointer is written once, before any kernel runs."""
+    loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
+    return loaded
+
+
+@infer_getattr
+class _PointerAttribute(AttributeTemplate):
+    """Types of the attributes of a named tuple behind a pointer."""
+
+    key = _Pointer
+
+    def generic_resolve(self, pointer: Any, name: str) -> Any:
+        """Returns the type of an attribute, None if there is no such attribute."""
+        fields = getattr(pointer.pointee, "fields", ())
+        if name not in fields:
+            return None
+        kind = pointer.pointee.types[fields.index(name)]
+        return _Pointer(kind) if isinstance(kind, types.BaseNamedTuple) else kind
+
+
+@lower_getattr_generic(_Pointer)
+def _read_attribute(context: Any, builder: Any, pointer: Any, value: Any, name: str) -> Any:
+    """Read an array or a number behind a pointer; of a nested named tuple, only its address."""
+    index = pointer.pointee.fields.index(name)
+    kind = pointer.pointee.types[index]
+    whole = builder.bitcast(value, context.get_data_type(pointer.pointee).as_pointer())
+    member = cgutils.gep_inbounds(builder, whole, 0, index)
+    if isinstance(kind, types.BaseNamedTuple):
+        return builder.bitcast(member, cgutils.voidptr_t)
+    return context.data_model_manager[kind].from_data(builder, _invariant(builder, builder.load(member)))
+
+
+def _words(value: Any) -> list[int]:
+    """``value`` as Numba lays it out in memory, in words of 8 bytes."""
+    if isinstance(value, tuple):
+        return [word for part in value for word in _words(part)]
+    if isinstance(value, np.ndarray):
+        # Whoever made the pointer keeps the array: no reference is counted, and nobody is named to count them.
+        nobody = [0, 0]
+        return [*nobody, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides]
+    if isinstance(value, KernelPointer | KernelPointers):
+        return [value.address]
+    if isinstance(value, float):
+        return [int(np.float64(value).view(np.int64))]
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        return [int(value)]
+    raise TypeError(
+        f"{value!r} cannot be behind a kernel's pointer: allowed are arrays, numbers, pointers and their tuples"
+    )
+
+
+def pointer_to(value: Any) -> KernelPointer:
+    """Put ``value``, a named tuple of arrays, numbers and more of its kind, behind a pointer.
+
+    Raises:
+        TypeError: if a part of ``value`` is anything else.
+    """
+    memory = np.array(_words(value), dtype=np.int64)
+    context = cpu_target.target_context
+    if memory.nbytes != context.get_abi_sizeof(context.get_data_type(numba.typeof(value))):
+        raise TypeError(f"Numba {numba.__version__} lays out {type(value).__name__} in another way than expected")
+    return KernelPointer(value, memory)
+
+
+def pointers_to(values: list[Any]) -> KernelPointers:
+    """Put ``values``, one or more named tuples of one type, behind a pointer to all of them."""
+    return KernelPointers([pointer_to(value) for value in values])

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import typeof
+
+from q2r2_control.control.jit import kernel
+from q2r2_control.control.kernel_compiler import _PartLibrary
+
+
+@pytest.fixture
+def chain() -> tuple[Any, Any, Any]:
+    """Three new kernels, of which each but the first calls the one before."""
+
+    @kernel
+    def third(x: float) -> float:
+        return x / 3.0
+
+    @kernel
+    def sixth(x: float) -> float:
+        return third(x) / 2.0
+
+    @kernel
+    def difference(x: float) -> float:
+        return third(x) - sixth(x)
+
+    return third, sixth, difference
+
+
+def compiled(function: Any) -> Any:
+    """The one thing that a kernel was compiled to."""
+    (found,) = function.overloads.values()
+    return found
+
+
+def test_a_kernel_that_only_kernels_call_has_no_machine_code_of_its_own(chain: tuple[Any, Any, Any]) -> None:
+    third, sixth, difference = chain
+    assert difference(6.0) == 1.0
+    for part in (third, sixth):
+        library = compiled(part).library
+        assert isinstance(library, _PartLibrary)
+        assert library.get_pointer_to_function(compiled(part).fndesc.llvm_func_name) == 0
+
+
+def test_a_part_that_python_calls_is_compiled_as_a_whole_and_gives_the_same(chain: tuple[Any, Any, Any]) -> None:
+    third, sixth, difference = chain
+    numbers = np.random.default_rng(1).normal(size=100)
+    differences = [difference(x) for x in numbers]
+    assert [third(x) - sixth(x) for x in numbers] == differences
+    assert not isinstance(compiled(third).library, _PartLibrary)
+
+
+def test_a_kernel_that_was_called_first_becomes_part_of_another(chain: tuple[Any, Any, Any]) -> None:
+    third, _, difference = chain
+    assert (third(6.0), difference(6.0)) == (2.0, 1.0)
+
+
+def test_a_part_that_cannot_be_compiled_says_so_and_the_next_kernel_is_a_whole(chain: tuple[Any, Any, Any]) -> None:
+    @kernel
+    def wrong(x: float) -> float:
+        return x.no_such_attribute  # type: ignore[attr-defined]
+
+    @kernel
+    def outer(x: float) -> float:
+        return wrong(x)
+
+    with pytest.raises(Exception, match="no_such_attribute"):
+        outer(1.0)
+    third, *_ = chain
+    assert third(3.0) == 1.0
+    assert typeof(1.0) in next(iter(third.overloads))

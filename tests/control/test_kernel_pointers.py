@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import copy
+import pickle
+from collections import namedtuple
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from q2r2_control.control import kernel_pointers
+from q2r2_control.control.jit import bound, kernel
+from q2r2_control.control.kernel_pointers import KernelPointer, pointee, pointer_to
+
+
+def test_a_copy_of_what_is_held_is_held_elsewhere() -> None:
+    held = pointer_to((np.ones(3),))
+    for other in (copy.deepcopy(held), pickle.loads(pickle.dumps(held))):
+        _double_held(other)
+        np.testing.assert_array_equal(other.value[0], 2.0)
+    np.testing.assert_array_equal(held.value[0], 1.0)
+
+
+def test_tuples_with_one_name_and_other_fields_are_not_mixed_up() -> None:
+    # Their types only: compiled code of types that are not the package's would be kept beside the package's.
+    one = namedtuple("Bodies", "first second")  # type: ignore[name-match]
+    other = namedtuple("Bodies", "second first")  # type: ignore[name-match]
+    values = np.ones(1), np.zeros(1)
+    kinds = [kernel_pointers._Pointer(numba.typeof(kind(*values))) for kind in (one, other, one)]
+    assert str(kinds[0]) == str(kinds[1])
+    assert kinds[0] != kinds[1]
+    assert kinds[0] == kinds[2]
+
+
+def test_what_is_not_held_is_an_error_and_no_crash() -> None:
+    double = bound(_double_held, pointer_to((np.ones(3),)))
+    with pytest.raises(AttributeError, match="address"):
+        double(None)
+
+
+@kernel
+def _double_held(held: KernelPointer) -> None:
+    (values,) = pointee(held)
+    for i in range(values.shape[0]):
+        values[i] *= 2.0
+
+
+@pytest.mark.parametrize(
+    "value", [(True,), ("a word",), (np.ones(2), None), ([1.0],)], ids=["bool", "text", "none", "list"]
+)
+def test_what_has_no_place_behind_a_pointer_is_refused(value: tuple[object, ...]) -> None:
+    with pytest.raises(TypeError, match="cannot be behind a kernel's pointer"):
+        pointer_to(value)
+
+
+class _All(NamedTuple):
+    number: float
+    whole: int
+    part: tuple[npt.NDArray[np.int64]]
+    turned: npt.NDArray[np.float64]
+
+
+@kernel
+def _read_all(pointer: KernelPointer, out: npt.NDArray[np.float64]) -> None:
+    value = pointee(pointer)
+    out[0], out[1] = value.number, value.whole
+    out[2], out[3] = value.part[0][1], value.turned[1, 0]
+
+
+def test_a_kernel_reads_what_python_put_behind_a_pointer() -> None:
+    out = np.zeros(4)
+    _read_all(pointer_to(_All(-0.5, 7, (np.array([3, 4]),), np.arange(6.0).reshape(2, 3).T)), out)
+    np.testing.assert_array_equal(out, [-0.5, 7.0, 4.0, 1.0])
