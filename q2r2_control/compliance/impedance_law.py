@@ -11,10 +11,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from q2r2_control.control.geometry.closest_points import dot, size_of
 from q2r2_control.control.geometry.kinematics import Chain, Placements, place
-from q2r2_control.control.jit import numpy_kernel
+from q2r2_control.control.jit import kernel, numpy_kernel
 from q2r2_control.control.kernel_pointers import KernelPointer, pointee
-from q2r2_control.control.tasks.frame import Tools, rotation_vector, tool_jacobian, tool_pose
+from q2r2_control.control.tasks.frame import Tools, rotation_vector, times_transposed, tool_jacobian, tool_pose
 from q2r2_control.types import Array
 
 BoolArray = npt.NDArray[np.bool_]
@@ -45,11 +46,12 @@ def plausible(numbers: Array) -> bool:
 def clip_errors(errors: Array, position: float, rotation: float) -> BoolArray:
     """Make each part of ``errors`` (k, 6) no longer than ``position`` [m], ``rotation`` [rad]; returns which were."""
     clipped = np.zeros(len(errors), dtype=np.bool_)
-    for i, error in enumerate(errors):
-        nearer = position / max(np.sqrt((error[:3] ** 2).sum()), position)
-        less = rotation / max(np.sqrt((error[3:] ** 2).sum()), rotation)
-        error[:3] *= nearer
-        error[3:] *= less
+    for i in range(len(errors)):
+        nearer = position / max(size_of(errors[i, :3]), position)
+        less = rotation / max(size_of(errors[i, 3:]), rotation)
+        for k in range(3):
+            errors[i, k] *= nearer
+            errors[i, 3 + k] *= less
         clipped[i] = min(nearer, less) < 1.0
     return clipped
 
@@ -69,10 +71,20 @@ def inertia_and_damping(mobility: Array, stiffness: Array) -> tuple[Array, Array
     diagonal would make the projector that is built with Lambda leak everywhere.
     """
     root = np.sqrt(stiffness)
-    values, vectors = np.linalg.eigh(mobility * np.outer(root, root))
-    values = np.maximum(values, stiffness[0] / _HEAVIEST)
-    shapes = vectors * root.reshape(-1, 1)
-    return (shapes / values) @ shapes.T, (shapes * (2.0 / np.sqrt(values))) @ shapes.T
+    scaled = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(6):
+            scaled[i, j] = root[i] * mobility[i, j] * root[j]
+    values, vectors = np.linalg.eigh(scaled)
+    inertia, damping = np.zeros((6, 6)), np.zeros((6, 6))
+    for k in range(6):
+        value = max(values[k], stiffness[0] / _HEAVIEST)
+        for i in range(6):
+            for j in range(6):
+                mode = root[i] * vectors[i, k] * vectors[j, k] * root[j]
+                inertia[i, j] += mode / value
+                damping[i, j] += 2.0 * mode / np.sqrt(value)
+    return inertia, damping
 
 
 @numpy_kernel
@@ -114,6 +126,7 @@ class ImpedanceData(NamedTuple):
     wanted_translation: Array  # (k, 3) [m]
     rotation: Array  # (3, 3) scratch: of a measured tool
     translation: Array  # (3,) [m]
+    turn: Array  # (3, 3) scratch: from the measured to the wanted rotation
     placements: Placements  # scratch
 
     @classmethod
@@ -138,6 +151,7 @@ class ImpedanceData(NamedTuple):
             wanted_translation=np.zeros((k, 3)),
             rotation=np.zeros((3, 3)),
             translation=np.zeros(3),
+            turn=np.zeros((3, 3)),
             placements=Placements.empty(model.chain),
         )
 
@@ -158,55 +172,69 @@ def impedance_torque(
     usable = plausible(measured) and plausible(added)
     if usable:
         if known:
-            data.torque[:] += data.M @ reference[2]
+            np.add(data.torque, data.M @ reference[2], data.torque)
         _add_springs(model, data, measured[0], measured[1])
-        data.torque[:] += data.repulsion + added
+        np.add(data.torque, data.repulsion + added, data.torque)
         usable = np.isfinite(data.torque).all()
     if known:
-        data.due[:] = reference[:2]
+        copy(reference[0], data.due[0])
+        copy(reference[1], data.due[1])
     else:
         data.due[1] = 0.0
     if not usable:
         return False, False, False, False
-    bounds = bound_torque(data.torque, data.commanded, model.torque_limit, change)
-    data.commanded[:], data.saturated[:], data.late[:] = bounds
-    held_back = data.saturated.any() or data.late.any()
-    return True, data.clipped.any(), data.repulsion.any(), held_back
+    commanded, saturated, late = bound_torque(data.torque, data.commanded, model.torque_limit, change)
+    copy(commanded, data.commanded)
+    copy(saturated, data.saturated)
+    copy(late, data.late)
+    return True, data.clipped.any(), data.repulsion.any(), saturated.any() or late.any()
 
 
 @numpy_kernel
 def _add_springs(model: ImpedanceModel, data: ImpedanceData, q: Array, v: Array) -> None:
     """Add J' (K e + D e') + N posture of all arms to ``data.torque``; ``data.repulsion`` is that of the limits."""
     _update_tools(model, data, q)
-    data.clipped[:] = clip_errors(data.error, model.largest_error[0], model.largest_error[1])
-    M_inverse, own_inertia = np.linalg.inv(data.M), np.diag(data.M)
+    copy(clip_errors(data.error, model.largest_error[0], model.largest_error[1]), data.clipped)
+    M_inverse, stiffness, posture = np.linalg.inv(data.M), np.zeros(6), np.zeros(len(q))
     for i in range(len(data.springs)):
-        J, values = data.J[i], data.springs[i]
-        stiffness = np.repeat(values[:2], 3)
+        J, values, member = data.J[i], data.springs[i], model.tools.member[i]
+        for k in range(6):
+            stiffness[k] = values[k // 3]
         inertia, damping = inertia_and_damping(J @ M_inverse @ J.T, stiffness)
         force = stiffness * data.error[i] + values[2] * (damping @ (data.wanted_twist[i] - J @ v))
-        # Each joint's damping has the ratio for the inertia that it moves by itself.
-        posture_damping = 2.0 * values[4] * np.sqrt(values[3] * own_inertia)
-        posture = (values[3] * (data.due[0] - q) + posture_damping * (data.due[1] - v)) * model.tools.member[i]
+        for j in range(len(q)):
+            # Each joint's damping has the ratio for the inertia that it moves by itself.
+            joint_damping = 2.0 * values[4] * np.sqrt(values[3] * data.M[j, j])
+            posture[j] = (values[3] * (data.due[0, j] - q[j]) + joint_damping * (data.due[1, j] - v[j])) * member[j]
         force -= consistent_force(inertia, J, M_inverse, posture)
-        data.torque[:] += posture + J.T @ force
-    data.repulsion[:] = limit_repulsion(model.limits, q, v, data.due[0])
+        np.add(data.torque, posture + J.T @ force, data.torque)
+    copy(limit_repulsion(model.limits, q, v, data.due[0]), data.repulsion)
 
 
-@numpy_kernel
+@kernel
 def _update_tools(model: ImpedanceModel, data: ImpedanceData, q: Array) -> None:
     """Jacobians at ``q``, wanted twists, and the ways from measured to wanted poses."""
     place(model.chain, data.due[0], data.placements)
     for i in range(len(data.J)):
         tool_pose(data.placements, model.tools, i, data.wanted_rotation[i], data.wanted_translation[i])
         tool_jacobian(model.chain, data.placements, model.tools, i, data.wanted_translation[i], data.J[i])
-        data.wanted_twist[i] = data.J[i] @ data.due[1]
+        for k in range(6):
+            data.wanted_twist[i, k] = dot(data.J[i, k], data.due[1])
     place(model.chain, q, data.placements)
     for i in range(len(data.J)):
         tool_pose(data.placements, model.tools, i, data.rotation, data.translation)
         tool_jacobian(model.chain, data.placements, model.tools, i, data.translation, data.J[i])
-        data.error[i, :3] = data.wanted_translation[i] - data.translation
-        rotation_vector(data.wanted_rotation[i] @ data.rotation.T, data.error[i, 3:])
+        for k in range(3):
+            data.error[i, k] = data.wanted_translation[i, k] - data.translation[k]
+        times_transposed(data.wanted_rotation[i], data.rotation, data.turn)
+        rotation_vector(data.turn, data.error[i, 3:])
+
+
+@kernel
+def copy(values: Array, out: Array) -> None:
+    """Write ``values`` (n,) into ``out`` (n,); Numba takes seconds to compile ``out[:] = values``."""
+    for i in range(values.shape[0]):
+        out[i] = values[i]
 
 
 @numpy_kernel

@@ -23,7 +23,7 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """A :func:`kernel` that becomes part of its callers: for a small one that is handed a whole model and data."""
-    return _compiled(function, _nrt=False, forceinline=True)
+    return _compiled(function, _nrt=False)
 
 
 def numpy_kernel(function: Callable[..., Any]) -> Callable[..., Any]:

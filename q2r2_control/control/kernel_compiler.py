@@ -92,16 +92,24 @@ class Kernel(CPUDispatcher):
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=_WholeCompiler)
+        self._wanted_as_part = False
         part_options = options | {"no_cpython_wrapper": True}
         numba_compiler = type(self._compiler)
         self._part_compiler = numba_compiler(function, self.targetdescr, part_options, {}, _PartCompiler)
 
-    def compile(self, sig: Any) -> Any:
-        """Compile for one signature, as a part where another kernel is being compiled."""
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What a caller that is being compiled has to know; a kernel needs no more of this one than a part."""
         with global_compiler_lock:
+            self._wanted_as_part = Kernel._being_compiled > 0
+            return super().get_call_template(args, kws)
+
+    def compile(self, sig: Any) -> Any:
+        """Compile for one signature, as a whole unless a kernel's compilation asks for a part."""
+        with global_compiler_lock:
+            as_part, self._wanted_as_part = self._wanted_as_part, False
             arguments, result = normalize_signature(sig)
             known = self.overloads.get(tuple(arguments))
-            if Kernel._being_compiled:
+            if as_part:
                 return (known or self._compile_part(arguments, result)).entry_point
             if known is not None and isinstance(known.library, _PartLibrary):
                 del self.overloads[tuple(arguments)]  # Python calls it, too: now it is needed as a whole

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numba import typeof
+from numba.core.event import RecordingListener, install_listener
 
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.kernel_compiler import _PartLibrary
@@ -71,3 +72,17 @@ def test_a_part_that_cannot_be_compiled_says_so_and_the_next_kernel_is_a_whole(c
     third, *_ = chain
     assert third(3.0) == 1.0
     assert typeof(1.0) in next(iter(third.overloads))
+
+
+def test_a_kernel_that_python_calls_while_another_one_is_compiled_is_a_whole(chain: tuple[Any, Any, Any]) -> None:
+    third, _, difference = chain
+
+    def while_compiled(event: Any) -> None:
+        called.append(third(6.0))
+
+    called: list[float] = []
+    listener = RecordingListener()
+    listener.on_end = while_compiled
+    with install_listener("numba:compile", listener):
+        assert difference(6.0) == 1.0
+    assert set(called) == {2.0}
