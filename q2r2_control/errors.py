@@ -33,7 +33,11 @@ class RecordingError(Q2R2Error):
 
 def shown(value: object, length: int = 60) -> str:
     """``value`` for an error: one line of at most ``length`` characters."""
-    return " ".join(repr(value).split())[:length]
+    try:
+        text = repr(value)
+    except Exception:  # an integer of thousands of digits, or an object of somebody else's
+        text = f"a value of type {type(value).__name__} that cannot be shown"
+    return " ".join(text.split())[:length]
 
 
 def check_kind(

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 
 from q2r2_control.config.strict import StrictModel, validated
-from q2r2_control.errors import ConfigError, check_kind
+from q2r2_control.errors import ConfigError, check_kind, shown
 
 EQUAL = "equal"
 _LIVE = "live"  # marks a setting that may change while a controller runs
@@ -150,7 +150,7 @@ class ControllerSettings(StrictModel):
         check_kind("control", values, Mapping, f"new values by name, of {', '.join(LIVE)}")
         for name, value in values.items():
             if name not in LIVE:
-                raise ConfigError(f"control.{name} = {value!r:.60}: while a controller runs: {', '.join(LIVE)}")
+                raise ConfigError(f"control.{shown(name)} = {shown(value)}: while a controller runs: {', '.join(LIVE)}")
         return validated(ControllerSettings, "control.", self.model_dump() | dict(values))
 
     @property

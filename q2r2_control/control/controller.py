@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,6 +89,7 @@ class CartesianController(WatchedPairs):
         self._qp = StepProblem(robot, settings, tasks, constraints)
         self._tools: TaskData = self._data_pointer.value.tasks
         self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step
+        self._kept_before = self._live.kept, self._objects.kept
         self._solution = np.zeros(self._nv)  # of the QP, whatever array has it
         self._targets = TargetTracker(self._model_pointer.value.tasks, self._arms, settings)
         self._compile()
@@ -282,7 +284,8 @@ class CartesianController(WatchedPairs):
         return self._reference(StepSummary(), usable)
 
     def _remember(self) -> None:
-        """The state to which :meth:`withdraw` returns."""
+        """The state to which :meth:`withdraw` returns, and what pairs keep there."""
+        self._kept_before = self._live.kept, self._objects.kept
         for kept, array in zip(self._before, (self._state.q, self._state.v, self._stop), strict=True):
             kept[:] = array
 
@@ -296,6 +299,10 @@ class CartesianController(WatchedPairs):
         for array, kept in zip((self._state.q, self._state.v, self._stop), self._before, strict=True):
             array[:] = kept
         reference.q[:], reference.v[:] = self._state.q, self._state.v
+        # Later parts of the step may have proven more for pairs than holds where the arms are now.
+        pairs_kept, objects_kept = self._kept_before
+        self._live.keep_no_more_than(pairs_kept)
+        self._objects.keep_no_more_than(objects_kept)
         self._observe_again(self._unchanged)
 
     def hold_at(self, q: Array | None) -> None:
@@ -383,4 +390,8 @@ def check_settings(robot: Robot, settings: ControllerSettings) -> None:
 
 def _passes(dt: float) -> bool:
     """Whether ``dt`` [s] is a time in which something may move."""
-    return isinstance(dt, _NUMBER) and math.isfinite(dt) and dt > 0.0
+    if not isinstance(dt, _NUMBER) or isinstance(dt, bool):
+        return False
+    with suppress(OverflowError):  # an integer that no float can hold
+        return math.isfinite(dt) and dt > 0.0
+    return False

@@ -35,7 +35,7 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.kernel_model import LEAST_BUFFER, KernelData, KernelModel, stop_buffer
 from q2r2_control.control.safety.safety_data import ROUNDING, provable_distances
 from q2r2_control.control.tasks.built_in import task_model_of
-from q2r2_control.errors import RobotError
+from q2r2_control.errors import RobotError, shown
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances, too_close_at_home
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot
@@ -77,7 +77,9 @@ class ObjectPairs:
         """
         if arm not in self._arms:
             allowed = ", ".join(self._arms) or "none"
-            raise RobotError(f"holding of arm {arm!r:.40}: its gripper has no object; those that have one: {allowed}")
+            raise RobotError(
+                f"holding of arm {shown(arm, 40)}: its gripper has no object; those that have one: {allowed}"
+            )
         if holds == (arm in self.holding):
             return False
         self.holding = self.holding | {arm} if holds else self.holding - {arm}
@@ -107,6 +109,10 @@ class ObjectPairs:
         """Let pairs keep what ``settings`` say: less at once, more as :meth:`step` finds the room."""
         self._aim(settings)
         self._write(np.minimum(self.kept, self._goal))
+
+    def keep_no_more_than(self, kept: Array) -> None:
+        """Take back what pairs have come to keep since they kept ``kept``, in a step that was undone [m]."""
+        self._write(np.where(np.isfinite(kept), np.minimum(self.kept, kept), self.kept))
 
     def _within_reach(self) -> Array:
         """d - S - buffer [m]."""
@@ -191,6 +197,10 @@ class LiveSettings:
                 self._due = _PERIOD
                 self._grow(GROWTH * max(_PERIOD, h))
                 self._stop_from(self._stops)
+
+    def keep_no_more_than(self, kept: Array) -> None:
+        """Take back what pairs have come to keep since they kept ``kept`` (p,), in a step that was undone [m]."""
+        self._write(np.minimum(self.kept, kept))
 
     def _grow(self, most: float) -> None:
         """Keep more, by at most ``most`` [m], where the stop at hand proves it."""

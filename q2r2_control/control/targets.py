@@ -105,7 +105,10 @@ class TargetTracker:
         if posture is None:
             self._targets.posture[:] = self._home
             return
-        posture = np.asarray(posture)
+        try:
+            posture = np.asarray(posture)
+        except Exception:  # rows of different lengths, or whatever an object of the caller's does
+            return
         if posture.shape == self._home.shape and posture.dtype.kind in "fiu" and np.isfinite(posture).all():
             self._targets.posture[:] = posture
 

@@ -192,7 +192,7 @@ class Robot:
         """A copy of ``values``, one for each joint (nv,). Raises :class:`RobotError` that says their ``name``."""
         try:
             array = np.array(values, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             array = np.empty(0)
         if array.shape != (self.model.nv,) or not np.isfinite(array).all():
             raise RobotError(f"{name} = {shown(values)}: expected {self.model.nv} finite numbers, one for each joint")

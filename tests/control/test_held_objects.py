@@ -191,3 +191,22 @@ def test_once_it_is_let_go_no_report_names_a_pair_of_it_even_if_no_time_passes(
     assert controller.step({}, 0.0).report.binding == ()
     assert not any(controller.holding.values())
     assert not counting(controller).size
+
+
+def test_an_undone_step_takes_back_what_its_later_parts_let_the_block_keep(
+    controller: CartesianController, at_grip: Array
+) -> None:
+    controller.reset(at_grip)
+    lifted, grown = {"left": at(GRIP + 0.2)}, 0
+    controller.set_holding("left", True)
+    for _ in range(60):
+        reference = controller.step(lifted, DT)
+        before, distances = controller.object_distances, object_distances(controller, reference.q)
+        late = controller.step(lifted, 0.1)
+        grown += bool((counting(controller) > before[np.isfinite(before)]).any())
+        controller.withdraw(late)
+        np.testing.assert_array_equal(controller.object_distances, before)
+        apart = distances > 0.0  # Coal's depth is another quantity
+        assert (distances[apart] >= controller.object_distances[apart] - 1e-6).all()
+        assert controller.step(lifted, DT).report.certified
+    assert grown > 10

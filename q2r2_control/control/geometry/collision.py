@@ -154,6 +154,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
     :class:`RobotError` for a pair of two boxes, which no kernel measures.
     """
     rows = []
+    offsets = [float(np.linalg.norm(translation)) for translation in chain.translation]
     for pair in model.collisionPairs:
         first, second = (pair.second, pair.first) if bodies.box[pair.first] else (pair.first, pair.second)
         if bodies.box[first]:
@@ -173,7 +174,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
                     carried = True
                 else:
                     moving[joint] = (sign, 1.0 if chain.prismatic[joint] else float(farthest))
-                farthest += np.linalg.norm(chain.translation[joint])
+                farthest += offsets[joint]
                 joint = int(chain.parent[joint])
         rows.append((first, second, moving, carried))
     width = max([len(moving) for _, _, moving, _ in rows], default=1)

@@ -16,7 +16,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.collision import CollisionBodies, turning_bodies
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.errors import RobotError
+from q2r2_control.errors import RobotError, shown
 from q2r2_control.robot.finger_bodies import FingerBody, part_of_segment
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import Capsules, TurningBody, TurningSweeps, sticks_out
@@ -48,11 +48,11 @@ class FingerOpenings:
     def checked(self, arm: str, least: float, greatest: float) -> Interval:
         """The interval as it can be set. Raises :class:`RobotError` for no interval."""
         usable = all(isinstance(value, int | float | np.floating) for value in (least, greatest))
-        if not (usable and math.isfinite(least) and math.isfinite(greatest) and least <= greatest):
+        if not (usable and -math.inf < least <= greatest < math.inf):
             raise RobotError(
-                f"opening of arm {arm} = {least!r:.40} .. {greatest!r:.40}: allowed: finite numbers, the least first"
+                f"opening of arm {arm} = {shown(least)} .. {shown(greatest)}: allowed: finite numbers, the least first"
             )
-        return min(max(float(least), 0.0), 1.0), min(max(float(greatest), 0.0), 1.0)
+        return float(min(max(least, 0.0), 1.0)), float(min(max(greatest, 0.0), 1.0))
 
     def set(self, arm: str, interval: Interval) -> IntArray:
         """Make an arm's fingers what they sweep in ``interval``; returns a 1 for each body (g,) that has grown.

@@ -1,0 +1,134 @@
+"""Nothing that a caller hands the controller ends a tick with an exception, or a reset with any but the stated one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, Robot
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.types import SIDES
+from q2r2_control.verification.contract import Contract
+
+HOSTILE: dict[str, Any] = {
+    "a huge integer": 10**400,
+    "a huge negative integer": -(10**400),
+    "an integer too long to print": 10**5000,
+    "not a number": float("nan"),
+    "infinity": float("inf"),
+    "a complex number": 1j,
+    "a truth value": True,
+    "a text": "0.001",
+    "bytes": b"\x00",
+    "none": None,
+    "an object": object(),
+    "a ragged list": [[1.0], [2.0, 3.0]],
+    "a list of huge integers": [10**400] * 14,
+    "a list of texts": ["0"] * 14,
+    "numbers and none": [0.0] * 13 + [None],
+    "an empty array": np.zeros(0),
+    "a column": np.zeros((14, 1)),
+    "an array of objects": np.array([object()] * 14),
+    "an array of complex numbers": np.zeros(14, dtype=complex),
+    "an array with one that is no number": np.append(np.zeros(13), np.nan),
+    "a masked array": np.ma.masked_all(14),
+    "a pose of no numbers": pin.SE3(np.full((4, 4), np.nan)),
+    "a class": int,
+    "a mapping": {"left": 1.0},
+}
+
+
+@pytest.fixture(params=HOSTILE.values(), ids=list(HOSTILE))
+def hostile(request: pytest.FixtureRequest) -> Any:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def controller(robot: Robot) -> CartesianController:
+    return CartesianController(robot, ControllerSettings(moving_obstacles=("hand",)))
+
+
+@pytest.fixture
+def contract(robot: Robot, controller: CartesianController) -> Iterator[Contract]:
+    """A controller whose arms are on their way, and that goes on in the same way afterwards."""
+    controller.reset(robot.home)
+    contract = Contract(controller)
+    going_on(contract, controller)
+    yield contract
+    going_on(contract, controller)
+
+
+def going_on(contract: Contract, controller: CartesianController) -> None:
+    pose = controller.tool_pose("left")
+    for _ in range(20):
+        contract.check(controller.step({"left": pin.SE3(pose.rotation, pose.translation + 0.1)}, 0.002), 0.002)
+
+
+def test_no_time_ends_a_tick_with_an_exception(
+    contract: Contract, controller: CartesianController, hostile: Any
+) -> None:
+    contract.check(controller.step({}, hostile), 0.0)
+
+
+def test_no_target_ends_a_tick_with_an_exception(
+    contract: Contract, controller: CartesianController, hostile: Any
+) -> None:
+    for arm in SIDES:
+        contract.check(controller.step({arm: hostile}, 0.002), 0.002)
+
+
+def test_no_posture_ends_a_tick_with_an_exception(
+    contract: Contract, controller: CartesianController, hostile: Any
+) -> None:
+    contract.check(controller.step({}, 0.002, hostile), 0.002)
+
+
+def test_no_given_solution_ends_a_tick_with_an_exception(
+    contract: Contract, controller: CartesianController, hostile: Any
+) -> None:
+    contract.check(controller.advance(hostile, {}, 0.002), 0.002)
+
+
+def test_targets_that_are_no_mapping_are_refused_and_nothing_moves(
+    contract: Contract, controller: CartesianController, hostile: Any
+) -> None:
+    if not isinstance(hostile, Mapping):
+        with pytest.raises(RobotError, match="targets"):
+            controller.step(hostile, 0.002)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda controller, value: controller.reset(value),
+        lambda controller, value: controller.reset(np.zeros(14), value),
+        lambda controller, value: controller.hold_at(value),
+        lambda controller, value: controller.withdraw(value),
+        lambda controller, value: controller.change({"min_distance": value}),
+        lambda controller, value: controller.change({"position_gain": value}),
+        lambda controller, value: controller.tool_pose(value),
+        lambda controller, value: controller.set_opening(value, 0.0, 1.0),
+        lambda controller, value: controller.set_opening("left", value, 1.0),
+        lambda controller, value: controller.set_opening("left", 0.0, value),
+        lambda controller, value: controller.set_holding(value, True),
+        lambda controller, value: controller.move_obstacle(value, None),
+        lambda controller, value: controller.move_obstacle("hand", value),
+    ],
+    ids=["reset q", "reset v", "hold_at", "withdraw", "change distance", "change gain", "tool_pose", "opening arm",
+         "opening from", "opening to", "holding arm", "obstacle name", "obstacle"],
+)  # fmt: skip
+def test_other_calls_refuse_with_one_of_our_errors_and_the_next_tick_keeps_every_promise(
+    robot: Robot, controller: CartesianController, hostile: Any, call: Any
+) -> None:
+    controller.reset(robot.home)
+    with suppress(RobotError, ConfigError):
+        call(controller, hostile)
+    controller.reset(robot.home)
+    contract = Contract(controller)
+    contract.check(controller.step({}, 0.002), 0.002)
