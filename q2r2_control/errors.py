@@ -36,6 +36,15 @@ def shown(value: object, length: int = 60) -> str:
     return " ".join(repr(value).split())[:length]
 
 
+def raised(error: BaseException, length: int = 200) -> str:
+    """What a stranger's code raised, as one line: its kind, and what it says if it can be asked."""
+    try:
+        said = " ".join(str(error).split())[:length]
+    except Exception:
+        said = "it cannot be printed"
+    return f"{type(error).__name__}: {said}"
+
+
 def check_kind(
     name: str, value: object, kind: type | tuple[type, ...], allowed: str, error: type[Q2R2Error] = ConfigError
 ) -> None:

@@ -142,6 +142,12 @@ class ControllerSettings(StrictModel):
         """The same, for modes in which nothing gives way: there ``contact_allowed`` allows nothing."""
         return self.model_copy(update={"contact_allowed": ()}) if self.contact_allowed else self
 
+    def with_solver(self, name: str | None) -> ControllerSettings:
+        """The same with the solver called ``name``, whose own defaults hold if it is another one; None: as it is."""
+        if name is None or name == self.solver:
+            return self
+        return self.model_copy(update={"solver": name, "solver_options": {}})
+
     def changed(self, values: Mapping[str, Any]) -> ControllerSettings:
         """The same with other ``values`` of what is in ``LIVE``, by name.
 

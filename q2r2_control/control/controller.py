@@ -78,7 +78,7 @@ class CartesianController(WatchedPairs):
         settings = ControllerSettings() if settings is None else settings
         check_kind("settings", settings, ControllerSettings, "ControllerSettings, which a Config has as config.control")
         if isinstance(solver, str):
-            settings = settings.model_copy(update={"solver": solver})
+            settings = settings.with_solver(solver)
         elif solver is not None and not callable(getattr(solver, "solve", None)):
             raise ConfigError(f"solver = {shown(solver)}: allowed: a solver's name, a Solver, or None: control.solver")
         super().__init__(robot, settings)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver
-from q2r2_control.errors import shown
+from q2r2_control.errors import raised, shown
 
 _REAL = "fiu"  # kinds of dtype that are real numbers
 # Numbers of a problem that may be solved, and the least diagonal of its cost's Cholesky factor. Ours are near 1.
@@ -53,8 +53,10 @@ class Guard:
             self.failure = "no solution" if v is None else self._fault(v, solve_time)
             if self.failure is None:
                 return QpSolution(np.array(v, dtype=float), float(solve_time))
-        except Exception as error:  # whatever a stranger's code raises is one tick without a solution
-            self.failure = f"{type(error).__name__}: {shown(str(error), 200)}"
+        except (KeyboardInterrupt, SystemExit):  # of a signal's handler, which ends the program
+            raise
+        except BaseException as error:  # as a panic in Rust is; whatever it raises is one tick without a solution
+            self.failure = raised(error)
         return _FAILED
 
     def _fault(self, v: Any, solve_time: Any) -> str | None:

@@ -37,8 +37,7 @@ def make_solver(
         ConfigError: There is no such solver, it is not installed, or it does not take the ``options``.
     """
     given = dict(options or {})
-    if name not in OURS:
-        _check_installed(name)
+    check_installed(name)
     try:
         with _on_stderr():
             solver = _made(name, nv, time_limit, given)
@@ -84,7 +83,10 @@ def _on_stderr() -> Iterator[None]:
         os.close(stdout)
 
 
-def _check_installed(name: str) -> None:
+def check_installed(name: str) -> None:
+    """Raises :class:`ConfigError`, with what there is, unless a solver called ``name`` is installed."""
+    if name in OURS:
+        return
     import qpsolvers  # see _made
 
     if name not in qpsolvers.available_solvers:
