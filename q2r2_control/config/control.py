@@ -71,8 +71,10 @@ class ContactPair(StrictModel):
 class ControllerSettings(StrictModel):
     """Settings of :class:`CartesianController`; every range is checked when the object is made."""
 
-    solver: str = Field("daqp", description="of the QP; daqp, osqp, or any other that qpsolvers finds installed")
-    solver_options: dict[str, Any] = Field({}, description="keyword arguments of that solver")
+    solver: str = Field(
+        "daqp", description="of the QP; daqp, osqp, or any other that qpsolvers finds installed; --solver NAME instead"
+    )
+    solver_options: dict[str, Any] = Field({}, description="keyword arguments of that solver, and of no other")
     solve_time_limit: float | None = Field(
         None, gt=0, le=0.1, description="a later solution counts as failed [s]; none: runs do not depend on the clock"
     )
