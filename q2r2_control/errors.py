@@ -37,7 +37,7 @@ def shown(value: object, length: int = 60) -> str:
 
 
 def raised(error: BaseException, length: int = 200) -> str:
-    """What a stranger's code raised, as one line: its kind, and what it says if it can be asked."""
+    """One line about an exception of a stranger's code: its kind, and its text, where that can be printed."""
     try:
         said = " ".join(str(error).split())[:length]
     except Exception:

@@ -7,8 +7,8 @@ a unit ball, and with rows a_i L^-T of unit norm the slack of each has one and t
     subject to  D lower <= D L^-T w <= D upper,    a_i L^-T w / n_i + sqrt(SOFTNESS) t_i >= lower_i / n_i
 
 with n_i = |L^-1 a_i|, and D, which makes the rows of the box unit rows as well. A slack that is below 0 costs as much
-as one above, so t >= 0 need not be said. The pattern is dense and fixed for a number of rows, of which unused ones
-bound nothing. That number doubles when a tick has more rows: only then OSQP is set up anew.
+as one above, so t >= 0 need not be said. The pattern is dense and fixed for 16, 32, 48, ... rows, of which unused ones
+bound nothing. Each of these is set up once, at the first tick that needs it, and warm-started from then on.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import scipy.sparse
 from q2r2_control.control.qp import SOFTNESS, QpProblem, QpSolution
 from q2r2_control.types import Array
 
-_ROWS_STEP = 16
+_ROWS_STEP = 16  # from one number of rows that OSQP is set up for to the next
 # adaptive_rho_interval counts iterations: by the clock, as it may be, a run would not be repeatable.
 _DEFAULTS: dict[str, Any] = {
     "eps_abs": 1e-5,
@@ -70,12 +70,12 @@ class _SizedOsqp:
 
     def __init__(self, nv: int, capacity: int, options: dict[str, Any]) -> None:
         self._nv = nv
-        self._matrix = np.zeros((nv + capacity, nv), order="F")
         # All entries of the columns of w, also zeros, then one entry in each column of t.
-        pattern = scipy.sparse.csc_matrix(np.hstack([np.ones_like(self._matrix), np.eye(nv + capacity)[:, nv:]]))
-        pattern.data[self._matrix.size :] = math.sqrt(SOFTNESS)
+        pattern = scipy.sparse.csc_matrix(np.hstack([np.ones((nv + capacity, nv)), np.eye(nv + capacity)[:, nv:]]))
         self._entries = pattern.data.copy()
-        self._matrix = self._entries[: self._matrix.size].reshape(self._matrix.shape, order="F")  # shares memory
+        self._matrix = self._entries[: (nv + capacity) * nv].reshape((nv + capacity, nv), order="F")  # shares memory
+        self._slacks = self._entries[self._matrix.size :]  # the same
+        self._slacks[:] = pattern.data[self._matrix.size :] = math.sqrt(SOFTNESS)
         self._lower, self._upper = np.full(nv + capacity, -np.inf), np.full(nv + capacity, np.inf)
         self._cost = np.zeros(nv + capacity)
         self._solver = osqp.OSQP()
@@ -84,7 +84,7 @@ class _SizedOsqp:
         self._cold = np.zeros(nv + capacity)
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """The solution of a problem that has a bound to keep; see :meth:`OsqpSolver.solve`."""
+        """Solve a problem in which a bound holds the cost's minimum back; see :meth:`OsqpSolver.solve`."""
         inverse = _inverse_factor(problem.H)
         self._write(problem, inverse)
         answer = self._solver.solve(raise_error=False)
@@ -107,14 +107,13 @@ class _SizedOsqp:
         self._upper[:nv] = problem.upper / norms[:nv]
         self._lower[nv : nv + m] = problem.rows_lower / norms[nv:]
         self._cost[:nv] = inverse @ problem.g
-        slacks = self._entries[self._matrix.size :]
-        slacks[:] = math.sqrt(SOFTNESS)
-        slacks[m - problem.hard : m] = 0.0  # a hard row has none
+        self._slacks[:] = math.sqrt(SOFTNESS)
+        self._slacks[m - problem.hard : m] = 0.0  # a hard row has none
         self._solver.update(q=self._cost, l=self._lower, u=self._upper, Ax=self._entries)
 
 
 def _inverse_factor(H: Array) -> Array:
-    """L^-1 of H = L L' (nv, nv). These two routines keep to one thread, which others do not on any matrix."""
+    """L^-1 of H = L L' (nv, nv). Other BLAS routines start a thread for each core even for so small a matrix."""
     factor, failed = scipy.linalg.lapack.dpotrf(H, lower=True)
     if failed:
         raise np.linalg.LinAlgError("H is not positive definite")

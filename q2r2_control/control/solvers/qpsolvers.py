@@ -65,7 +65,7 @@ class QpSolversSolver:
     def __init__(self, name: str, **options: Any) -> None:
         self._name, self._options = name, _DEFAULTS.get(name, {}) | options
         self._sparse = name not in qpsolvers.dense_solvers
-        # At each problem that is not solved they would print a line. Our report says as much.
+        # The wrappers warn at each problem that is not solved. The report of the step says so already.
         warnings.filterwarnings("ignore", module=r"qpsolvers\.solvers\.")
 
     def solve(self, problem: QpProblem) -> QpSolution:
@@ -77,7 +77,8 @@ class QpSolversSolver:
             return QpSolution(problem.minimum, 0.0)
         made = slack_problem(problem, self._sparse)
         if made.h is not None:
-            # Solvers print a warning at numbers that they take as infinite. Rows that the box keeps stay as kept.
+            # Solvers print a warning at a number that they take as infinite. A row that the box keeps is kept as well
+            # with a bound just beyond what the box allows.
             fastest = np.maximum(np.abs(problem.lower), np.abs(problem.upper))
             made.h = np.minimum(made.h, np.abs(problem.rows) @ fastest + 1.0)
         solution = qpsolvers.solve_problem(made, self._name, **self._options)

@@ -31,7 +31,7 @@ FAR_M = 2e-3  # that first-order solvers lead a tool from where DAQP does
 
 @contextmanager
 def silence(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
-    """What is printed in the block, by libraries too, and what is warned of fails the test."""
+    """Fail if something is printed in the block, also by a library, or warned of."""
     capfd.readouterr()  # of solvers as they are made: HiGHS says on stderr that it is there, once
     with warnings.catch_warnings():
         warnings.simplefilter("error")
