@@ -354,7 +354,9 @@ class CartesianController(WatchedPairs):
     def _move_as_permitted(self, solved: bool, h: float, share: float, summary: StepSummary) -> tuple[int, float]:
         """Move where the hard constraints permit it, and along the stop elsewhere.
 
-        A solution that the certificate has moved towards the stop is looked at once more, and undone if need be.
+        A solution that the certificate has moved towards the stop is looked at once more, and undone if need be. Then
+        posture, velocity and the stop at hand are those before the step, and the stop reads nothing else. It is
+        therefore the one that was certified before.
         """
         own, problem, state = self._qp.constraints, self._qp.problem, self._state
         usable = solved and own.permit(np.clip(self._solution, problem.lower, problem.upper))
