@@ -40,6 +40,15 @@ def shown(value: object, length: int = 60) -> str:
     return " ".join(text.split())[:length]
 
 
+def raised(error: BaseException, length: int = 200) -> str:
+    """One line about an exception of a stranger's code: its kind, and its text, where that can be printed."""
+    try:
+        said = " ".join(str(error).split())[:length]
+    except Exception:
+        said = "it cannot be printed"
+    return f"{type(error).__name__}: {said}"
+
+
 def check_kind(
     name: str, value: object, kind: type | tuple[type, ...], allowed: str, error: type[Q2R2Error] = ConfigError
 ) -> None:

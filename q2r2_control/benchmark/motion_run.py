@@ -42,15 +42,19 @@ class OwnController:
     def __init__(self, robot: Robot, config: Config, name: str = "q2r2_control") -> None:
         self.name = name
         self._controller = CartesianController(robot, config.control.model_copy(update={"solve_time_limit": None}))
-        self.stopped: list[bool] = []  # of each tick since the reset: whether the certified stop was executed
+        # Of each tick since the reset: whether the certified stop was executed, and whether some QP was not solved.
+        self.stopped: list[bool] = []
+        self.unsolved: list[bool] = []
 
     def reset(self, q: Array) -> None:
         self._controller.reset(q)
         self.stopped.clear()
+        self.unsolved.clear()
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
         reference = self._controller.step(targets, dt)
         self.stopped.append(reference.report.fallback)
+        self.unsolved.append(reference.report.unsolved > 0)
         return reference.q, reference.v
 
     def hold(self) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Annotated
 
 from rich.table import Table
@@ -12,8 +13,17 @@ from typer import Exit, Option
 
 from q2r2_control.benchmark.motion_run import PATIENCE, BenchReport, BenchRow, MotionFigures, run_bench
 from q2r2_control.benchmark.peers.base import PEERS, WITHOUT_ACCELERATION_LIMIT
+from q2r2_control.benchmark.solver_run import INSTALL, SOLVERS, SolverReport, run_solvers
 from q2r2_control.benchmark.work_motions import TIMED_MOTIONS, WORK_MOTIONS, motions_named
-from q2r2_control.cli.output import DEMO_CONFIG, Json, notice_of_compiling, print_progress, print_report
+from q2r2_control.cli.output import (
+    DEMO_CONFIG,
+    Json,
+    Solver,
+    notice_of_compiling,
+    print_progress,
+    print_report,
+    with_solver,
+)
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.verification.fault_injection import FINGERS, with_contact
@@ -34,6 +44,10 @@ _NOTES = (
     f"gave up: took more than {PATIENCE:g} times the motion's own time; figures are of the share that was done",
     "peers get their targets ahead by speed / gain, since they have no feed-forward",
 )
+_SOLVER_NOTES = (
+    "unsolved: ticks without a solution, in which the certified stop was executed",
+    "off DAQP's: largest distance of a tool from where DAQP leads it; near, rest: as above",
+)
 
 
 def bench(
@@ -41,19 +55,24 @@ def bench(
     peers: Annotated[bool, Option(help="Measure roboplan, mink and pink too, where they are installed.")] = True,
     work: Annotated[bool, Option("--work", help="Two-armed work motions instead of circle and contact.")] = False,
     motion: Annotated[list[str] | None, Option(help="With --work: only this, or such as begin so; repeatable.")] = None,
+    solver: Solver = None,
     json: Json = False,
 ) -> None:
     """Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.
 
-    Also measured are errors, distances, rest and certified stops, beside ours in free air.
+    Also measured are errors, distances, rest and certified stops, beside ours in free air. Without --work a second
+    table has the contact motion with each QP solver that is installed; with --solver, with DAQP and that one.
     """
     if motion and not work:
         raise ConfigError("--motion needs --work")
     motions = motions_named(motion or WORK_MOTIONS) if work else TIMED_MOTIONS
     names = tuple(PEERS) if peers else ()
+    config = with_solver(load_config(DEMO_CONFIG), solver)
     with notice_of_compiling():
-        report = run_bench(load_config(DEMO_CONFIG), motions, names, rounds or (1 if work else _ROUNDS), print_progress)
-    print_report(report, (bench_table(report),), json)
+        report = run_bench(config, motions, names, rounds or (1 if work else _ROUNDS), print_progress)
+    solvers = None if work else run_solvers(config, SOLVERS if solver is None else (solver,), print_progress)
+    tables = (bench_table(report), *(() if solvers is None else (solver_table(solvers),)))
+    print_report({**asdict(report), "solvers": solvers}, tables, json)
 
 
 def bench_table(report: BenchReport) -> Table:
@@ -66,6 +85,26 @@ def bench_table(report: BenchReport) -> Table:
         ),
         _bench_rows(report),
         [*(f"{row.motion}: {row.about}" for row in report.rows), *_NOTES, *report.notes],
+    )
+
+
+def solver_table(report: SolverReport) -> Table:
+    """A row for each solver."""
+    return figure_table(
+        f"{report.cell}: {report.motion}, ticks of {1e3 * report.dt:g} ms, by QP solver",
+        ("solver", "p50 [us]", "p99 [us]", "unsolved [%]", "off DAQP's [mm]", "near [mm]", "rest [s-2]"),
+        (
+            (
+                f"{found.solver}{'' if found.motion.done == 1.0 else f' ({100.0 * found.motion.done:.0f} % done)'}",
+                *(found.motion.times_us or (None, None))[:2],
+                found.unsolved_percent,
+                found.off_daqp_mm,
+                found.motion.min_distance_mm,
+                found.motion.rest_acceleration,
+            )
+            for found in report.figures
+        ),
+        [*_SOLVER_NOTES, *([f"not installed: {', '.join(report.missing)}; {INSTALL}"] if report.missing else ())],
     )
 
 
@@ -103,13 +142,15 @@ def soak(
         bool, Option("--policy", help="Hostile actions of a policy, through the whole pipeline.")
     ] = False,
     seed: Annotated[int, Option(min=0, help="Of all that is drawn at random.")] = 0,
+    solver: Solver = None,
     json: Json = False,
 ) -> None:
     """Check every promise of the controller in random hostile targets, ticks, starts and solver failures.
 
+    A healthy solver, as --solver names it, is asked at the other ticks.
     Prints the worst margin of each promise. Exit 1 if one was broken.
     """
-    config = load_config(DEMO_CONFIG)
+    config = with_solver(load_config(DEMO_CONFIG), solver)
     config = with_contact(config, FINGERS) if contact else config
     with notice_of_compiling():
         if policy:
@@ -117,10 +158,15 @@ def soak(
         else:
             report = run_soak(config, ticks, seed, print_progress)
     table = figure_table(
-        f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, seed {report.seed}",
+        f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, seed {report.seed}, {report.solver}",
         ("promise", "worst", "allowed", "checked", "broken"),
         _soak_rows(report),
-        list(_soak_notes(report, f"{'--policy ' * policy}{'--contact ' * contact}")),
+        list(
+            _soak_notes(
+                report,
+                f"{'--policy ' * policy}{'--contact ' * contact}{'' if solver is None else f'--solver {solver} '}",
+            )
+        ),
     )
     print_report(report.as_json(), (table,), json)
     raise Exit(0 if report.passed else 1)

@@ -16,7 +16,9 @@ from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
 
+from q2r2_control.config.cell import Config
 from q2r2_control.control.jit import compiling
+from q2r2_control.control.solvers.registry import check_installed
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import ReasonKind
@@ -39,12 +41,22 @@ WebHost = Annotated[str, Option(metavar="HOST", help="Address of the page; beyon
 WebPort = Annotated[int, Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0: any free one.")]
 Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
 Task = Annotated[str | None, Option(help="With --record: what is done, noted in the recording.")]
+Solver = Annotated[
+    str | None, Option(metavar="NAME", help="Of the QP, not control.solver: daqp, osqp, or another that is installed.")
+]
 Operator = Annotated[str | None, Option(help="With --record: whose hands, noted as well.")]
 
 
 def as_json_text(value: Any) -> str:
     """``value`` as strict JSON: dataclasses and mappings as objects, arrays as lists, what is not finite as null."""
     return to_json(value, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode()
+
+
+def with_solver(config: Config, name: str | None) -> Config:
+    """The cell with the QP solver called ``name``; None: with its own. Raises :class:`ConfigError` without one."""
+    if name is not None:
+        check_installed(name)
+    return config.model_copy(update={"control": config.control.with_solver(name)})
 
 
 def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:

@@ -23,6 +23,7 @@ from q2r2_control.cli.output import (
     Json,
     Operator,
     RealTime,
+    Solver,
     Task,
     WebHost,
     WebPort,
@@ -33,6 +34,7 @@ from q2r2_control.cli.output import (
     print_progress,
     print_report,
     say,
+    with_solver,
 )
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
@@ -85,6 +87,7 @@ def run(
     seed: Seed = 0,
     policy: Annotated[str | None, Option(metavar="MODULE:NAME", help="With --input policy: what drives.")] = None,
     takeover: Annotated[str | None, Option(metavar="NAME", help="The same: an input whose hands take over.")] = None,
+    solver: Solver = None,
     host: Host = None,
     port: Port = None,
     usb: Usb = False,
@@ -112,7 +115,7 @@ def run(
     engages it, and where measured links met in torque mode.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
-    cell = load_config(config)
+    cell = with_solver(load_config(config), solver)
     if (plant or cell.plant) == "fri" and not i_know and (why := not_commissioned(cell, find_resource(config))):
         raise ConfigError(f"{config}: {why}; q2r2 commission {config} commissions it; --i-know runs it all the same")
     if (plant or cell.plant) == "fri" and not full_speed and has_real_cabinets(cell):
@@ -186,6 +189,7 @@ def demo(
     ] = None,
     record: Record = None,
     rt: RealTime = False,
+    solver: Solver = None,
     json: Json = False,
 ) -> None:
     """Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted hands.
@@ -208,7 +212,7 @@ def demo(
         unfit |= {"--duration": duration is not None, "--seed": seed != 0}
         if refused := [option for option, given in unfit.items() if given]:
             raise ConfigError(f"{refused[0]} cannot be used with --seeds")
-        _try_tasks(chosen, mode, seeds, shaky, json)
+        _try_tasks(chosen, mode, seeds, shaky, solver, json)
         return
     trajectory = "+".join(task.name for task in chosen)
     work = trajectory_named(trajectory)
@@ -238,18 +242,21 @@ def demo(
     )
     if plant == "fri":
         with rehearsal(_FRI_CONFIG, mode, chosen, period, rt) as results:
-            done = run_cell(with_controls(load_config(_FRI_CONFIG)), options)
+            done = run_cell(with_solver(with_controls(load_config(_FRI_CONFIG)), solver), options)
         done = replace(done, tasks=held_to_promises(results, done.summary))
     else:
-        done = run_cell(with_controls(load_config(DEMO_CONFIG)), options)
+        done = run_cell(with_solver(with_controls(load_config(DEMO_CONFIG)), solver), options)
     print_summary(done, json)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)
 
 
-def _try_tasks(tasks: tuple[AssemblyTask, ...], mode: CommandMode, seeds: int, shaky: bool, json: bool) -> None:
+def _try_tasks(
+    tasks: tuple[AssemblyTask, ...], mode: CommandMode, seeds: int, shaky: bool, solver: str | None, json: bool
+) -> None:
     with notice_of_compiling():
-        reports = try_tasks(load_config(DEMO_CONFIG), tasks, mode, seeds, shaky, print_progress)
+        config = with_solver(load_config(DEMO_CONFIG), solver)
+        reports = try_tasks(config, tasks, mode, seeds, shaky, print_progress)
     if json:
         print(as_json_text(reports))
     for report in () if json else reports:

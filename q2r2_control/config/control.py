@@ -71,8 +71,10 @@ class ContactPair(StrictModel):
 class ControllerSettings(StrictModel):
     """Settings of :class:`CartesianController`; every range is checked when the object is made."""
 
-    solver: str = Field("daqp", description="of the QP; daqp, osqp, or any other that qpsolvers finds installed")
-    solver_options: dict[str, Any] = Field({}, description="keyword arguments of that solver")
+    solver: str = Field(
+        "daqp", description="of the QP; daqp, osqp, or any other that qpsolvers finds installed; --solver NAME instead"
+    )
+    solver_options: dict[str, Any] = Field({}, description="keyword arguments of that solver, and of no other")
     solve_time_limit: float | None = Field(
         None, gt=0, le=0.1, description="a later solution counts as failed [s]; none: runs do not depend on the clock"
     )
@@ -141,6 +143,12 @@ class ControllerSettings(StrictModel):
     def without_contact(self) -> ControllerSettings:
         """The same, for modes in which nothing gives way: there ``contact_allowed`` allows nothing."""
         return self.model_copy(update={"contact_allowed": ()}) if self.contact_allowed else self
+
+    def with_solver(self, name: str | None) -> ControllerSettings:
+        """The same with the solver called ``name``, whose own defaults hold if it is another one; None: as it is."""
+        if name is None or name == self.solver:
+            return self
+        return self.model_copy(update={"solver": name, "solver_options": {}})
 
     def changed(self, values: Mapping[str, Any]) -> ControllerSettings:
         """The same with other ``values`` of what is in ``LIVE``, by name.

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from q2r2_control.errors import raised
 from q2r2_control.types import Array
 
 Answer = tuple[Array, Array]
@@ -32,7 +33,7 @@ def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array) -> Answ
             return f"returned {type(answer).__name__}; allowed: a matrix and a vector"
         matrix, vector = (np.asarray(part, dtype=np.float64) for part in answer)
     except Exception as error:
-        return f"raised {type(error).__name__}: {' '.join(str(error).split())[:_LENGTH]}"
+        return f"raised {raised(error, _LENGTH)}"
     nv = len(q)
     if matrix.ndim != 2 or matrix.shape[1] != nv or vector.shape != matrix.shape[:1]:
         return f"returned shapes {matrix.shape} and {vector.shape}; allowed: (k, {nv}) and (k,)"

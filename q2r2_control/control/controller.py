@@ -79,7 +79,7 @@ class CartesianController(WatchedPairs):
         settings = ControllerSettings() if settings is None else settings
         check_kind("settings", settings, ControllerSettings, "ControllerSettings, which a Config has as config.control")
         if isinstance(solver, str):
-            settings = settings.model_copy(update={"solver": solver})
+            settings = settings.with_solver(solver)
         elif solver is not None and not callable(getattr(solver, "solve", None)):
             raise ConfigError(f"solver = {shown(solver)}: allowed: a solver's name, a Solver, or None: control.solver")
         super().__init__(robot, settings)
@@ -361,7 +361,9 @@ class CartesianController(WatchedPairs):
     def _move_as_permitted(self, solved: bool, h: float, share: float, summary: StepSummary) -> tuple[int, float]:
         """Move where the hard constraints permit it, and along the stop elsewhere.
 
-        A solution that the certificate has moved towards the stop is looked at once more, and undone if need be.
+        A solution that the certificate has moved towards the stop is looked at once more, and undone if need be. Then
+        posture, velocity and the stop at hand are those before the step, and the stop reads nothing else. It is
+        therefore the one that was certified before.
         """
         own, problem, state = self._qp.constraints, self._qp.problem, self._state
         usable = solved and own.permit(np.clip(self._solution, problem.lower, problem.upper))

@@ -175,6 +175,7 @@ class PolicySoak:
         finally:
             log.disabled = False
         return SoakReport(
+            solver=self._pipeline.config.control.solver,
             cell=self._cell,
             seed=self._seed,
             ticks=self._ticks,

@@ -15,7 +15,9 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.solvers.daqp import DaqpSolver
+from q2r2_control.control.qp import Solver
+from q2r2_control.control.solvers.guard import Guard
+from q2r2_control.control.solvers.registry import DAQP, solver_of
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -38,6 +40,7 @@ COUNTED = {
     "attacks": "ticks with a solver that works against the arms",
     "fallbacks": "certified stops executed",
     "fallbacks_healthy": "of these with a healthy solver",
+    "unsolved": "ticks that a healthy solver left unsolved",
     "openings": "openings of grippers",
     "openings_refused": "of these refused",
     "grasps": "grasps and releases",
@@ -67,6 +70,7 @@ class SoakReport:
     """Results of a soak."""
 
     cell: str
+    solver: str
     seed: int
     ticks: int
     simulated_s: float
@@ -87,23 +91,34 @@ class SoakReport:
         return data | data.pop("counts") | {"passed": self.passed}
 
 
-def run_soak(config: Config, ticks: int, seed: int, progress: Callable[[str], None] = lambda what: None) -> SoakReport:
-    """Soak the controller of a cell."""
+def run_soak(
+    config: Config,
+    ticks: int,
+    seed: int,
+    progress: Callable[[str], None] = lambda what: None,
+    solver: Solver | None = None,
+) -> SoakReport:
+    """Soak the controller of a cell; at ticks without a made-up fault the cell's solver, or ``solver``, is asked."""
     robot = Robot.from_config(config)
     settings = config.control.model_copy(update={"solve_time_limit": config.control.solve_time_limit or 0.005})
     # The solver gets no time limit: a soak that finds something has to find it again.
-    inner = DaqpSolver(robot.model.nv)
+    untimed = config.control.model_copy(update={"solve_time_limit": None})
+    inner = solver_of(untimed, robot.model.nv) if solver is None else Guard(solver, robot.model.nv)
+    name = config.control.solver if solver is None else type(solver).__name__
     worst = WorstSolver(robot, np.random.default_rng([seed, 6]))
-    solver = FaultySolver(inner, np.random.default_rng([seed, 1]), worst)
-    controller = CartesianController(robot, settings, solver=solver)
-    return Soak(config.name, controller, solver, seed).run(ticks, progress)
+    faulty = FaultySolver(inner, np.random.default_rng([seed, 1]), worst)
+    controller = CartesianController(robot, settings, solver=faulty)
+    return Soak(config.name, controller, faulty, seed, name).run(ticks, progress)
 
 
 class Soak:
     """Drives a controller through random segments and has every tick checked."""
 
-    def __init__(self, cell: str, controller: CartesianController, solver: FaultySolver, seed: int) -> None:
+    def __init__(
+        self, cell: str, controller: CartesianController, solver: FaultySolver, seed: int, solver_name: str = DAQP
+    ) -> None:
         self._cell, self._controller, self._solver, self._seed = cell, controller, solver, seed
+        self._solver_name = solver_name
         self._hostile = HostileChanges(controller, seed)
         self._contract = Contract(controller, random=np.random.default_rng([seed, 2]))
         self._broken: dict[str, Violation] = {}
@@ -122,6 +137,7 @@ class Soak:
         after = _memory_mb()
         return SoakReport(
             cell=self._cell,
+            solver=self._solver_name,
             seed=self._seed,
             ticks=ticks,
             simulated_s=self._simulated,
@@ -175,6 +191,7 @@ class Soak:
         self._counts["attacks"] += fault in ATTACKS
         self._counts["fallbacks"] += reference.report.fallback
         self._counts["fallbacks_healthy"] += reference.report.fallback and fault is None
+        self._counts["unsolved"] += reference.report.unsolved > 0 and fault is None
 
     def _change_cell(self) -> None:
         """Openings of grippers, grasps and settings change as they like."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.errors import ConfigError
 from q2r2_control.verification.soak import SoakReport, run_soak
 from tests.cli.command import CELL, FAST, changed_cell, external_cell, one_object, q2r2
 
@@ -47,6 +49,10 @@ from tests.cli.command import CELL, FAST, changed_cell, external_cell, one_objec
         (("check", "pyproject.toml"), "pyproject.toml"),
         (("bench", "--work", "--motion", "dance"), "motion 'dance': allowed: carry-"),
         (("bench", "--motion", "meet"), "needs --work"),
+        *(
+            ((*command, "--solver", "simplex"), "control.solver = 'simplex': installed: clarabel, daqp")
+            for command in (("run", CELL), ("demo",), ("bench",), ("soak",))
+        ),
         (("soak", "--ticks", "99"), "'--ticks'"),
         (("soak", "--seed", "-1"), "'--seed'"),
     ],
@@ -108,10 +114,44 @@ def test_the_demo_says_of_a_task_that_did_not_succeed_why_and_so_does_its_exit_c
 
 @pytest.mark.slow
 def test_bench_times_free_motion_and_contact_or_the_work_motions_that_are_asked_for() -> None:
-    result = q2r2("bench", "--no-peers", "--rounds", "1")
+    result = q2r2("bench", "--no-peers", "--rounds", "1", "--solver", "osqp")
     assert all(text in result.stdout for text in ("free motion", "contact (!)", "q2r2_control", "p99"))
+    assert all(text in result.stdout for text in ("by QP solver", "daqp", "osqp", "unsolved"))
     report = one_object(q2r2("bench", "--work", "--no-peers", "--rounds", "1", "--motion", "reach", "--json").stdout)
     assert [row["motion"] for row in report["rows"]] == ["reach-under"]
+    assert report["solvers"] is None
+
+
+@pytest.mark.parametrize("command", [("run", CELL), ("demo",), ("demo", "--plant", "fri")], ids=" ".join)
+def test_a_run_gets_the_solver_of_its_option(command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[str] = []
+
+    def run_cell(config: Config, options: Any) -> Any:
+        chosen.append(config.control.solver)
+        raise ConfigError("seen")
+
+    monkeypatch.setattr("q2r2_control.cli.run.run_cell", run_cell)
+    monkeypatch.setattr("q2r2_control.cli.run.rehearsal", lambda *given: nullcontext([]))
+    for option in ((), ("--solver", "osqp")):
+        assert "seen" in q2r2(*command, *option).stderr
+    assert chosen == ["daqp", "osqp"]
+
+
+def test_trials_of_a_demo_get_the_solver_of_its_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[str] = []
+
+    def try_tasks(config: Config, *given: Any) -> list[Any]:
+        chosen.append(config.control.solver)
+        return []
+
+    monkeypatch.setattr("q2r2_control.cli.run.try_tasks", try_tasks)
+    assert q2r2("demo", "grasp", "--seeds", "1", "--solver", "osqp").exit_code == 0
+    assert chosen == ["osqp"]
+
+
+def test_a_soak_asks_the_solver_of_its_option_and_says_so() -> None:
+    report = one_object(q2r2("soak", "--ticks", "100", "--solver", "osqp", "--json").stdout)
+    assert (report["solver"], report["passed"]) == ("osqp", True)
 
 
 def test_a_soak_prints_every_promise_and_ends_in_0_when_all_were_kept() -> None:

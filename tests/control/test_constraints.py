@@ -11,6 +11,8 @@ import pytest
 import qpsolvers
 
 from q2r2_control import CartesianController, ConfigError, Robot
+from q2r2_control.control.qp import QpProblem
+from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.types import Array, LimitKind
 from q2r2_control.verification.contract import Contract
 from tests.control.test_problem import DT, crossing, solved_by
@@ -42,8 +44,18 @@ def raising(nv: int) -> Any:
     raise RuntimeError("two\nlines")
 
 
+class UnprintableError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("nor this")
+
+
+def unprintable(nv: int) -> Any:
+    raise UnprintableError
+
+
 NONSENSE: dict[str, Callable[[int], Any]] = {
     "an exception": raising,
+    "an exception that cannot be printed": unprintable,
     "None": lambda nv: None,
     "one array": lambda nv: np.zeros((1, nv)),
     "another width": lambda nv: (np.zeros((1, nv + 1)), np.zeros(1)),
@@ -128,6 +140,52 @@ def test_a_given_solution_that_breaks_a_hard_row_is_not_executed(robot: Robot) -
         x[3] = 0.01
         report = controller.advance(x, targets, DT).report
         assert report.fallback
+
+
+class NoLess:
+    """The next velocities are to be as fast along ``along`` as was told last."""
+
+    hard = True
+    along: Array | None = None
+
+    def rows(self, q: Array, v: Array) -> tuple[Array, Array]:
+        if self.along is None:
+            return np.zeros((0, len(q))), np.zeros(0)
+        return self.along[None, :], np.array([self.along @ self.along])
+
+
+def test_a_certified_part_of_a_solution_that_breaks_a_hard_row_gives_way_to_the_stop_to_the_bit(robot: Robot) -> None:
+    """Solutions that know no pair: the certificate takes a part of each, which is slower than the row allows."""
+    constraints = NoLess(), NoLess()
+    one, other = (CartesianController(robot, constraints=[constraint]) for constraint in constraints)
+    daqp, contract, stops, follows = DaqpSolver(robot.model.nv), Contract(one), 0, 0
+    nv = robot.model.nv
+    for tick in range(500):
+        targets = crossing(robot, tick)
+        problem = one.problem(targets, DT)
+        assert problem.lb is not None
+        assert problem.ub is not None
+        H, box = np.ascontiguousarray(problem.P[:nv, :nv]), (problem.lb[:nv], problem.ub[:nv])
+        x = daqp.solve(QpProblem(H, problem.q[:nv], *box, np.empty((0, nv)), np.empty(0))).v
+        assert x is not None
+        for constraint in constraints:
+            constraint.along = x
+        reference = one.advance(x, targets, DT)
+        contract.check(reference, DT)
+        stopped = reference.report.fallback
+        expected = other.advance(None if stopped else x, targets, DT)
+        for found, wanted in zip(
+            (reference.q, reference.v, reference.a, one.stop_deceleration),
+            (expected.q, expected.v, expected.a, other.stop_deceleration),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(found, wanted)
+        assert reference.report.certified == expected.report.certified
+        assert reference.report.closest_distance == expected.report.closest_distance
+        assert reference.report.binding == expected.report.binding
+        stops, follows = stops + stopped, follows + (not stopped)
+    assert stops > 50
+    assert follows > 50
 
 
 @pytest.mark.parametrize("name", [name for name in ("clarabel", "quadprog") if name in qpsolvers.available_solvers])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -9,15 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import qpsolvers
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.qp import QpProblem, QpSolution
 from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Reference
-from q2r2_control.verification.fault_injection import FINGERS, FaultySolver, with_contact
+from q2r2_control.types import Array, Reference
+from q2r2_control.verification.fault_injection import FINGERS, FaultySolver, WorstSolver, with_contact
 from q2r2_control.verification.soak import Soak, SoakReport, run_soak
 from tests.support.object_cell import cell
 
@@ -89,6 +92,116 @@ def test_three_thousand_hostile_ticks_break_no_promise(config: Config, seed: int
     assert report.passed
     counts = report.counts | {margin.name: margin.checked for margin in report.margins}
     assert all(counts[name] > count for name, count in least.items())
+
+
+@pytest.mark.parametrize("name", ["osqp", "quadprog"])
+def test_hostile_ticks_with_another_solver_break_no_promise(name: str) -> None:
+    if name not in ("osqp", *qpsolvers.available_solvers):
+        pytest.skip(f"{name} is not installed")
+    config = CONFIG.model_copy(update={"control": SETTINGS.with_solver(name)})
+    report = run_soak(config, 1500, 4)
+    assert report.passed, report.broken
+    assert report.solver == name
+    assert report.counts["unsolved"] < 0.01 * report.ticks
+
+
+class Garbage:
+    """Of each kind of answer one, in turns, from no answer at all to numbers that look like one."""
+
+    def __init__(self) -> None:
+        self.random, self.asked = np.random.default_rng(1), 0
+
+    def solve(self, problem: QpProblem) -> Any:
+        self.asked += 1
+        nv = len(problem.g)
+        return (
+            lambda: QpSolution(self.random.normal(size=nv) * 10.0 ** self.random.uniform(-3.0, 12.0), 0.0),
+            lambda: QpSolution(np.where(self.random.random(nv) < 0.5, problem.lower, problem.upper), 0.0),
+            lambda: QpSolution(np.full(nv, np.nan), 0.0),
+            lambda: QpSolution(np.zeros((nv, nv)), 0.0),
+            lambda: QpSolution(np.zeros(nv), float("nan")),
+            lambda: QpSolution(None, 0.0),
+            lambda: None,
+            lambda: 1 / 0,
+            lambda: self._writing(problem),
+            lambda: self._late(problem),
+        )[int(self.random.integers(10))]()
+
+    def _writing(self, problem: QpProblem) -> QpSolution:
+        for array in (problem.H, problem.g, problem.lower, problem.upper, problem.rows, problem.rows_lower):
+            array[...] = 1e9
+        return QpSolution(problem.upper, 0.0)
+
+    def _late(self, problem: QpProblem) -> QpSolution:
+        time.sleep(0.002)
+        return QpSolution(problem.upper, 0.002)
+
+
+def test_hostile_ticks_with_a_solver_that_returns_garbage_break_no_promise() -> None:
+    solver = Garbage()
+    report = run_soak(CONFIG, 2000, 8, solver=solver)
+    assert report.passed, report.broken
+    assert report.solver == "Garbage"
+    assert solver.asked > 500
+    assert report.counts["unsolved"] > 200
+
+
+class Impossible:
+    """Asks for joint speeds that no acceleration limit allows."""
+
+    hard = True
+
+    def rows(self, q: Array, v: Array) -> Any:
+        return np.eye(len(q)), np.full(len(q), 50.0)
+
+
+class Flipping:
+    """Each tick asks for the opposite: the first joint is to turn this way, then that way."""
+
+    hard = True
+
+    def __init__(self) -> None:
+        self.sign, self.random = 1.0, np.random.default_rng(2)
+
+    def rows(self, q: Array, v: Array) -> Any:
+        self.sign = -self.sign
+        return self.sign * np.eye(len(q))[:3], np.full(3, float(self.random.uniform(-0.2, 0.05)))
+
+
+class Moody:
+    """Mostly harmless rows, and at random no rows at all: NaN, another shape, an exception."""
+
+    hard = True
+
+    def __init__(self) -> None:
+        self.random, self.asked = np.random.default_rng(3), 0
+
+    def rows(self, q: Array, v: Array) -> Any:
+        self.asked += 1
+        usual = (-np.sign(v + 1e-300)[None, :], np.array([-3.0]))  # joints may not all be fast
+        if self.asked < 50 or self.random.random() < 0.7:
+            return usual
+        kind = int(self.random.integers(5))
+        if kind == 0:
+            raise RuntimeError("moody")
+        return (
+            None,
+            (np.full((1, len(q)), np.nan), np.zeros(1)),
+            (np.ones((2, 3)), np.ones(7)),
+            (np.full((1, len(q)), 1e-12), np.ones(1)),
+            (q, v),
+        )[kind]
+
+
+@pytest.mark.parametrize("constraint", [Impossible(), Flipping(), Moody()], ids=lambda one: type(one).__name__)
+def test_hostile_ticks_with_a_hostile_hard_constraint_break_no_promise(constraint: Any) -> None:
+    solver = FaultySolver(
+        DaqpSolver(robot().model.nv), np.random.default_rng(1), WorstSolver(robot(), np.random.default_rng(2))
+    )
+    controller = CartesianController(robot(), SETTINGS, solver=solver, constraints=[constraint])
+    report = Soak("cell", controller, solver, 6).run(2000)
+    assert report.passed, report.broken
+    assert report.counts["fallbacks_healthy"] > 20
 
 
 def test_fingers_that_open_without_a_proof_are_found(monkeypatch: pytest.MonkeyPatch) -> None:

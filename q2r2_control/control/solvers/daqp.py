@@ -16,6 +16,9 @@ _HARD, _SOFT = 0, 8  # how DAQP marks a row
 class DaqpSolver:
     """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022): dual active set, soft rows.
 
+    It starts cold at each tick. The last multipliers as a start save 16 of 17 iterations in contact, but no time: most
+    of it goes into setting the problem up. The solution would depend on the past besides.
+
     Args:
         nv: number of joints.
         time_limit: DAQP gives up after this time [s]; None: never.

@@ -2,6 +2,9 @@
 
 The safety filter clamps the answer to the very box that a solver is handed. A solver that wrote into that box would
 move the limits, and the certificate would be about the moved ones. A solver therefore gets copies.
+
+Costs and rows of a program's own may be of any size, and the sum of costs need not be convex. Libraries print a line
+or loop for ever at such a problem. No solver is asked about one.
 """
 
 from __future__ import annotations
@@ -12,9 +15,11 @@ from typing import Any
 import numpy as np
 
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver
-from q2r2_control.errors import shown
+from q2r2_control.errors import raised, shown
 
 _REAL = "fiu"  # kinds of dtype that are real numbers
+# Numbers of a problem that may be solved, and the least diagonal of its cost's Cholesky factor. Ours are near 1.
+_LARGEST, _FLATTEST = 1e12, 1e-8
 _FAILED = QpSolution(None, 0.0)
 
 
@@ -40,13 +45,18 @@ class Guard:
         An exception, and any other answer, is a failed solve. ``v = None`` is one by the solver's own word.
         """
         try:
+            self.failure = _fault_of(problem)
+            if self.failure is not None:
+                return _FAILED
             answer: Any = self._solver.solve(_copy_of(problem))
             v, solve_time = answer.v, answer.solve_time
             self.failure = "no solution" if v is None else self._fault(v, solve_time)
             if self.failure is None:
                 return QpSolution(np.array(v, dtype=float), float(solve_time))
-        except Exception as error:  # whatever a stranger's code raises is one tick without a solution
-            self.failure = f"{type(error).__name__}: {shown(str(error), 200)}"
+        except (KeyboardInterrupt, SystemExit):  # of a signal's handler, which ends the program
+            raise
+        except BaseException as error:  # as a panic in Rust is; whatever it raises is one tick without a solution
+            self.failure = raised(error)
         return _FAILED
 
     def _fault(self, v: Any, solve_time: Any) -> str | None:
@@ -57,6 +67,18 @@ class Guard:
         if not isinstance(solve_time, float | int | np.floating) or not 0.0 <= float(solve_time) < math.inf:
             return f"solve_time = {shown(solve_time)}: allowed: seconds, 0 or more"
         return None
+
+
+def _fault_of(problem: QpProblem) -> str | None:
+    """Why nobody can solve the ``problem``; None where somebody may."""
+    for part in (problem.H, problem.g, problem.rows, problem.rows_lower):
+        if not np.abs(part).max(initial=0.0) <= _LARGEST:  # written so that NaN is too large as well
+            return f"the problem has numbers that are not finite, or above {_LARGEST:g}"
+    try:
+        factor = np.linalg.cholesky(problem.H)
+    except np.linalg.LinAlgError:
+        return "the problem's cost is not convex"
+    return "the problem's cost is too flat" if factor.diagonal().min() < _FLATTEST else None
 
 
 def _copy_of(problem: QpProblem) -> QpProblem:

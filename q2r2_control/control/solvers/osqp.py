@@ -7,8 +7,8 @@ a unit ball, and with rows a_i L^-T of unit norm the slack of each has one and t
     subject to  D lower <= D L^-T w <= D upper,    a_i L^-T w / n_i + sqrt(SOFTNESS) t_i >= lower_i / n_i
 
 with n_i = |L^-1 a_i|, and D, which makes the rows of the box unit rows as well. A slack that is below 0 costs as much
-as one above, so t >= 0 need not be said. The pattern is dense and fixed for a number of rows, of which unused ones
-bound nothing. That number doubles when a tick has more rows: only then OSQP is set up anew.
+as one above, so t >= 0 need not be said. The pattern is dense and fixed for 16, 32, 48, ... rows, of which unused ones
+bound nothing. Each of these is set up once, at the first tick that needs it, and warm-started from then on.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import scipy.sparse
 from q2r2_control.control.qp import SOFTNESS, QpProblem, QpSolution
 from q2r2_control.types import Array
 
-_FEWEST_ROWS = 16
+_ROWS_STEP = 16  # from one number of rows that OSQP is set up for to the next
 # adaptive_rho_interval counts iterations: by the clock, as it may be, a run would not be repeatable.
 _DEFAULTS: dict[str, Any] = {
     "eps_abs": 1e-5,
@@ -50,23 +50,7 @@ class OsqpSolver:
     def __init__(self, nv: int, time_limit: float | None = None, **options: Any) -> None:
         limit = {} if time_limit is None else {"time_limit": time_limit}
         self._nv, self._options = nv, _DEFAULTS | limit | options
-        self._capacity = 0
-        self._set_up(_FEWEST_ROWS)
-
-    def _set_up(self, capacity: int) -> None:
-        """Make room for ``capacity`` rows; the next solve starts cold."""
-        nv, self._capacity = self._nv, capacity
-        self._matrix = np.zeros((nv + capacity, nv))
-        # All entries of the columns of w, also zeros, then one entry in each column of t.
-        pattern = scipy.sparse.csc_matrix(np.hstack([np.ones_like(self._matrix), np.eye(nv + capacity)[:, nv:]]))
-        pattern.data[self._matrix.size :] = math.sqrt(SOFTNESS)
-        self._entries = pattern.data.copy()
-        self._lower, self._upper = np.full(nv + capacity, -np.inf), np.full(nv + capacity, np.inf)
-        self._cost = np.zeros(nv + capacity)
-        self._solver = osqp.OSQP()
-        identity = scipy.sparse.eye(nv + capacity, format="csc")
-        self._solver.setup(identity, self._cost, pattern, self._lower, self._upper, **self._options)
-        self._x, self._y = np.zeros(nv + capacity), np.zeros(nv + capacity)
+        self._sized: dict[int, _SizedOsqp] = {}
 
     def solve(self, problem: QpProblem) -> QpSolution:
         """See :class:`Solver`; OSQP is asked only where a bound holds the cost's own minimum back.
@@ -75,34 +59,63 @@ class OsqpSolver:
         """
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)
-        nv, m = self._nv, len(problem.rows_lower)
-        if m > self._capacity:
-            self._set_up(2 ** math.ceil(math.log2(m)))
-        factor: Array = np.linalg.cholesky(problem.H).astype(float, copy=False)
-        self._write(problem, factor, m)
+        steps = max(math.ceil(len(problem.rows_lower) / _ROWS_STEP), 1)
+        if steps not in self._sized:
+            self._sized[steps] = _SizedOsqp(self._nv, steps * _ROWS_STEP, self._options)
+        return self._sized[steps].solve(problem)
+
+
+class _SizedOsqp:
+    """OSQP for up to ``capacity`` rows."""
+
+    def __init__(self, nv: int, capacity: int, options: dict[str, Any]) -> None:
+        self._nv = nv
+        # All entries of the columns of w, also zeros, then one entry in each column of t.
+        pattern = scipy.sparse.csc_matrix(np.hstack([np.ones((nv + capacity, nv)), np.eye(nv + capacity)[:, nv:]]))
+        self._entries = pattern.data.copy()
+        self._matrix = self._entries[: (nv + capacity) * nv].reshape((nv + capacity, nv), order="F")  # shares memory
+        self._slacks = self._entries[self._matrix.size :]  # the same
+        self._slacks[:] = pattern.data[self._matrix.size :] = math.sqrt(SOFTNESS)
+        self._lower, self._upper = np.full(nv + capacity, -np.inf), np.full(nv + capacity, np.inf)
+        self._cost = np.zeros(nv + capacity)
+        self._solver = osqp.OSQP()
+        identity = scipy.sparse.eye(nv + capacity, format="csc")
+        self._solver.setup(identity, self._cost, pattern, self._lower, self._upper, **options)
+        self._cold = np.zeros(nv + capacity)
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        """Solve a problem in which a bound holds the cost's minimum back; see :meth:`OsqpSolver.solve`."""
+        inverse = _inverse_factor(problem.H)
+        self._write(problem, inverse)
         answer = self._solver.solve(raise_error=False)
         time = answer.info.update_time + answer.info.solve_time
         if answer.info.status_val != osqp.SolverStatus.OSQP_SOLVED:
-            self._solver.warm_start(x=self._x, y=self._y)  # where it is may be anywhere
+            self._solver.warm_start(x=self._cold, y=self._cold)  # where it is may be anywhere
             return QpSolution(None, time)
-        v: Array = scipy.linalg.solve_triangular(factor, answer.x[:nv], trans=1, lower=True, check_finite=False)
+        v: Array = answer.x[: self._nv] @ inverse
         return QpSolution(v, time)
 
-    def _write(self, problem: QpProblem, factor: Array, m: int) -> None:
-        """Put the problem into OSQP, with unit rows."""
-        nv = self._nv
-        bounds = np.vstack([np.eye(nv), problem.rows])
-        rows = scipy.linalg.solve_triangular(factor, bounds.T, lower=True, check_finite=False).T
-        norms = np.sqrt(np.sum(rows**2, axis=1))
+    def _write(self, problem: QpProblem, inverse: Array) -> None:
+        """Put the problem into OSQP, with unit rows; ``inverse`` is L^-1."""
+        nv, m = self._nv, len(problem.rows_lower)
+        rows = np.concatenate([inverse.T, problem.rows @ inverse.T])
+        norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))
         self._matrix[nv + m :] = 0.0
         self._matrix[: nv + m] = rows / norms[:, None]
         self._lower[nv + m :] = -np.inf
         self._lower[:nv] = problem.lower / norms[:nv]
         self._upper[:nv] = problem.upper / norms[:nv]
         self._lower[nv : nv + m] = problem.rows_lower / norms[nv:]
-        self._cost[:nv] = scipy.linalg.solve_triangular(factor, problem.g, lower=True, check_finite=False)
-        self._entries[: self._matrix.size] = self._matrix.T.ravel()
-        slacks = self._entries[self._matrix.size :]
-        slacks[:] = math.sqrt(SOFTNESS)
-        slacks[m - problem.hard : m] = 0.0  # a hard row has none
+        self._cost[:nv] = inverse @ problem.g
+        self._slacks[:] = math.sqrt(SOFTNESS)
+        self._slacks[m - problem.hard : m] = 0.0  # a hard row has none
         self._solver.update(q=self._cost, l=self._lower, u=self._upper, Ax=self._entries)
+
+
+def _inverse_factor(H: Array) -> Array:
+    """L^-1 of H = L L' (nv, nv). Other BLAS routines start a thread for each core even for so small a matrix."""
+    factor, failed = scipy.linalg.lapack.dpotrf(H, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("H is not positive definite")
+    inverse: Array = scipy.linalg.lapack.dtrtri(factor, lower=True)[0]
+    return inverse

@@ -10,6 +10,7 @@ Source: https://github.com/qpsolvers/qpsolvers, whose form is P, q, G x <= h, lb
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -46,17 +47,26 @@ def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem
     )
 
 
+# Options without which a solver is of no use in a loop.
+_DEFAULTS: dict[str, dict[str, Any]] = {
+    "highs": {"output_flag": False, "qp_iteration_limit": 1000},  # its active set may cycle for ever
+    "scs": {"max_iters": 10000},  # ten times as many, as it may take, are a second
+}
+
+
 class QpSolversSolver:
     """A solver of qpsolvers by its name.
 
     Args:
         name: one of ``qpsolvers.available_solvers``.
-        options: keyword arguments of that solver, see qpsolvers' documentation.
+        options: keyword arguments of that solver, see qpsolvers' documentation. They go before :data:`_DEFAULTS`.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
-        self._name, self._options = name, options
+        self._name, self._options = name, _DEFAULTS.get(name, {}) | options
         self._sparse = name not in qpsolvers.dense_solvers
+        # The wrappers warn at each problem that is not solved. The report of the step says so already.
+        warnings.filterwarnings("ignore", module=r"qpsolvers\.solvers\.")
 
     def solve(self, problem: QpProblem) -> QpSolution:
         """See :class:`Solver`; the solver is asked only where a bound holds the cost's own minimum back.
@@ -65,7 +75,13 @@ class QpSolversSolver:
         """
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)
-        solution = qpsolvers.solve_problem(slack_problem(problem, self._sparse), self._name, **self._options)
+        made = slack_problem(problem, self._sparse)
+        if made.h is not None:
+            # Solvers print a warning at a number that they take as infinite. A row that the box keeps is kept as well
+            # with a bound just beyond what the box allows.
+            fastest = np.maximum(np.abs(problem.lower), np.abs(problem.upper))
+            made.h = np.minimum(made.h, np.abs(problem.rows) @ fastest + 1.0)
+        solution = qpsolvers.solve_problem(made, self._name, **self._options)
         time = (solution.build_time or 0.0) + (solution.solve_time or 0.0)
         if not solution.found or solution.x is None:
             return QpSolution(None, time)

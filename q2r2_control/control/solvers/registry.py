@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -34,11 +37,11 @@ def make_solver(
         ConfigError: There is no such solver, it is not installed, or it does not take the ``options``.
     """
     given = dict(options or {})
-    if name not in OURS:
-        _check_installed(name)
+    check_installed(name)
     try:
-        solver = _made(name, nv, time_limit, given)
-        solver.solve(_smallest_problem(nv))  # an option that is unknown shows here, and not in motion
+        with _on_stderr():
+            solver = _made(name, nv, time_limit, given)
+            solver.solve(_smallest_problem(nv))  # an option that is unknown shows here, and not in motion
     except Exception as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"control.solver_options = {shown(given)}: {name} refuses: {reason:.120}") from error
@@ -63,7 +66,27 @@ def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any])
     return QpSolversSolver(name, **options)
 
 
-def _check_installed(name: str) -> None:
+@contextmanager
+def _on_stderr() -> Iterator[None]:
+    """Print on stderr what is printed on stdout, by libraries too: that is where results are, as one JSON object."""
+    try:
+        sys.stdout.flush()
+        stdout = os.dup(1)
+    except (OSError, ValueError, AttributeError):  # there is none to keep clean
+        yield
+        return
+    try:
+        os.dup2(2, 1)
+        yield
+    finally:
+        os.dup2(stdout, 1)
+        os.close(stdout)
+
+
+def check_installed(name: str) -> None:
+    """Raises :class:`ConfigError`, with what there is, unless a solver called ``name`` is installed."""
+    if name in OURS:
+        return
     import qpsolvers  # see _made
 
     if name not in qpsolvers.available_solvers:

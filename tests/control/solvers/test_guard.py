@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -109,3 +110,53 @@ def test_an_answer_that_a_solver_changes_later_is_not_changed() -> None:
     answer = Guard(Late(), NV).solve(QpProblem(np.eye(NV), ZEROS, -wide, wide, np.empty((0, NV)), np.empty(0)))
     kept[:] = 5.0
     np.testing.assert_array_equal(answer.v, 0.001)
+
+
+class UnprintableError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("nor this")
+
+
+class Panic(BaseException):
+    """As a library in Rust raises it."""
+
+
+@pytest.mark.parametrize("error", [UnprintableError(), Panic("at the disco")], ids=["unprintable", "panic"])
+def test_no_exception_of_a_solver_leaves_a_step(error: BaseException) -> None:
+    controller = CartesianController(ROBOT, ControllerSettings(), solver=Raising(error))
+    report = controller.step({arm: controller.tool_pose(arm) for arm in ROBOT.arms}, DT).report
+    assert report.unsolved == 1
+    assert type(error).__name__ in str(controller.solver_failure)
+
+
+def test_ctrl_c_within_a_solver_ends_the_step() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        Guard(Raising(KeyboardInterrupt()), NV).solve(problem_of(np.eye(NV), ZEROS))
+
+
+class Raising:
+    def __init__(self, error: BaseException) -> None:
+        self.error = error
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        raise self.error
+
+
+def problem_of(H: Any, g: Any) -> QpProblem:
+    return QpProblem(H, g, -np.ones(NV), np.ones(NV), np.empty((0, NV)), np.empty(0))
+
+
+@pytest.mark.parametrize(
+    ("problem", "told"),
+    [
+        pytest.param(problem_of(np.eye(NV), np.full(NV, np.nan)), "not finite", id="NaN"),
+        pytest.param(problem_of(np.eye(NV), np.full(NV, np.inf)), "not finite", id="infinite"),
+        pytest.param(problem_of(1e200 * np.eye(NV), ZEROS), "above 1e\\+12", id="too large"),
+        pytest.param(problem_of(-np.eye(NV), ZEROS), "not convex", id="not convex"),
+        pytest.param(problem_of(1e-20 * np.eye(NV), ZEROS), "too flat", id="too flat"),
+    ],
+)
+def test_no_solver_is_asked_about_a_problem_that_libraries_loop_at(problem: QpProblem, told: str) -> None:
+    guard = Guard(Raising(AssertionError("asked")), NV)
+    assert guard.solve(problem).v is None
+    assert re.search(told, str(guard.failure))

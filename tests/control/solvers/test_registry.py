@@ -44,3 +44,11 @@ def test_a_name_in_python_takes_the_place_of_the_settings() -> None:
 def test_what_is_neither_a_name_nor_a_solver_is_refused(solver: Any) -> None:
     with pytest.raises(ConfigError, match="allowed: a solver's name, a Solver, or None"):
         CartesianController(ROBOT, ControllerSettings(), solver=solver)
+
+
+def test_options_are_for_the_solver_that_the_settings_name() -> None:
+    settings = ControllerSettings(solver="daqp", solver_options={"iter_limit": 500})
+    assert settings.with_solver(None) is settings.with_solver("daqp") is settings
+    other = settings.with_solver("osqp")
+    assert (other.solver, other.solver_options) == ("osqp", {})
+    CartesianController(ROBOT, settings, solver="osqp")

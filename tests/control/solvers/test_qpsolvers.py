@@ -1,0 +1,115 @@
+"""Every solver that is installed leads the arms as DAQP does, prints nothing, and raises nothing that a step shows."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import qpsolvers
+
+from q2r2_control import CartesianController
+from q2r2_control.benchmark.solver_run import SOLVERS
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.qp import QpProblem
+from q2r2_control.control.solvers import registry
+from q2r2_control.control.solvers.registry import OURS, make_solver
+from q2r2_control.types import Array
+from q2r2_control.verification.contract import Contract
+from tests.control.cells import cell
+from tests.control.scenarios import crossing
+
+DT = 0.002
+ROBOT = cell("dual_iiwa7").robot
+NV = ROBOT.model.nv
+INSTALLED = [name for name in SOLVERS if name in (*OURS, *qpsolvers.available_solvers)]
+FAR_M = 2e-3  # that first-order solvers lead a tool from where DAQP does
+
+
+@contextmanager
+def silence(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
+    """Fail if something is printed in the block, also by a library, or warned of."""
+    capfd.readouterr()  # of solvers as they are made: HiGHS says on stderr that it is there, once
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+    assert capfd.readouterr() == ("", "")
+
+
+def _driven(controller: CartesianController, ticks: int) -> tuple[Array, int]:
+    """Postures of a run in which the tools are sent to each other, and how many ticks were unsolved."""
+    home = {arm: controller.tool_pose(arm) for arm in ROBOT.arms}
+    contract, q, unsolved = Contract(controller), [], 0
+    for tick in range(ticks):
+        reference = controller.step(crossing(tick * DT, home), DT)
+        contract.check(reference, DT)
+        unsolved += reference.report.unsolved
+        q.append(reference.q)
+    return np.array(q), unsolved
+
+
+def _problem(random: np.random.Generator, rows: int, hard: int = 0) -> QpProblem:
+    J, matrix = random.normal(size=(12, NV)), random.normal(size=(rows, NV))
+    matrix /= np.linalg.norm(matrix, axis=1, keepdims=True)
+    H, wide, lower = J.T @ J + 0.1 * np.eye(NV), np.ones(NV), random.uniform(-1.0, 0.2, rows)
+    return QpProblem(H, random.normal(size=NV), -wide, wide, matrix, lower, hard=hard)
+
+
+@pytest.mark.parametrize("name", [name for name in INSTALLED if name != "daqp"])
+def test_arms_go_with_each_solver_where_they_go_with_daqp(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    chosen = CartesianController(ROBOT, ControllerSettings(), solver=name)
+    with silence(capfd):
+        q, unsolved = _driven(chosen, 250)
+    expected, _ = _driven(CartesianController(ROBOT, ControllerSettings()), 250)
+    assert unsolved == 0
+    tools = [[[ROBOT.tool_pose(at, arm).translation for arm in ROBOT.arms] for at in run] for run in (q, expected)]
+    assert np.abs(np.array(tools[0]) - np.array(tools[1])).max() < FAR_M
+    assert np.abs(q[-1] - q[0]).max() > 0.1
+
+
+@pytest.mark.parametrize("name", INSTALLED)
+def test_a_problem_that_nothing_solves_is_a_failed_solve_and_the_next_one_is_solved(
+    name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    solver, random = make_solver(name, NV), np.random.default_rng(2)
+    against, usual = _problem(random, 2, hard=2), _problem(random, 20)
+    against.rows[1] = -against.rows[0]
+    against.rows_lower[:] = 0.5
+    with silence(capfd):
+        assert solver.solve(against).v is None
+        found, expected = solver.solve(usual).v, make_solver("daqp", NV).solve(usual).v
+    assert found is not None
+    assert expected is not None
+    np.testing.assert_allclose(found, expected, atol=5e-3)
+
+
+@pytest.mark.parametrize("name", [name for name in INSTALLED if name not in OURS])
+def test_a_row_that_no_velocity_can_break_is_taken_without_a_word(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    solver = make_solver(name, NV)
+    problem = _problem(np.random.default_rng(4), 5)
+    problem.rows_lower[:3] = -1e11
+    with silence(capfd):
+        assert solver.solve(problem).v is not None
+
+
+def test_what_is_printed_as_a_solver_is_made_goes_to_stderr(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Loud:
+        def solve(self, problem: QpProblem) -> None:
+            os.write(1, b"loud\n")
+
+    monkeypatch.setattr(registry, "_made", lambda *given: Loud())
+    make_solver("osqp", NV)
+    os.write(1, b"result\n")
+    assert capfd.readouterr() == ("result\n", "loud\n")
+
+
+@pytest.mark.skipif("highs" not in INSTALLED, reason="HiGHS is not installed")
+def test_an_iteration_limit_that_is_reached_is_a_failed_solve() -> None:
+    problem = _problem(np.random.default_rng(5), 40)
+    assert make_solver("highs", NV, options={"qp_iteration_limit": 1}).solve(problem).v is None
+    assert make_solver("highs", NV).solve(problem).v is not None
