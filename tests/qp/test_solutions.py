@@ -61,7 +61,7 @@ def corners() -> dict[str, QpProblem]:
         "two rows that contradict each other": small(random, [[1, 1, 0, 0], [-1, -1, 0, 0]], [0.3, 0.3]),
         "one row three times": small(random, [[0, 1, 1, 0]] * 3, [0.6] * 3),
         "all rows active": small(random, random.normal(size=(4, NV)).tolist(), [2.0, 3.0, 4.0, 5.0]),
-        "more rows than joints": small(random, random.normal(size=(6, NV)).tolist(), [0.2] * 6),
+        "more rows than joints": small(random, random.normal(size=(5, NV)).tolist(), [0.2] * 5),
         "one joint that must brake": _boxed(random, [0.1, -1, -1, -1], [0.1, 1, 1, 1], 1, -1, 0, 0),
         "no joint with a choice": _boxed(random, [0.1, -0.2, 0.0, 0.3], [0.1, -0.2, 0.0, 0.3], 1, -1, 0, 0),
         "a box that excludes rest": _boxed(random, [0.1, 0.2, -1, -1], [0.3, 0.4, 1, 1]),

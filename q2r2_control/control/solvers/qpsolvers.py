@@ -18,6 +18,8 @@ import scipy.sparse
 
 from q2r2_control.control.qp import QpProblem, QpSolution, row_softness
 
+_WIDE = 1.0  # of bounds that an equation makes needless, and which must be finite for some solvers [rad/s]
+
 
 def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem:
     """The problem with a slack for each row.
@@ -46,6 +48,17 @@ def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem
     )
 
 
+def _state_equations(problem: qpsolvers.Problem, sparse: bool) -> None:
+    """Turn pairs of equal bounds into equations, since quadprog finds no solution between two bounds without room."""
+    fixed = np.flatnonzero(problem.lb == problem.ub)
+    if not len(fixed):
+        return
+    A = np.eye(len(problem.q))[fixed]
+    problem.A, problem.b = scipy.sparse.csc_matrix(A) if sparse else A, problem.lb[fixed]
+    problem.lb[fixed] -= _WIDE
+    problem.ub[fixed] += _WIDE
+
+
 class QpSolversSolver:
     """A solver of qpsolvers by its name.
 
@@ -65,7 +78,9 @@ class QpSolversSolver:
         """
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)
-        solution = qpsolvers.solve_problem(slack_problem(problem, self._sparse), self._name, **self._options)
+        slack = slack_problem(problem, self._sparse)
+        _state_equations(slack, self._sparse)
+        solution = qpsolvers.solve_problem(slack, self._name, **self._options)
         time = (solution.build_time or 0.0) + (solution.solve_time or 0.0)
         if not solution.found or solution.x is None:
             return QpSolution(None, time)
