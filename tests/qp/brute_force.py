@@ -14,6 +14,7 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
+import numpy.typing as npt
 
 from q2r2_control.control.qp import QpProblem, row_softness
 from q2r2_control.types import Array
@@ -49,7 +50,7 @@ def solve_by_brute_force(problem: QpProblem) -> Array:
     return best
 
 
-def _least_point(problem: QpProblem, sides: Array, active: Array) -> Array | None:
+def _least_point(problem: QpProblem, sides: npt.NDArray[np.int64], active: npt.NDArray[np.bool_]) -> Array | None:
     """Least point of f with joints at the bounds that ``sides`` say, soft rows giving way and hard ones met."""
     soft = np.arange(len(active)) < len(active) - problem.hard
     giving, met = problem.rows[active & soft], problem.rows[active & ~soft]

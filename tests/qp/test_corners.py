@@ -89,7 +89,7 @@ def test_the_box_is_never_empty_and_all_numbers_are_finite(name: str) -> None:
     controller.reset(q, v)
     for dt in (1e-4, DT, 0.02, 0.1):
         problem = controller.problem(moved(controller, way), dt)
-        assert (problem.lb <= problem.ub).all()
+        assert (np.asarray(problem.lb) <= np.asarray(problem.ub)).all()
         assert np.isfinite(problem.P).all()
         assert np.isfinite(problem.q).all()
         assert problem.G is None or np.isfinite(problem.G).all()
@@ -121,7 +121,7 @@ def test_a_joint_at_its_limit_that_still_runs_towards_it_brakes_as_hard_as_it_ca
         q[joint], v[joint] = limit[joint], sign * ROBOT.velocity_limit[joint]
         driven = Driven(controller, q, v, DT)
         problem = controller.problem(driven.start, DT)
-        towards = (problem.ub if sign > 0.0 else -problem.lb)[joint]
+        towards = sign * np.asarray(problem.ub if sign > 0.0 else problem.lb)[joint]
         assert towards == pytest.approx(abs(v[joint]) - braking[joint] * DT, abs=1e-9), "no room but to brake"
         for _ in range(TICKS):
             reference = driven.drive(DT, driven.start)

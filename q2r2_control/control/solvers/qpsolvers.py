@@ -50,13 +50,13 @@ def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem
 
 def _state_equations(problem: qpsolvers.Problem, sparse: bool) -> None:
     """Turn pairs of equal bounds into equations, since quadprog finds no solution between two bounds without room."""
-    fixed = np.flatnonzero(problem.lb == problem.ub)
-    if not len(fixed):
+    lower, upper = np.asarray(problem.lb), np.asarray(problem.ub)
+    fixed = lower == upper
+    if not fixed.any():
         return
-    A = np.eye(len(problem.q))[fixed]
-    problem.A, problem.b = scipy.sparse.csc_matrix(A) if sparse else A, problem.lb[fixed]
-    problem.lb[fixed] -= _WIDE
-    problem.ub[fixed] += _WIDE
+    A = np.eye(len(lower))[fixed]
+    problem.A, problem.b = scipy.sparse.csc_matrix(A) if sparse else A, lower[fixed]
+    problem.lb, problem.ub = np.where(fixed, lower - _WIDE, lower), np.where(fixed, upper + _WIDE, upper)
 
 
 class QpSolversSolver:
