@@ -1,9 +1,12 @@
 """embodiK: prioritised differential inverse kinematics in C++, on Pinocchio and Coal.
 
-Scales tasks down, the first priority last, until joints keep their position, velocity and acceleration limits and the
-nearest pairs their distance. It is given the same URDF as roboplan, with our bodies as its collision shapes, the same
-pairs, and rows for the ten nearest. Both tools have the first priority and the posture the second one: its weights are
-gains, so that a posture cannot have a small weight against a tool. Fingers, joints there, may not move.
+Has position, velocity and acceleration limits and keeps the nearest pairs apart, by scaling tasks down, the lowest
+priority first, and not by a QP. Where no scale satisfies all limits it says so, and has no solution. It knows nothing
+of braking distances. It is given the same URDF as roboplan, with our bodies as its collision shapes, the same pairs,
+and rows for the ten nearest, whatever their distance. By itself it has rows for pairs within five times the distance
+that they keep, which is 5 mm here: one tick in 400 in contact had no solution then, and one in 2,000 now. Both tools
+have the first priority and the posture the second one: its weights are gains, and a posture cannot have a small weight
+against a tool. Fingers, joints there, may not move.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from q2r2_control.types import Array
 class Embodik:
     """See the module."""
 
-    limitations = "no braking distance to pairs; no certificate"
+    limitations = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
 
     def __init__(self, setup: PeerSettings, name: str) -> None:
         self.name = name
@@ -39,21 +42,13 @@ class Embodik:
         self._rest = np.zeros(self._model.nq)
         for joint, value in setup.home_of_others.items():
             self._rest[joints.index(joint)] = value
-        self._acceleration = np.full(self._model.nv, setup.acceleration.max())
-        self._acceleration[self._indices] = setup.acceleration
         solver = self._solver = embodik.KinematicsSolver(self._model)
         solver.dt = setup.dt
-        solver.enable_position_limits(True)
-        solver.enable_velocity_limits(True)
-        for index in range(self._model.nv):
-            solver.set_joint_velocity_limit(index, 0.0)
-        for index, limit in zip(self._indices, setup.velocity, strict=True):
-            solver.set_joint_velocity_limit(int(index), float(limit))
-        solver.set_acceleration_limits(self._acceleration)
-        solver.enable_acceleration_limits(True)
+        self._limit_joints(setup)
         solver.configure_collision_constraint(
             setup.min_distance, pair_names(robot.collision_model), max_constraints=NEAREST_ROWS
         )
+        solver.set_proximity_gated_collision_activation_enabled(False)
         self._tools = {}
         for arm, description in robot.arms.items():
             task = self._tools[arm] = solver.add_frame_task(arm, description.tool_frame)
@@ -62,6 +57,18 @@ class Embodik:
         posture.priority, posture.weight = 1, control.posture_gain
         posture.set_controlled_joint_targets(robot.home)
         self.reset(robot.home)
+
+    def _limit_joints(self, setup: PeerSettings) -> None:
+        """Our limits, and 0 rad/s for the fingers. Position limits are those of the URDF."""
+        solver = self._solver
+        velocity, acceleration = np.zeros(self._model.nv), np.full(self._model.nv, setup.acceleration.max())
+        velocity[self._indices], acceleration[self._indices] = setup.velocity, setup.acceleration
+        for index, limit in enumerate(velocity.tolist()):
+            solver.set_joint_velocity_limit(index, limit)
+        solver.set_acceleration_limits(acceleration)
+        solver.enable_position_limits(True)
+        solver.enable_velocity_limits(True)
+        solver.enable_acceleration_limits(True)
 
     def reset(self, q: Array) -> None:
         self._q = self._rest.copy()
