@@ -1,12 +1,13 @@
 """embodiK: prioritised differential inverse kinematics in C++, on Pinocchio and Coal.
 
-Has position, velocity and acceleration limits and keeps the nearest pairs apart, by scaling tasks down, the lowest
-priority first, and not by a QP. Where no scale satisfies all limits it says so, and has no solution. It knows nothing
-of braking distances. It is given the same URDF as roboplan, with our bodies as its collision shapes, the same pairs,
-and rows for the ten nearest, whatever their distance. By itself it has rows for pairs within five times the distance
-that they keep, which is 5 mm here: one tick in 400 in contact had no solution then, and one in 2,000 now. Both tools
-have the first priority and the posture the second one: its weights are gains, and a posture cannot have a small weight
-against a tool. Fingers, joints there, may not move.
+Has position, velocity and acceleration limits and keeps the nearest pairs apart, not by a QP but by joints and rows
+that are held at their limits one by one. They can contradict each other; it says so then. It knows nothing of braking
+distances. It is given the same URDF as roboplan, with our bodies as its collision shapes, the same pairs, and rows for
+the ten nearest, whatever their distance: by itself it has them within five times the distance kept, which is 5 mm here.
+Tools go as near to their targets as limits allow (MIN_ERROR). By itself it scales a tool's whole velocity down until
+all limits hold (SCALE), and then stood 47 mm from a target in free air. Both tools have the first priority and the
+posture the second one: its weights are gains, and a posture cannot have a small weight against a tool. Fingers, joints
+there, may not move.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class Embodik:
         for arm, description in robot.arms.items():
             task = self._tools[arm] = solver.add_frame_task(arm, description.tool_frame)
             task.priority, task.weight = 0, control.position_gain
+            task.solve_mode = embodik.TaskSolveMode.MIN_ERROR
         posture = solver.add_posture_task("posture", self._indices.tolist())
         posture.priority, posture.weight = 1, control.posture_gain
         posture.set_controlled_joint_targets(robot.home)
