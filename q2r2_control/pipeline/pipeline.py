@@ -64,8 +64,8 @@ class Pipeline(RequestedRun):
         config: The cell.
         robot: Its arms.
         input: Whose hands, or policy, lead them.
-        plant: What moves.
-        mode: What the plant gets: joint positions, velocities, or the torques of a Cartesian impedance.
+        plant: The arms, real or simulated, that its commands move.
+        mode: Kind of the plant's commands: joint positions, velocities, or the torques of a Cartesian impedance.
         solver: As of :class:`CartesianController`, like ``tasks`` and ``constraints``. A recording does not have these
             objects, so that a replay of the run goes without them.
         tasks: Costs beside those of ``config.control.tasks``.

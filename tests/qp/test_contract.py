@@ -88,7 +88,7 @@ def test_arms_keep_the_contract_and_come_to_rest(solver: str, name: str) -> None
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a run may not exceed, as the robot and the settings have it, without the controller's own bookkeeping."""
+    """Limits of a run as the robot and the settings have them, without the controller's own bookkeeping."""
 
     lower: Array  # (nv,) [rad]
     upper: Array  # (nv,) [rad]
