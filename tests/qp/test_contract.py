@@ -10,14 +10,15 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.types import Array, Reference
 from q2r2_control.verification.promises import COAL
 from tests.control.scenarios import Targets, circle
 from tests.control.test_scenarios import CASES, Case, ticks_of
-from tests.qp.solvers import NAMES, ROBOT, controller_with
+from tests.qp.solvers import NAMES, ROBOT, controller_with, each_solver
 from tests.support.driven import Driven
 
-DT, MOVING, RESTING = 0.002, 0.2, 2.5  # [s]
+DT, MOVING, RESTING = 0.002, 0.16, 2.5  # [s]
 SLOWLY_OUT = "start in penetration"  # arms part at 50 mm/s, and a tick has up to 80 rows
 REST, RESTED = 1e-3, 0.02  # a speed of every joint [rad/s], for so long [s]
 TRACKING = 1.05  # times DAQP's error that another solver's may be
@@ -104,7 +105,7 @@ def limits_of(controller: CartesianController) -> Limits:
         ROBOT.position_upper - settings.position_margin,
         ROBOT.velocity_limit * settings.velocity_scale,
         ROBOT.capped_acceleration(settings.acceleration_limit),
-        controller.kept_distances,
+        kept_distances(ROBOT, settings).values,
     )
 
 
@@ -112,22 +113,43 @@ def from_rest(case: Case) -> bool:
     return not case.recovers and not case.jitter
 
 
-@pytest.mark.parametrize(
-    ("solver", "name"), [_every(solver, name) for solver in NAMES for name in MOTIONS if from_rest(MOTIONS[name])]
-)
-def test_limits_and_distances_hold_at_every_tick_by_plain_arithmetic_and_coal(solver: str, name: str) -> None:
-    limits = limits_of(controller_with(solver))
-    q = np.array([reference.q for reference in motion(solver, name).references])
-    v = np.array([reference.v for reference in motion(solver, name).references])
+def assert_within(limits: Limits, references: list[Reference]) -> None:
+    """Check ticks of ``DT`` from rest on. A tick moves along a parabola, so positions tell the same velocities."""
+    q = np.array([reference.q for reference in references])
+    v = np.array([reference.v for reference in references])
     assert (q >= limits.lower - ROUNDING).all()
     assert (q <= limits.upper + ROUNDING).all()
     assert (np.abs(v) <= limits.velocity * (1.0 + ROUNDING)).all()
     changes = np.abs(np.diff(v, axis=0, prepend=0.0)) / DT
     assert (changes <= limits.acceleration * (1.0 + ROUNDING)).all()
-    # A tick moves along a parabola, so positions tell the same velocities.
     np.testing.assert_allclose(np.diff(q, axis=0), 0.5 * DT * (v[1:] + v[:-1]), atol=1e-11)
     for posture in q:
         assert (ROBOT.distance_values(posture) >= limits.distances - COAL).all()
+
+
+@pytest.mark.parametrize(
+    ("solver", "name"), [_every(solver, name) for solver in NAMES for name in MOTIONS if from_rest(MOTIONS[name])]
+)
+def test_limits_and_distances_hold_at_every_tick_by_plain_arithmetic_and_coal(solver: str, name: str) -> None:
+    assert_within(limits_of(controller_with(solver)), motion(solver, name).references)
+
+
+@pytest.mark.parametrize("solver", each_solver())
+def test_joints_that_are_driven_beyond_their_limits_meet_each_limit_and_break_none(solver: str) -> None:
+    controller, last = controller_with(solver), [arm.joints[-1] for arm in ROBOT.arms.values()]
+    limits, q = limits_of(controller), ROBOT.home.copy()
+    q[last] = limits.upper[last] - 1.2
+    driven = Driven(controller, q, dt=DT)
+    q[last] = limits.upper[last] + 1.0
+    controller.hold_at(q)
+    references = [driven.drive(DT, {}) for _ in range(450)]
+    controller.hold_at(None)
+    assert_within(limits, references)
+    fastest = np.max([np.abs(reference.v) for reference in references], axis=0)
+    strongest = np.max([np.abs(reference.a) for reference in references], axis=0)
+    np.testing.assert_allclose(fastest[last], limits.velocity[last], rtol=1e-3)
+    np.testing.assert_allclose(strongest[last], limits.acceleration[last], rtol=1e-3)
+    np.testing.assert_allclose(references[-1].q[last], limits.upper[last], atol=2e-3)
 
 
 def test_a_motion_that_can_be_followed_is_followed_to_millimetres() -> None:

@@ -15,7 +15,7 @@ from tests.control.test_scenarios import in_penetration
 from tests.qp.solvers import NAMES, ROBOT, controller_with, each_solver
 from tests.support.driven import Driven
 
-DT, DRIVEN = 0.002, 0.06  # [s]
+DT, DRIVEN = 0.002, 0.04  # [s]
 TICKS = 6
 Corner = tuple[Array, Array, pin.Motion]  # q, v, and how the targets move away from the tools [m], [rad]
 OUT = pin.Motion(np.array([0.3, 0.0, 0.3]), np.zeros(3))
