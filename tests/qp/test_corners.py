@@ -12,7 +12,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.control.test_scenarios import in_penetration
-from tests.qp.solvers import NAMES, ROBOT, controller_with, each_solver
+from tests.qp.solvers import ROBOT, controller_with, each_solver
 from tests.support.driven import Driven
 
 DT, DRIVEN = 0.002, 0.04  # [s]
@@ -108,7 +108,7 @@ def test_every_tick_from_a_corner_is_solved_and_keeps_the_contract(solver: str, 
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["upper", "lower"])
-@pytest.mark.parametrize("solver", NAMES)
+@pytest.mark.parametrize("solver", each_solver())
 def test_a_joint_at_its_limit_that_still_runs_towards_it_brakes_as_hard_as_it_can(solver: str, sign: float) -> None:
     controller = controller_with(solver)
     settings = controller.settings
@@ -131,7 +131,7 @@ def test_a_joint_at_its_limit_that_still_runs_towards_it_brakes_as_hard_as_it_ca
     assert unsolved <= (0.15 if solver == "osqp" else 0.0) * TICKS * len(joints)
 
 
-@pytest.mark.parametrize("solver", NAMES)
+@pytest.mark.parametrize("solver", each_solver())
 def test_arms_in_penetration_part_at_the_speed_that_they_may(solver: str) -> None:
     q, v = in_penetration(ROBOT)
     driven = Driven(controller_with(solver), q, v, DT)
