@@ -48,17 +48,6 @@ def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem
     )
 
 
-def _state_equations(problem: qpsolvers.Problem, sparse: bool) -> None:
-    """Turn pairs of equal bounds into equations, since quadprog finds no solution between two bounds without room."""
-    lower, upper = np.asarray(problem.lb), np.asarray(problem.ub)
-    fixed = lower == upper
-    if not fixed.any():
-        return
-    A = np.eye(len(lower))[fixed]
-    problem.A, problem.b = scipy.sparse.csc_matrix(A) if sparse else A, lower[fixed]
-    problem.lb, problem.ub = np.where(fixed, lower - _WIDE, lower), np.where(fixed, upper + _WIDE, upper)
-
-
 class QpSolversSolver:
     """A solver of qpsolvers by its name.
 
@@ -78,10 +67,21 @@ class QpSolversSolver:
         """
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)
-        slack = slack_problem(problem, self._sparse)
-        _state_equations(slack, self._sparse)
-        solution = qpsolvers.solve_problem(slack, self._name, **self._options)
+        made = slack_problem(problem, self._sparse)
+        _state_equations(made, self._sparse)
+        solution = qpsolvers.solve_problem(made, self._name, **self._options)
         time = (solution.build_time or 0.0) + (solution.solve_time or 0.0)
         if not solution.found or solution.x is None:
             return QpSolution(None, time)
         return QpSolution(solution.x[: len(problem.g)], time)
+
+
+def _state_equations(problem: qpsolvers.Problem, sparse: bool) -> None:
+    """Turn pairs of equal bounds into equations, since quadprog finds no solution between two bounds without room."""
+    lower, upper = np.asarray(problem.lb), np.asarray(problem.ub)
+    fixed = lower == upper
+    if not fixed.any():
+        return
+    A = np.eye(len(lower))[fixed]
+    problem.A, problem.b = scipy.sparse.csc_matrix(A) if sparse else A, lower[fixed]
+    problem.lb, problem.ub = np.where(fixed, lower - _WIDE, lower), np.where(fixed, upper + _WIDE, upper)
