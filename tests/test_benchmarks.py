@@ -19,7 +19,11 @@ SHARED = (
     *("ros_processes.py", "work_hands.py"),
 )
 SCRIPTS = sorted(file.name for file in FOLDER.glob("*.py") if file.name not in SHARED)
-NEEDED = {"ros": ("rclpy", "quest2ros"), "page": ("viser", "websockets")}  # by what a script's name begins with
+NEEDED = {
+    "ros": ("rclpy", "quest2ros"),
+    "page": ("viser", "websockets"),
+    "qp": ("qpbenchmark",),
+}  # by what a script's name begins with
 
 
 def run(script: str, *options: str) -> str:
@@ -45,6 +49,23 @@ def test_the_loop_s_benchmark_times_every_stage() -> None:
     assert set(cases) == {"kinematic position", "mujoco position", "mujoco torque"}
     for stage in ("inputs", "measured state", "teleop", "supervision", "control", "drive", "apply", "physics"):
         assert all(case[stage]["median_us"] > 0.0 for case in cases.values()), stage
+
+
+def test_qps_of_motions_are_a_test_set_that_qpbenchmark_loads_and_daqp_solves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    benchmark = pytest.importorskip("qpbenchmark.benchmark")
+    file = tmp_path / load_script("benchmarks/qp_problems.py").FILE
+    told = json.loads(run("qp_problems.py", "--ticks", "40", "--solved", "8", "--file", str(file), "--json"))
+    assert (told["ticks"], told["solved"]) == (40, 8)
+    assert set(told["success_percent"]["daqp"].values()) == {100.0}
+    monkeypatch.chdir(tmp_path)  # where the set looks for its file
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    names = [problem.name for problem in benchmark.load_test_set(str(FOLDER / "qp_problems.py"))]
+    assert [name.split("_")[0] for name in names] == [
+        kind for kind in ("free", "contact", "limits", "recovery") for _ in range(10)
+    ]
+    assert len(set(names)) == 40
 
 
 def test_every_line_of_the_table_stands_once_in_its_file() -> None:

@@ -1,4 +1,4 @@
-"""Examples run as they stand: each script in examples/, and the code and commands of the README."""
+"""Examples run as they stand: each script in examples/, the code and commands of the README, and code of docs/."""
 
 from __future__ import annotations
 
@@ -63,6 +63,15 @@ def test_an_example_runs_and_prints_what_came_of_it(script: Path, tmp_path: Path
 def test_the_code_of_the_readme_runs(as_main: Callable[..., str]) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert as_main(code, "README.md").strip().endswith("True")
+
+
+@pytest.mark.parametrize(("page", "ends"), [("api.md", "True 0"), ("solvers.md", "")])
+def test_the_code_of_a_page_of_docs_runs_from_its_first_to_its_last_line(
+    page: str, ends: str, as_main: Callable[..., str]
+) -> None:
+    parts = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.DOTALL)
+    assert parts
+    assert as_main("".join(parts), page).strip().endswith(ends)
 
 
 def test_every_command_that_the_readme_names_exists() -> None:

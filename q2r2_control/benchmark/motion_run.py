@@ -41,7 +41,7 @@ class OwnController:
 
     def __init__(self, robot: Robot, config: Config, name: str = "q2r2_control") -> None:
         self.name = name
-        self._controller = CartesianController(robot, config.control.model_copy(update={"solve_time_limit": None}))
+        self._controller = CartesianController(robot, config.control.timed(realtime=False))
         # Of each tick since the reset: whether the certified stop was executed, and whether some QP was not solved.
         self.stopped: list[bool] = []
         self.unsolved: list[bool] = []

@@ -52,7 +52,7 @@ _SOLVER_NOTES = (
 
 def bench(
     rounds: Annotated[int | None, Option(min=1, help=f"How often: {_ROUNDS}, with --work 1.")] = None,
-    peers: Annotated[bool, Option(help="Measure roboplan, mink and pink too, where they are installed.")] = True,
+    peers: Annotated[bool, Option(help="Measure roboplan, mink, pink and embodik too, where installed.")] = True,
     work: Annotated[bool, Option("--work", help="Two-armed work motions instead of circle and contact.")] = False,
     motion: Annotated[list[str] | None, Option(help="With --work: only this, or such as begin so; repeatable.")] = None,
     solver: Solver = None,

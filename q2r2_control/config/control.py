@@ -68,6 +68,9 @@ class ContactPair(StrictModel):
     speed: float = Field(0.03, ge=0.005, le=0.2, description="closing speed before and in contact [m/s]")
 
 
+_LONGEST_SOLVE = 0.005  # in real time, where a cell says nothing [s]
+
+
 class ControllerSettings(StrictModel):
     """Settings of :class:`CartesianController`; every range is checked when the object is made."""
 
@@ -76,7 +79,10 @@ class ControllerSettings(StrictModel):
     )
     solver_options: dict[str, Any] = Field({}, description="keyword arguments of that solver, and of no other")
     solve_time_limit: float | None = Field(
-        None, gt=0, le=0.1, description="a later solution counts as failed [s]; none: runs do not depend on the clock"
+        None,
+        gt=0,
+        le=0.1,
+        description="a later solution counts as failed [s]; null: 5 ms in real time. Simulated time has no limit",
     )
     max_substep: float = Field(0.002, gt=0, le=0.02, description="a longer dt is split into equal parts below this [s]")
 
@@ -149,6 +155,15 @@ class ControllerSettings(StrictModel):
         if name is None or name == self.solver:
             return self
         return self.model_copy(update={"solver": name, "solver_options": {}})
+
+    def timed(self, realtime: bool) -> ControllerSettings:
+        """The same with a ``solve_time_limit`` in real time, and without one in simulated time.
+
+        Whether a solution is late depends on the computer, and a repeatable run must not. In real time a solver that
+        blocks must not keep the arms waiting.
+        """
+        limit = (self.solve_time_limit or _LONGEST_SOLVE) if realtime else None
+        return self.model_copy(update={"solve_time_limit": limit})
 
     def changed(self, values: Mapping[str, Any]) -> ControllerSettings:
         """The same with other ``values`` of what is in ``LIVE``, by name.

@@ -32,30 +32,65 @@ SOFTNESS = 1e-5  # part of its correction by which a row gives way
 
 @dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
 class QpProblem:
-    """One tick's problem; arrays are valid until the next tick."""
+    """The problem of one step, for nv joints.
 
-    H: Array  # (nv, nv), symmetric positive definite
-    g: Array  # (nv,)
-    lower: Array  # (nv,) [rad/s]
-    upper: Array  # (nv,) [rad/s]
-    rows: Array  # (m, nv), unit rows
-    rows_lower: Array  # (m,) [rad/s]
-    minimum: Array | None = None  # (nv,) of the cost alone, if that keeps box and rows and so is the solution [rad/s]
-    hard: int = 0  # how many of the last rows may not give way
+        minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i
+        subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0,    s_i = 0 for a hard row
+
+    The variables are the next joint velocities v [rad/s]; rho_i is :func:`row_softness`. Our own solver is handed the
+    controller's arrays, which hold until the next step; every other solver is handed copies.
+
+    Attributes:
+        H: Of the cost (nv, nv), symmetric and positive definite.
+        g: Of the cost (nv,).
+        lower: Least next velocities (nv,) [rad/s]. They keep position, velocity and acceleration limits.
+        upper: Greatest next velocities (nv,) [rad/s].
+        rows: Left-hand sides (m, nv), of unit norm: separation first, then soft constraints, then hard ones.
+        rows_lower: Right-hand sides (m,) [rad/s].
+        minimum: Minimum of the cost alone (nv,) [rad/s] where it keeps box and rows, and so is the solution; else None.
+        hard: How many of the last rows are hard.
+    """
+
+    H: Array
+    g: Array
+    lower: Array
+    upper: Array
+    rows: Array
+    rows_lower: Array
+    minimum: Array | None = None
+    hard: int = 0
 
 
 @dataclass(slots=True)
 class QpSolution:
-    """The answer of a solver."""
+    """The answer of a solver.
 
-    v: Array | None  # (nv,) [rad/s]; None: no solution
-    solve_time: float  # the solver's own measure, 0 where none was asked [s]
+    Attributes:
+        v: Next joint velocities (nv,) [rad/s]; None if the solver found none.
+        solve_time: How long the solver says that it took [s]; 0 where it was not asked.
+    """
+
+    v: Array | None
+    solve_time: float
 
 
 class Solver(Protocol):
-    """Solves a :class:`QpProblem`. An exception of it is a failed solve."""
+    """Whatever solves a :class:`QpProblem`: ``CartesianController(robot, settings, solver=MySolver())`` uses it.
 
-    def solve(self, problem: QpProblem) -> QpSolution: ...
+    Nothing about its answer is trusted. An exception, and an answer that is not usable, is a failed solve: the step
+    executes the certified stop.
+    """
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        """Solve ``problem``, as well as may be.
+
+        Args:
+            problem: The problem of this step.
+
+        Returns:
+            The solution; one whose ``v`` is None where there is none.
+        """
+        ...
 
 
 def row_softness(H: Array, rows: Array) -> Array:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.cell import AUTO, Config
+from q2r2_control.control.constraints import Constraint
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.qp import Solver
+from q2r2_control.control.tasks.external import Task
 from q2r2_control.drives.base import make_drive, permitted
 from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import ROUTINE, Reason, ReasonKind
@@ -55,10 +59,34 @@ class Pipeline(RequestedRun):
     The arms are brought to rest before input and plant are closed, for whatever reason a run ends. A listener that
     raises ends the run like :meth:`stop`, and its exception goes to the caller. A plant that measures nonsense or does
     not follow ends it with a :class:`PlantError`: see ``supervision``.
+
+    Args:
+        config: The cell.
+        robot: Its arms.
+        input: Whose hands, or policy, lead them.
+        plant: The arms, real or simulated, that its commands move.
+        mode: Kind of the plant's commands: joint positions, velocities, or the torques of a Cartesian impedance.
+        solver: As of :class:`CartesianController`, like ``tasks`` and ``constraints``. A recording does not have these
+            objects, so that a replay of the run goes without them.
+        tasks: Costs beside those of ``config.control.tasks``.
+        constraints: Rows beside those of the controller.
+
+    Raises:
+        ConfigError: An argument is of another kind, the plant lacks the mode, the input lacks a control that is bound,
+            or the controller refuses its part.
     """
 
     def __init__(
-        self, config: Config, robot: Robot, input: Input, plant: Plant, mode: CommandMode | str = CommandMode.POSITION
+        self,
+        config: Config,
+        robot: Robot,
+        input: Input,
+        plant: Plant,
+        mode: CommandMode | str = CommandMode.POSITION,
+        *,
+        solver: Solver | str | None = None,
+        tasks: Sequence[Task] = (),
+        constraints: Sequence[Constraint] = (),
     ) -> None:
         super().__init__()
         check_kind("config", config, Config, "a Config, as load_config returns")
@@ -70,7 +98,11 @@ class Pipeline(RequestedRun):
         # A session is of one mode: its arms follow no positions while torques are not safe.
         has_servos = CommandMode.POSITION in plant.modes and not isinstance(plant, SessionPlant)
         self.drive = make_drive(check_mode(mode, plant), robot, config, has_servos)
-        self.controller = CartesianController(robot, permitted(config.control, self.drive))
+        if isinstance(solver, str):
+            self.config = config.model_copy(update={"control": config.control.with_solver(solver)})
+            solver = None
+        self._own: dict[str, Any] = {"solver": solver, "tasks": tasks, "constraints": constraints}
+        self.controller = CartesianController(robot, permitted(self.config.control, self.drive), **self._own)
         self._data = robot.model.createData()
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
@@ -86,16 +118,21 @@ class Pipeline(RequestedRun):
         input: Input | str | None = None,
         plant: Plant | str | None = None,
         mode: CommandMode | str = CommandMode.POSITION,
+        solver: Solver | str | None = None,
+        tasks: Sequence[Task] = (),
+        constraints: Sequence[Constraint] = (),
     ) -> Pipeline:
         """Build a pipeline with an ``input`` (such as ``headset``) and a ``plant`` (such as ``kinematic``).
 
         Either is the name of an entry point, see :mod:`q2r2_control.plugins`, an object, or None: the cell's. ``mode``:
         the plant gets joint positions, velocities, or the torques of a Cartesian impedance. Raises :class:`ConfigError`
-        for an unknown name, a mode that the plant lacks, and a binding to a control that the input lacks.
+        for an unknown name, a mode that the plant lacks, and a binding to a control that the input lacks. The others
+        are those of the class; a task or constraint may have been made with another Robot of the same ``config``.
         """
         robot = Robot.from_config(config)
         source = make_input(config.input if input is None else input, config)
-        return cls(config, robot, source, make_plant(config.plant if plant is None else plant, robot, config), mode)
+        moves = make_plant(config.plant if plant is None else plant, robot, config)
+        return cls(config, robot, source, moves, mode, solver=solver, tasks=tasks, constraints=constraints)
 
     @property
     def supervisor(self) -> Supervisor:
@@ -218,11 +255,9 @@ class Pipeline(RequestedRun):
 
     def _prepare(self, realtime: bool) -> None:
         """Nothing of an earlier run may move an arm: every run starts paused and with open grippers, as the plant."""
-        # Whether a solution is late depends on the machine; a repeatable run must not.
-        changes = {} if realtime else {"solve_time_limit": None}
-        settings = permitted(self.config.control.model_copy(update=changes), self.drive)
+        settings = permitted(self.config.control.timed(realtime), self.drive)
         if settings != self.controller.settings:
-            self.controller = CartesianController(self.robot, settings)
+            self.controller = CartesianController(self.robot, settings, **self._own)
         self._set_up()
 
     def _set_up(self) -> None:

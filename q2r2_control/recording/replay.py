@@ -137,7 +137,7 @@ class ReplayPipeline(Pipeline):
         self.requests.extend(event.reason for event in asked if event.kind in REPEATED)
 
     def _prepare(self, realtime: bool) -> None:
-        settings = permitted(self.config.control.model_copy(update={"solve_time_limit": None}), self.drive)
+        settings = permitted(self.config.control.timed(realtime=False), self.drive)
         inner = solver_of(settings, self.robot.model.nv)
         self.controller = CartesianController(self.robot, settings, solver=_Solver(inner, self._recorded))
         super()._prepare(realtime)

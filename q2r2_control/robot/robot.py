@@ -77,6 +77,20 @@ class Robot:
     can meet, and what stands in the cell. Every monitored shape is a capsule, a sphere, or a box fixed in the world. A
     finger is all that it sweeps, and ``finger_bodies`` says what counts at a known opening. ``objects`` are what
     grippers hold, beside the collision model. ``ignored_pairs`` of one arm's shapes overlap by construction.
+
+    Attributes:
+        name: Of the URDF.
+        model: ``pinocchio.Model`` of the joints that move a tool. With data of its own, ``robot.model.createData()``, a
+            task or a constraint computes Jacobians by Pinocchio: ``pinocchio.computeFrameJacobian(robot.model, data,
+            q, robot.arms["left"].frame_id, pinocchio.LOCAL_WORLD_ALIGNED)``, (6, nv), linear, then angular.
+        joint_names: Names in the order of every array of joints.
+        arms: By name, base to tool: ``frame_id`` of its tool in ``model``, ``joints``, the places of its joints in
+            arrays of joints, and ``tool_frame``, the name of its tool's link.
+        home: Joint positions at which the cell starts (nv,) [rad].
+        position_lower: The model's limits (nv,) [rad]; ``position_upper`` likewise.
+        velocity_limit: The model's limits (nv,) [rad/s].
+        torque_limit: The model's limits (nv,) [Nm].
+        urdf: The whole cell as a text.
     """
 
     def __init__(

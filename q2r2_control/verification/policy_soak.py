@@ -142,7 +142,7 @@ class PolicySoak:
 
     def __init__(self, config: Config, seed: int, streams: Sequence[str] = STREAMS) -> None:
         self._streams, self._round = streams, list[str]()  # each of them comes once a round
-        config = config.model_copy(update={"control": config.control.model_copy(update={"solve_time_limit": None})})
+        config = config.model_copy(update={"control": config.control.timed(realtime=False)})
         self._cell, self._seed, self._period = config.name, seed, 1.0 / config.nominal_rate_hz
         self._input = PolicyInput()
         self._pipeline = Pipeline.from_config(config, input=self._input, plant="kinematic")

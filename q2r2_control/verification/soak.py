@@ -100,9 +100,9 @@ def run_soak(
 ) -> SoakReport:
     """Soak the controller of a cell; at ticks without a made-up fault the cell's solver, or ``solver``, is asked."""
     robot = Robot.from_config(config)
-    settings = config.control.model_copy(update={"solve_time_limit": config.control.solve_time_limit or 0.005})
+    settings = config.control.timed(realtime=True)
     # The solver gets no time limit: a soak that finds something has to find it again.
-    untimed = config.control.model_copy(update={"solve_time_limit": None})
+    untimed = config.control.timed(realtime=False)
     inner = solver_of(untimed, robot.model.nv) if solver is None else Guard(solver, robot.model.nv)
     name = config.control.solver if solver is None else type(solver).__name__
     worst = WorstSolver(robot, np.random.default_rng([seed, 6]))

@@ -10,15 +10,63 @@ import pytest
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ContactPair
+from q2r2_control.control.qp import QpProblem, QpSolution
+from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
-from q2r2_control.types import SIDES, HandInputs, HandSample
+from q2r2_control.types import SIDES, Array, HandInputs, HandSample
 from tests.pipeline.loops import FreezingLoop, pipeline
 from tests.support.processes import Watch, assert_torque_bounds, cell, changes, speed
+
+
+class Counting:
+    """A constraint that holds left_A3, a cost of nothing and a solver, each of which counts how often it is asked."""
+
+    hard = True
+
+    def __init__(self) -> None:
+        self.asked = {"rows": 0, "cost": 0, "solve": 0}
+
+    def rows(self, q: Array, v: Array) -> tuple[Array, Array]:
+        self.asked["rows"] += 1
+        row = np.eye(len(q))[2:3]
+        return np.concatenate([row, -row]), np.zeros(2)
+
+    def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
+        self.asked["cost"] += 1
+        return np.zeros((len(q), len(q))), np.zeros(len(q))
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        self.asked["solve"] += 1
+        return DaqpSolver(len(problem.g)).solve(problem)
+
+
+def test_a_loop_asks_a_program_s_own_tasks_constraints_and_solver_at_every_tick_of_each_run() -> None:
+    own = Counting()
+    config = cell().model_copy(update={"loop_rate_hz": 500.0})
+    loop = Pipeline.from_config(
+        config, input=ScriptedInput("circle"), plant="kinematic", solver=own, tasks=[own], constraints=[own]
+    )
+    speeds: list[Array] = []
+    loop.listeners.append(lambda tick: speeds.append(np.abs(tick.reference.v)))
+    for _ in range(2):  # a run in simulated time may have a controller of its own
+        own.asked = dict.fromkeys(own.asked, 0)
+        loop.run(1.8, realtime=False)
+        assert min(own.asked.values()) >= 900
+    fastest = np.max(speeds, axis=0)
+    assert fastest[2] < 1e-3
+    assert fastest[3] > 0.01
+
+
+def test_a_loop_takes_its_solver_s_name_in_place_of_the_cell_s() -> None:
+    loop = Pipeline.from_config(cell(), input=ScriptedInput("circle"), plant="kinematic", solver="osqp")
+    assert loop.controller.settings.solver == loop.config.control.solver == "osqp"
+    with pytest.raises(ConfigError, match=r"control\.solver = 'nosuch'"):
+        Pipeline.from_config(cell(), input=ScriptedInput("circle"), plant="kinematic", solver="nosuch")
 
 
 @pytest.mark.slow

@@ -16,7 +16,13 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 # Peer -> the package that it needs, whose name its module and its class have here.
-PEERS = {"roboplan": "roboplan", "roboplan, 10 nearest": "roboplan", "mink": "mink", "pink, 10 nearest": "pink"}
+PEERS = {
+    "roboplan": "roboplan",
+    "roboplan, 10 nearest": "roboplan",
+    "mink": "mink",
+    "pink, 10 nearest": "pink",
+    "embodik, 10 nearest": "embodik",
+}
 WITHOUT_ACCELERATION_LIMIT = ("mink",)
 INSTALL = "pip install 'q2r2_control[bench]'"
 NEAREST_ROWS = 10  # separation rows of a peer that is given the nearest pairs only

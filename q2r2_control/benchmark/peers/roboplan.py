@@ -12,19 +12,17 @@ by itself, is off: with it the tools hardly follow at ticks of 1 ms.
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from itertools import combinations
 
-import coal
 import numpy as np
 import pinocchio as pin
 from roboplan import core, optimal_ik
 
 from q2r2_control.benchmark.peers.base import DETECTION_DISTANCE, NEAREST_ROWS, PeerSettings
+from q2r2_control.benchmark.peers.bodies import urdf_with_our_bodies
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
-from q2r2_control.robot.urdf_parts import numbers
 from q2r2_control.types import Array
 
 _GROUP = "arms"
@@ -40,7 +38,7 @@ class Roboplan:
     def __init__(self, setup: PeerSettings, name: str) -> None:
         self.name = name
         robot, control, dt = setup.robot, setup.config.control, setup.dt
-        self._scene = core.Scene(robot.name, core.loadUrdfSceneDescriptionFromXml(_description(setup)))
+        self._scene = core.Scene(robot.name, core.loadUrdfSceneDescriptionFromXml(urdf_with_our_bodies(setup)))
         self._scene.addGroup(_GROUP, list(robot.joint_names))
         _watch_pairs(self._scene, robot)
         solver = optimal_ik.OinkSettings()
@@ -102,39 +100,6 @@ class Roboplan:
     def hold(self) -> tuple[Array, Array]:
         self._acceleration.reset()
         return self._q[self._indices], np.zeros(len(self._indices))
-
-
-def _description(setup: PeerSettings) -> str:
-    """The cell's URDF, its position limits narrowed by our margin, with our bodies as its collision shapes."""
-    root = ET.fromstring(setup.robot.urdf)
-    for name, lower, upper in zip(setup.robot.joint_names, setup.lower, setup.upper, strict=True):
-        limit = root.find(f"joint[@name='{name}']/limit")
-        if limit is not None:
-            limit.set("lower", repr(float(lower)))
-            limit.set("upper", repr(float(upper)))
-    links = {link.get("name"): link for link in root.iterfind("link")}
-    for link in links.values():
-        for shape in [*link.findall("collision"), *link.findall("collision_checking")]:
-            link.remove(shape)
-    for item in setup.robot.collision_model.geometryObjects:
-        _add_body(links[link_of(item.name)], item, setup.robot)
-    return ET.tostring(root, encoding="unicode")
-
-
-def _add_body(link: ET.Element, item: pin.GeometryObject, robot: Robot) -> None:
-    frame = robot.model.frames[robot.model.getFrameId(link_of(item.name), pin.FrameType.BODY)]
-    placement = frame.placement.actInv(item.placement)
-    body, shape = ET.SubElement(link, "collision", name=item.name), item.geometry
-    rpy = pin.rpy.matrixToRpy(placement.rotation)
-    ET.SubElement(body, "origin", xyz=numbers(placement.translation), rpy=numbers(rpy))
-    geometry = ET.SubElement(body, "geometry")
-    if isinstance(shape, coal.Box):
-        ET.SubElement(geometry, "box", size=numbers(2.0 * shape.halfSide))
-    elif isinstance(shape, coal.Sphere):
-        ET.SubElement(geometry, "sphere", radius=repr(shape.radius))
-    else:
-        ET.SubElement(geometry, "cylinder", radius=repr(shape.radius), length=repr(2.0 * shape.halfLength))
-        ET.SubElement(ET.SubElement(link, "collision_checking"), "capsule", name=item.name)
 
 
 def _watch_pairs(scene: core.Scene, robot: Robot) -> None:

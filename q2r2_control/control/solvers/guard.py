@@ -10,6 +10,7 @@ or loop for ever at such a problem. No solver is asked about one.
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -42,17 +43,20 @@ class Guard:
         """See :class:`Solver`.
 
         The answer must have a real array ``v`` of shape (nv,), all finite, and a finite ``solve_time`` of at least 0.
-        An exception, and any other answer, is a failed solve. ``v = None`` is one by the solver's own word.
+        An exception, and any other answer, is a failed solve. ``v = None`` is one by the solver's own word. The
+        ``solve_time`` of the result is at least what we measured, so that no solver can say that it was in time.
         """
         try:
             self.failure = _fault_of(problem)
             if self.failure is not None:
                 return _FAILED
+            begun = time.perf_counter()
             answer: Any = self._solver.solve(_copy_of(problem))
+            measured = time.perf_counter() - begun
             v, solve_time = answer.v, answer.solve_time
             self.failure = "no solution" if v is None else self._fault(v, solve_time)
             if self.failure is None:
-                return QpSolution(np.array(v, dtype=float), float(solve_time))
+                return QpSolution(np.array(v, dtype=float), max(float(solve_time), measured))
         except (KeyboardInterrupt, SystemExit):  # of a signal's handler, which ends the program
             raise
         except BaseException as error:  # as a panic in Rust is; whatever it raises is one tick without a solution

@@ -19,6 +19,8 @@ import scipy.sparse
 
 from q2r2_control.control.qp import QpProblem, QpSolution, row_softness
 
+_WIDE = 1.0  # of bounds that an equation makes needless, and which must be finite for some solvers [rad/s]
+
 
 def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem:
     """The problem with a slack for each row.
@@ -81,8 +83,20 @@ class QpSolversSolver:
             # with a bound just beyond what the box allows.
             fastest = np.maximum(np.abs(problem.lower), np.abs(problem.upper))
             made.h = np.minimum(made.h, np.abs(problem.rows) @ fastest + 1.0)
+        _state_equations(made, self._sparse)
         solution = qpsolvers.solve_problem(made, self._name, **self._options)
         time = (solution.build_time or 0.0) + (solution.solve_time or 0.0)
         if not solution.found or solution.x is None:
             return QpSolution(None, time)
         return QpSolution(solution.x[: len(problem.g)], time)
+
+
+def _state_equations(problem: qpsolvers.Problem, sparse: bool) -> None:
+    """Turn pairs of equal bounds into equations, since quadprog finds no solution between two bounds without room."""
+    lower, upper = np.asarray(problem.lb), np.asarray(problem.ub)
+    fixed = lower == upper
+    if not fixed.any():
+        return
+    A = np.eye(len(lower))[fixed]
+    problem.A, problem.b = scipy.sparse.csc_matrix(A) if sparse else A, lower[fixed]
+    problem.lb, problem.ub = np.where(fixed, lower - _WIDE, lower), np.where(fixed, upper + _WIDE, upper)

@@ -39,7 +39,7 @@ def make_solver(
     given = dict(options or {})
     check_installed(name)
     try:
-        with _on_stderr():
+        with printing_to_stderr():
             solver = _made(name, nv, time_limit, given)
             solver.solve(_smallest_problem(nv))  # an option that is unknown shows here, and not in motion
     except Exception as error:
@@ -67,7 +67,7 @@ def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any])
 
 
 @contextmanager
-def _on_stderr() -> Iterator[None]:
+def printing_to_stderr() -> Iterator[None]:
     """Print on stderr what is printed on stdout, by libraries too: that is where results are, as one JSON object."""
     try:
         sys.stdout.flush()

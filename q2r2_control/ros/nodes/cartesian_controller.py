@@ -81,7 +81,9 @@ class CartesianControllerNode(ManagedNode):
         self._watch = watch
         if isinstance(self._output.drive, TorqueDrive):
             make_impedance_live(self, self._output.drive.impedance)
-        self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
+        self._controller = CartesianController(
+            robot, permitted(config.control.timed(realtime=True), self._output.drive)
+        )
         make_control_live(self, self._controller)
         self._obstacles = ObstacleIntake(self, self._controller)
         self._loop = ControlLoop(

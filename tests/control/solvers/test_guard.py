@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from typing import Any
 
 import numpy as np
@@ -160,3 +161,18 @@ def test_no_solver_is_asked_about_a_problem_that_libraries_loop_at(problem: QpPr
     guard = Guard(Raising(AssertionError("asked")), NV)
     assert guard.solve(problem).v is None
     assert re.search(told, str(guard.failure))
+
+
+class Blocking:
+    """Finds a solution too late, and says that it took no time."""
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        time.sleep(0.02)
+        return QpSolution(np.zeros(NV), 0.0)
+
+
+def test_a_solver_that_blocks_is_late_whatever_it_says() -> None:
+    controller = CartesianController(ROBOT, ControllerSettings().timed(realtime=True), solver=Blocking())
+    report = controller.step({"left": controller.tool_pose("left")}, DT).report
+    assert report.unsolved == 1
+    assert report.solve_time >= 0.02

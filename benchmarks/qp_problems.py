@@ -1,0 +1,203 @@
+"""Which QP solvers solve the controller's problems, as the public qpbenchmark counts it?
+
+Writes the QPs of 2,000 ticks, of arms that move freely, press against each other, run into limits and recover, and
+prints qpbenchmark's success rates of the installed solvers. ``qpbenchmark --results-path build/qp_problems.csv
+benchmarks/qp_problems.py run`` then plays the same file, with reports and plots.
+Both need ``pip install 'q2r2_control[bench]'``.
+
+A problem is solved if the largest primal residual, dual residual and duality gap are below the tolerance of the
+settings: 1 (default), 1e-3, 1e-6 and 1e-9. The problem is that of ``CartesianController.problem``, with a slack for
+each row, given to each solver through qpsolvers. OSQP is therefore set up anew at every problem, and DAQP is not called
+directly.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas
+import pinocchio as pin
+import qpbenchmark
+import qpsolvers
+import typer
+from qpbenchmark.parquet_test_set import ParquetTestSet
+from qpbenchmark.problem_list import ProblemList
+from qpbenchmark.utils import time_solve_problem
+from rich.table import Table
+
+from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
+from q2r2_control.control.solvers.registry import printing_to_stderr
+from q2r2_control.types import Array
+from q2r2_control.viewer.tables import figure_table
+
+FILE = Path("build/qp_problems.parquet")
+TICKS, SOLVED = 2000, 200
+DT = 0.002  # [s]
+_ANEW = 50  # ticks of a recovery
+Targets = dict[str, pin.SE3]
+Motion = Callable[[float, Mapping[str, pin.SE3]], Targets]
+
+
+class QpProblems(ParquetTestSet):
+    """The problems of ``path``, under the name that qpbenchmark looks for in this file."""
+
+    title = "Two arms of a QP controller"
+    description = "QPs of differential inverse kinematics of two KUKA iiwa 7 that keep limits and distances."
+    sparse_only = False
+
+    def __init__(self, path: Path = FILE) -> None:
+        super().__init__(path)
+
+
+def moved(start: Mapping[str, pin.SE3], *by: float) -> Targets:
+    """The tools' poses at the start, shifted [m]."""
+    return {arm: pin.SE3(pose.rotation, pose.translation + np.array(by)) for arm, pose in start.items()}
+
+
+def freely(t: float, start: Mapping[str, pin.SE3]) -> Targets:
+    """Both tools go round a circle in free air."""
+    return moved(start, 0.0, 0.1 * math.sin(math.pi * t), 0.1 - 0.1 * math.cos(math.pi * t))
+
+
+def pressing(t: float, start: Mapping[str, pin.SE3]) -> Targets:
+    """Each tool is sent to where the other one was, up and down."""
+    left, right = start["left"], start["right"]
+    swing = np.array([0.0, 0.0, 0.1 * math.sin(math.tau * t)])
+    return {
+        "left": pin.SE3(left.rotation, right.translation + swing),
+        "right": pin.SE3(right.rotation, left.translation - swing),
+    }
+
+
+def out_of_reach(t: float, start: Mapping[str, pin.SE3]) -> Targets:
+    """Targets jump to places beyond the reach every quarter of a second."""
+    random = np.random.default_rng(int(4.0 * t))
+    places = {arm: random.uniform([-0.5, -1.5, -0.6], [2.0, 1.5, 1.5]) for arm in start}
+    turns = {arm: pin.exp3(random.normal(size=3)) for arm in start}
+    return {arm: pin.SE3(turns[arm] @ pose.rotation, pose.translation + places[arm]) for arm, pose in start.items()}
+
+
+MOTIONS: dict[str, Motion] = {"free": freely, "contact": pressing, "limits": out_of_reach, "recovery": freely}
+
+
+def outside(robot: Robot, random: np.random.Generator) -> Array:
+    """Anywhere within the limits, where arms often overlap, with one joint 0.05 rad beyond its own (nv,) [rad]."""
+    q = random.uniform(robot.position_lower, robot.position_upper)
+    joint = random.integers(robot.model.nv)
+    q[joint] = robot.position_upper[joint] + 0.05
+    return np.asarray(q)
+
+
+def problems(ticks: int) -> Iterator[qpbenchmark.Problem]:
+    """The problem of every tick, as many of each of ``MOTIONS``."""
+    robot = Robot.from_config(load_config(DEMO_CONFIG))
+    controller, random = CartesianController(robot), np.random.default_rng(1)
+    start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
+    for name, motion in MOTIONS.items():
+        controller.reset(robot.home)
+        for tick in range(ticks // len(MOTIONS)):
+            if name == "recovery" and tick % _ANEW == 0:
+                controller.reset(outside(robot, random))
+            targets = motion(tick * DT, start)
+            yield qpbenchmark.Problem.from_qpsolvers(controller.problem(targets, DT), f"{name}_{tick:04d}")
+            controller.step(targets, DT)
+
+
+def write(path: Path, ticks: int) -> None:
+    """Write the problems of ``ticks`` as a file for :class:`QpProblems`."""
+    found = ProblemList()
+    for problem in problems(ticks):
+        found.append(problem)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    found.to_parquet(str(path))
+
+
+def solve(test_set: QpProblems, count: int) -> qpbenchmark.Results:
+    """The results of all installed solvers and all settings, of ``count`` problems evenly spread over the set."""
+    total = test_set.count_problems()
+    chosen = set(np.linspace(0, total - 1, min(count, total)).astype(int).tolist())
+    rows: list[dict[str, Any]] = []
+    for index, problem in enumerate(test_set):
+        if index not in chosen:
+            continue
+        if len(rows) % 20 == 0:
+            print_progress(f"{problem.name} of {total} problems")
+        for solver in sorted(test_set.solvers):
+            for settings, by_solver in test_set.solver_settings.items():
+                rows.append(_row(problem, solver, settings, by_solver[solver]))
+    results = qpbenchmark.Results(None, test_set)
+    # In one go, since a row that is added by ``update`` copies all others.
+    results.df = pandas.DataFrame(rows)
+    return results
+
+
+def _row(problem: qpbenchmark.Problem, solver: str, settings: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of matrices that a solver wants sparse
+        solution, runtime = time_solve_problem(problem, solver, **options)
+    return {
+        "problem": problem.name,
+        "solver": solver,
+        "settings": settings,
+        "runtime": runtime,
+        "found": bool(solution.found),
+        "primal_residual": solution.primal_residual(),
+        "dual_residual": solution.dual_residual(),
+        "duality_gap": solution.duality_gap(),
+    }
+
+
+def success_rates(results: qpbenchmark.Results) -> pandas.DataFrame:
+    """Percentage of problems that each solver solves, by solver and settings, as qpbenchmark's reports have it."""
+    tolerances = results.test_set.tolerances
+    by_kind = [
+        {name: getattr(tolerance, kind) for name, tolerance in tolerances.items()} for kind in ("primal", "dual", "gap")
+    ]
+    return results.build_success_rate_df(*by_kind)
+
+
+def table_of(results: qpbenchmark.Results, ticks: int, solved: int) -> Table:
+    """Success rates, and the median time of a solve with default settings."""
+    rates = success_rates(results)
+    default = results.df[results.df["settings"] == "default"]
+    median = 1e6 * default.groupby("solver")["runtime"].median()
+    order = ("default", "low_accuracy", "mid_accuracy", "high_accuracy")
+    return figure_table(
+        f"QPs of {ticks} ticks, {solved} of them solved",
+        ("solver", "default [%]", "1e-3 [%]", "1e-6 [%]", "1e-9 [%]", "median [us]"),
+        [(solver, *(float(rates.at[solver, name]) for name in order), float(median[solver])) for solver in rates.index],
+        ("solved: primal and dual residual and duality gap below 1, 1e-3, 1e-6, 1e-9; median: of a default solve",),
+    )
+
+
+def main(
+    ticks: Annotated[int, typer.Option(min=4, help="Whose QPs are written.")] = TICKS,
+    solved: Annotated[int, typer.Option(min=1, help="Problems to solve, evenly spread.")] = SOLVED,
+    file: Annotated[Path, typer.Option(help="Where the test set is written.")] = FILE,
+    json: Json = False,
+) -> None:
+    """Write the test set, solve a part of it by every installed solver, and print the success rates."""
+    print_progress(f"{ticks} ticks")
+    write(file, ticks)
+    with printing_to_stderr():
+        results = solve(QpProblems(file), solved)
+    count = int(results.df["problem"].nunique())
+    data = {
+        "file": str(file),
+        "ticks": ticks,
+        "solved": count,
+        "qpbenchmark": qpbenchmark.__version__,
+        "qpsolvers": qpsolvers.__version__,
+        "success_percent": success_rates(results).to_dict("index"),
+    }
+    print_report(data, (table_of(results, ticks, count),), json)
+
+
+if __name__ == "__main__":
+    typer.run(main)

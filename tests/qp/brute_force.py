@@ -1,0 +1,71 @@
+"""The solution of a small QP without a solver: every set of active bounds and rows is tried.
+
+The cost with the slacks put in, s_i = max(0, lower_i - a_i v), is
+
+    f(v) = 1/2 v' H v + g' v + 1/2 sum_i max(0, lower_i - a_i v)^2 / rho_i.
+
+At the solution each joint is at its lower bound, at its upper one or between them, and each row is satisfied or gives
+way. For each of these cases f is a parabola, whose least point is found by one linear system. The best of all such
+points that satisfy the box and the hard rows is the solution, since f is strictly convex.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from q2r2_control.control.qp import QpProblem, row_softness
+from q2r2_control.types import Array
+
+_ROUNDING = 1e-9
+
+
+def cost_of(problem: QpProblem, v: Array) -> float:
+    """f at velocities ``v`` (nv,) [rad/s], in which a hard row costs nothing."""
+    soft = len(problem.rows_lower) - problem.hard
+    slack = np.maximum(problem.rows_lower - problem.rows @ v, 0.0)[:soft]
+    softness = row_softness(problem.H, problem.rows)[:soft]
+    return float(0.5 * v @ problem.H @ v + problem.g @ v + 0.5 * np.sum(slack**2 / softness))
+
+
+def is_feasible(problem: QpProblem, v: Array, tolerance: float = _ROUNDING) -> bool:
+    """Whether ``v`` (nv,) [rad/s] is within the box and satisfies the hard rows, to a ``tolerance`` [rad/s]."""
+    soft = len(problem.rows_lower) - problem.hard
+    outside = np.maximum(problem.lower - v, v - problem.upper).max()
+    lacking = (problem.rows_lower - problem.rows @ v)[soft:].max(initial=0.0)
+    return bool(max(outside, lacking) <= tolerance)
+
+
+def solve_by_brute_force(problem: QpProblem) -> Array:
+    """The solution (nv,) [rad/s] of a problem that has one; the time is 3^nv 2^m."""
+    best, least = None, np.inf
+    for sides in product((-1, 0, 1), repeat=len(problem.g)):
+        for active in product((False, True), repeat=len(problem.rows_lower)):
+            v = _least_point(problem, np.array(sides), np.array(active, dtype=bool))
+            if v is not None and is_feasible(problem, v) and (cost := cost_of(problem, v)) < least:
+                best, least = v, cost
+    assert best is not None
+    return best
+
+
+def _least_point(problem: QpProblem, sides: npt.NDArray[np.int64], active: npt.NDArray[np.bool_]) -> Array | None:
+    """Least point of f with joints at the bounds that ``sides`` say, soft rows giving way and hard ones met."""
+    soft = np.arange(len(active)) < len(active) - problem.hard
+    giving, met = problem.rows[active & soft], problem.rows[active & ~soft]
+    stiffness = 1.0 / row_softness(problem.H, problem.rows)[active & soft]
+    H = problem.H + giving.T * stiffness @ giving
+    g = problem.g - giving.T * stiffness @ problem.rows_lower[active & soft]
+    fixed, free = sides != 0, sides == 0
+    v = np.where(sides < 0, problem.lower, problem.upper) * fixed
+    k = len(met)
+    system = np.block([[H[np.ix_(free, free)], met[:, free].T], [met[:, free], np.zeros((k, k))]])
+    right = np.concatenate([-(g + H @ v)[free], problem.rows_lower[active & ~soft] - met @ v])
+    if not len(right):
+        return v
+    try:
+        v[free] = np.linalg.solve(system, right)[: free.sum()]
+    except np.linalg.LinAlgError:  # more hard rows than free joints
+        return None
+    return v
