@@ -19,6 +19,7 @@ from q2r2_control.control.reference import observe_bodies, spare_distance
 from q2r2_control.control.safety.protective_distance import ObstacleData
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.control.step_report import LimitNames
+from q2r2_control.errors import RobotError, shown
 from q2r2_control.robot.obstacle_bodies import distances_with, roles_with_obstacles, with_obstacle_bodies
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
@@ -127,6 +128,15 @@ class WatchedPairs:
         self._obstacles.keep_clear(0.0)
         self._observe_again(self._unchanged)
         return None if blocked < 0 else self._names.pair(blocked)
+
+    def pass_time(self, time: float) -> None:
+        """Let reports of moving obstacles become older by a ``time`` [s] for which no step is taken.
+
+        Raises :class:`RobotError` for what is no time.
+        """
+        if not (isinstance(time, float | int) and 0.0 <= time < np.inf):
+            raise RobotError(f"time = {shown(time)}: allowed: seconds, 0 or more")
+        self._obstacles.pass_time(time)
 
     def pairs_ahead(self, stop: float) -> PairsAhead:
         """All pairs, for a look at a way before it is gone by arms that stop in ``stop`` [s].

@@ -37,6 +37,9 @@ class LoopStep:
     refusals: dict[str, Reason] = field(default_factory=dict)  # arm -> why its target is not followed
 
 
+_SAME_TIME = 1e-6  # [s]; less is rounding
+
+
 class ControlLoop:
     """Supervision, controller, grippers and drive, in the order that one tick needs.
 
@@ -75,6 +78,8 @@ class ControlLoop:
         self.holding: dict[str, bool] = {}  # of each arm that has an object, whether its gripper holds it
         self.granted_openings: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and granted
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
+        self._first: float | None = None  # time of the first tick [s]
+        self._aged = 0.0  # by how much reports of moving obstacles became older since then [s]
 
     @property
     def held_grippers(self) -> dict[str, tuple[str, str]]:
@@ -129,6 +134,7 @@ class ControlLoop:
         ``openings`` the measured ones, 0 closed .. 1 fully open. ``posture`` (nv,) [rad]: where
         joints go that the targets leave free; None: home.
         """
+        self._age_obstacles(now)
         supervisor, refusals = self.supervisor, {}
         for arm, pose in targets.items():
             if pose is None:
@@ -144,6 +150,7 @@ class ControlLoop:
             self._begin(state, openings, now)
         if reference is None and self._owns_plant:
             reference = self.controller.brake(dt)  # the rest of the arms' motion
+        self._aged += braked if reference is None else braked + dt
         if self.controller.kept_distances is not self._kept:  # the step may have taken up others
             self._kept = self.controller.kept_distances
             self.drive.set_kept_distances(self._kept)
@@ -157,6 +164,19 @@ class ControlLoop:
             command = self.drive.command(reference, state, commanded, dt, trusted)
             command.deceleration = self.controller.stop_deceleration
         return LoopStep(reference, command, commanded, trusted, self.drive.report, refusals)
+
+    def _age_obstacles(self, now: float) -> None:
+        """Let reports of moving obstacles be as old as the clock says.
+
+        A step makes them older by the time that it moves the reference by. Less passes than on the clock while the loop
+        stalls, and none while the arms are not commanded.
+        """
+        if self._first is None:
+            self._first = now
+        behind = now - self._first - self._aged
+        if behind > _SAME_TIME:
+            self.controller.pass_time(behind)
+            self._aged += behind
 
     def limit_grippers(
         self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float

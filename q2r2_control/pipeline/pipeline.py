@@ -107,6 +107,7 @@ class Pipeline(RequestedRun):
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
         self._stopping = False
+        self._rested_since: float | None = None  # the end of the run before this one [s]
         self._pace: WallPace | None = None  # of a run in simulated time that must not be faster than the clock
         self._set_up()
 
@@ -278,6 +279,8 @@ class Pipeline(RequestedRun):
         self.plant.reset()
         self._state = check_state(self.plant.state(), self.robot)  # the newest one
         self._clock = self.make_clock(realtime)
+        if realtime and self._rested_since is not None:
+            self.controller.pass_time(self._clock.now - self._rested_since)
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)
         self._lead = TargetLead()
@@ -325,6 +328,7 @@ class Pipeline(RequestedRun):
             # From the last state that came: a plant that has lost its sensors still takes commands.
             if (command := self.drive.last_command(self._state, self._grippers)) is not None:
                 self.plant.apply(command)
+            self._rested_since = time.monotonic()
 
     def tick(self) -> Tick:
         """The way of the data, once: sample -> target -> reference -> command -> state."""

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive
 from q2r2_control.events import Reason, ReasonKind
@@ -23,10 +24,11 @@ DT = 0.004
 class Arms:
     """Both arms at home, as another program's plant measures them."""
 
-    def __init__(self, owns_plant: bool) -> None:
+    def __init__(self, owns_plant: bool, obstacles: tuple[str, ...] = ()) -> None:
         config, robot = cell(), Robot.from_config(cell())
         drive, watch = make_drive(CommandMode.POSITION, robot, config), watch_settings(config.supervision, False)
-        controller = CartesianController(robot, config.control)
+        settings = config.control.model_copy(update={"moving_obstacles": obstacles})
+        controller = CartesianController(robot, settings)
         self.loop = ControlLoop(controller, drive, DT, StreamSettings(), watch, owns_plant=owns_plant)
         self.home, self.now = robot.home, 0.0
 
@@ -113,3 +115,36 @@ def test_while_the_arms_do_not_move_a_gripper_that_was_held_goes_back_only(
     before: tuple[float, float] | None, wanted: float, granted: float
 ) -> None:
     assert without_proof(wanted, before) == granted
+
+
+class ReportedHand(Arms):
+    """A hand far from the arms was reported at the first tick and never again."""
+
+    def __init__(self, owns_plant: bool) -> None:
+        super().__init__(owns_plant, ("hand",))
+        self.loop.controller.move_obstacle(
+            "hand", MovingObstacle(shape="sphere", size=(0.1,), position=(9.0, 9.0, 9.0), speed=0.1)
+        )
+
+    @property
+    def age(self) -> float:
+        return self.loop.controller.obstacle_reports["hand"].age
+
+
+def test_a_report_of_a_hand_is_as_old_as_the_clock_says_when_the_loop_stalls() -> None:
+    arms = ReportedHand(owns_plant=True)
+    arms.loop.activate(arms.state, arms.now)
+    first = arms.now + DT
+    for tick in range(200):
+        arms.now += 0.06 if tick % 40 == 39 else 0.0  # a tick goes on by DT all the same
+        arms.tick()
+        assert arms.now - first - 1e-9 <= arms.age <= arms.now - first + DT + 1e-5
+
+
+def test_a_report_of_a_hand_gets_older_while_arms_of_another_program_are_not_commanded() -> None:
+    arms = ReportedHand(owns_plant=False)
+    first = arms.now + DT
+    for _ in range(500):
+        arms.tick()
+        arms.loop.supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
+    assert arms.now - first - 1e-9 <= arms.age <= arms.now - first + DT + 1e-5

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,23 @@ def test_springs_of_torque_mode_change_on_a_ramp_and_no_others() -> None:
         loop.change_control({"translational_stiffness": -1.0})
     with pytest.raises(ConfigError, match="translational_stiffness"):
         pipeline().change_control({"translational_stiffness": 500.0})
+
+
+def test_a_report_of_a_hand_gets_older_between_two_runs_of_one_pipeline() -> None:
+    loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
+    hand = MovingObstacle(shape="sphere", size=(0.1,), position=(9.0, 9.0, 9.0), speed=0.1)
+    reported: list[float] = []
+
+    def look(tick: Tick) -> None:
+        if not reported:
+            loop.controller.move_obstacle("hand", hand)
+            reported.append(time.monotonic())
+
+    loop.listeners.append(look)
+    loop.run(0.02)
+    time.sleep(0.2)
+    loop.run(0.02)
+    assert loop.controller.obstacle_reports["hand"].age >= 0.2
 
 
 def test_a_hand_that_a_program_reports_in_front_of_an_arm_is_named_once_and_brakes_it() -> None:
