@@ -198,7 +198,7 @@ class ReasonKind(StrEnum):
     FRI_SESSION = (
         "fri_session",
         "{arm}: the cabinet is in {session}, connection {quality}, safety {safety}, drives {drives}; "
-        "commands are followed in commanding active",
+        "commands are followed in commanding active, without a stop of the safety controller",
     )
     FRI_COMMAND_MODE = "fri_command_mode", "{arm}: the Sunrise application asks for {asked} commands; allowed: {wanted}"
     FRI_TOO_SELDOM = (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.plants.fri.answers import CATCH_UP
-from q2r2_control.plants.fri.wire import JOINTS, CommandKind, IoValue, Joints, Monitoring, Session, in_words
+from q2r2_control.plants.fri.wire import JOINTS, CommandKind, IoValue, Joints, Monitoring, Safety, Session, in_words
 
 TORQUE_PERIOD = 0.005  # between two answers at most: with 0.01 the arm swings up at the default stiffness [s]
 _SILENT = 0.1  # a cabinet without a message for longer is gone [s]
@@ -77,7 +77,8 @@ class SessionState:
         if self.is_too_slow:
             period, allowed = 1e3 * self.period, 1e3 * TORQUE_PERIOD
             return Reason.of(ReasonKind.FRI_TOO_SELDOM, arm=self.arm, period=period, allowed=allowed)
-        if newest.session is not Session.COMMANDING_ACTIVE:
+        # Some stops of the safety controller let the session go on for a while, in which our own stop is to begin.
+        if newest.session is not Session.COMMANDING_ACTIVE or newest.safety is not Safety.NORMAL:
             states = newest.session, newest.quality, newest.safety, newest.drives
             doing, quality, safety, drives = map(in_words, states)
             return Reason.of(

@@ -118,3 +118,16 @@ def test_between_two_ticks_the_posture_is_on_the_parabola_of_the_reference() -> 
     for t in (1.0, 1.025, 1.05, 1.1):
         np.testing.assert_allclose(path.at(t), 5.0 * (t - 1.0) ** 2, atol=1e-15)
     assert path.at(0.5) == 0.0
+
+
+@pytest.mark.parametrize("lost", [10, 65, 300, 2000])
+def test_a_cabinet_that_heard_no_answer_for_long_gets_the_next_one_after_the_last_that_it_heard(lost: int) -> None:
+    period = 0.001
+    times, heard = AnswerTimes(period, 0.004), -1
+    for question in range(100):
+        last = times.at(question, question * period, question, heard)
+        heard = question
+    for question in range(100, 100 + lost):
+        time = times.at(question, question * period, question, heard)
+        oldest_known = max(lost - 1024, 0) * (1.0 + CATCH_UP) * period
+        assert 0.0 < time - last <= (1.0 + CATCH_UP) * period + oldest_known

@@ -12,7 +12,7 @@ from q2r2_control.events import ReasonKind
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
 from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand
-from q2r2_control.plants.fri.wire import CommandKind, FriCommand, Monitoring, Session, write_monitoring
+from q2r2_control.plants.fri.wire import CommandKind, FriCommand, Monitoring, Safety, Session, write_monitoring
 from q2r2_control.wording import sentence
 from tests.plants.fri.asking_cabinet import ACTIVE, IPO, MONITORING, WAITING, Cabinet, Q
 
@@ -239,6 +239,18 @@ def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> Non
     assert kinds == [ReasonKind.FRI_SILENT, ReasonKind.FRI_SILENT]
     assert fault is not None
     assert fault.kind is ReasonKind.FRI_COMMAND_MODE
+
+
+@pytest.mark.parametrize("stop", [Safety.STOP_0_OR_1, Safety.STOP_1_ON_PATH, Safety.STOP_2])
+def test_a_stop_of_the_safety_controller_is_a_fault_while_the_session_goes_on(stop: Safety) -> None:
+    cabinet = Cabinet()
+    for message in (MONITORING, WAITING, ACTIVE):
+        cabinet.ask(message)
+    assert cabinet.session.state.fault(cabinet.now) is None
+    cabinet.ask(replace(ACTIVE, safety=stop))
+    fault = cabinet.session.state.fault(cabinet.now)
+    assert fault is not None
+    assert fault.kind is ReasonKind.FRI_SESSION
 
 
 def test_an_older_message_is_not_answered_and_lost_ones_are_counted() -> None:
