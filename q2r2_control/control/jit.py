@@ -22,8 +22,8 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A :func:`kernel` that becomes part of its callers: for a small one that is handed a whole model and data."""
-    return _compiled(function, _nrt=False)
+    """A :func:`kernel` that becomes part of its callers: for a small one that is called for each pair."""
+    return _compiled(function, _nrt=False, forceinline=True)
 
 
 def numpy_kernel(function: Callable[..., Any]) -> Callable[..., Any]:

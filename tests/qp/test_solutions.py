@@ -168,6 +168,22 @@ def test_a_solver_finds_daqps_solution_of_each_problem_of_a_motion(name: str, mo
         _assert_solved(solver.solve(problem), problem, expected, accuracy_of(name))
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_solver_finds_a_solution_where_the_box_hardly_lets_similar_rows_be_kept(name: str) -> None:
+    nv, up, unsolved = 7, np.full(7, 0.1), 0
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        rows = random.normal(size=nv) + 0.1 * random.normal(size=(3, nv))
+        rows /= np.linalg.norm(rows, axis=1)[:, None]
+        lower = 0.1 * np.abs(rows).sum(axis=1) * random.uniform(0.95, 1.05, 3)  # of what the box allows
+        problem = QpProblem(300.0 * np.eye(nv), np.zeros(nv), -up, up, rows, lower)
+        v = solver_of(name, nv).solve(problem).v
+        unsolved += v is None
+        if v is not None:
+            assert (rows @ np.clip(v, -up, up) >= np.minimum(lower, 0.1 * np.abs(rows).sum(axis=1)) - 0.01).all()
+    assert unsolved <= (2 if name == "osqp" else 0)
+
+
 def test_daqp_through_qpsolvers_finds_what_daqp_finds_directly() -> None:
     through, directly = QpSolversSolver("daqp"), solver_of("daqp", ROBOT.model.nv)
     for motion in MOTIONS:

@@ -52,7 +52,7 @@ def at_least(model: CollisionModel, data: CollisionData, p: int) -> float:
     return 0.5 * np.sqrt(square) - bodies.size[first] - bodies.size[second]
 
 
-@inlined_kernel
+@kernel
 def measure(model: CollisionModel, data: CollisionData, p: int) -> float:
     """Signed distance [m] of pair ``p``; fills ``data.contact``.
 

@@ -96,7 +96,7 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
     data.rows.used[0] = count
 
 
-@inlined_kernel
+@kernel
 def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: float, straight: bool) -> float:
     """Write how far pair ``p`` is apart at the instants, infinite where none is looked at; returns the least [m].
 
@@ -128,7 +128,7 @@ def _tangent(data: SafetyData, row: Array) -> float:
     return change
 
 
-@inlined_kernel
+@kernel
 def _append_row(
     model: SafetyModel, data: SafetyData, at: CollisionData, p: int, distance: float, moment: StopTime, count: int
 ) -> int:
@@ -167,7 +167,7 @@ def _append_row(
     return count + 1
 
 
-@inlined_kernel
+@kernel
 def _append_end_rows(
     model: SafetyModel, data: SafetyData, at: CollisionData, p: int, distance: float, moment: StopTime, count: int
 ) -> int:

@@ -6,7 +6,7 @@ The instants are spaced evenly in time, so that samples which one pair needs ser
 from __future__ import annotations
 
 from q2r2_control.control.geometry.collision import CollisionData, update_placements
-from q2r2_control.control.jit import inlined_kernel, kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.kernel_pointers import pointee_at
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData, SafetyModel
@@ -83,7 +83,7 @@ def stay_with_stop(data: SafetyData) -> None:
         data.candidate.deceleration[j] = data.certified[j]
 
 
-@inlined_kernel
+@kernel
 def sample_of(model: SafetyModel, data: SafetyData, i: int, duration: float) -> CollisionData:
     """The bodies at sample ``i`` of the candidate's stop."""
     candidate, rollout = data.candidate, data.rollout

@@ -22,12 +22,15 @@ from q2r2_control.control.qp import QpProblem, QpSolution, row_softness
 _WIDE = 1.0  # of bounds that an equation makes needless, and which must be finite for some solvers [rad/s]
 
 
-def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem:
+def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False) -> qpsolvers.Problem:
     """The problem with a slack for each row.
 
     Args:
         problem: of nv joints and m rows.
         sparse: whether matrices are ``scipy.sparse.csc_matrix``, as some solvers need.
+        scaled: whether the slacks are s_i / sqrt(rho_i), of which each costs as much as the other. quadprog takes some
+            problems for contradictions where costs differ by orders of magnitude. Others stop at residuals, which
+            are larger in these units.
 
     Returns:
         A ``qpsolvers.Problem`` in x = [v; s], (nv + m,) [rad/s], which shares no memory with ``problem``.
@@ -35,8 +38,10 @@ def slack_problem(problem: QpProblem, sparse: bool = False) -> qpsolvers.Problem
     nv, m = len(problem.g), len(problem.rows_lower)
     P = np.zeros((nv + m, nv + m))
     P[:nv, :nv] = problem.H
-    P[range(nv, nv + m), range(nv, nv + m)] = 1.0 / row_softness(problem.H, problem.rows)
-    G = np.hstack([-problem.rows, -np.eye(m)]) if m else None
+    softness = row_softness(problem.H, problem.rows)
+    P[range(nv, nv + m), range(nv, nv + m)] = 1.0 if scaled else 1.0 / softness
+    unit = np.sqrt(softness) if scaled else np.ones(m)
+    G = np.hstack([-problem.rows, -np.diag(unit)]) if m else None
     most = np.full(m, np.inf)
     most[m - problem.hard :] = 0.0
     return qpsolvers.Problem(
@@ -77,7 +82,7 @@ class QpSolversSolver:
         """
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)
-        made = slack_problem(problem, self._sparse)
+        made = slack_problem(problem, self._sparse, scaled=self._name == "quadprog")
         if made.h is not None:
             # Solvers print a warning at a number that they take as infinite. A row that the box keeps is kept as well
             # with a bound just beyond what the box allows.
