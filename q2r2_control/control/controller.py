@@ -85,7 +85,8 @@ class CartesianController(WatchedPairs):
         super().__init__(robot, settings)
         self._nv = robot.model.nv
         own = None if isinstance(solver, str) else solver
-        self._solver = solver_of(settings, self._nv) if own is None else Guard(own, self._nv)
+        guarded = own if own is None or isinstance(own, Guard) else Guard(own, self._nv)
+        self._solver = solver_of(settings, self._nv) if guarded is None else guarded
         self._qp = StepProblem(robot, settings, tasks, constraints)
         self._tools: TaskData = self._data_pointer.value.tasks
         self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step

@@ -30,6 +30,7 @@ from q2r2_control.verification.fault_injection import (
     Segment,
     WorstSolver,
     segments,
+    untimed,
 )
 from q2r2_control.verification.promises import Margin
 
@@ -102,12 +103,12 @@ def run_soak(
     robot = Robot.from_config(config)
     settings = config.control.timed(realtime=True)
     # The solver gets no time limit: a soak that finds something has to find it again.
-    untimed = config.control.timed(realtime=False)
-    inner = solver_of(untimed, robot.model.nv) if solver is None else Guard(solver, robot.model.nv)
+    simulated = config.control.timed(realtime=False)
+    inner = solver_of(simulated, robot.model.nv) if solver is None else Guard(solver, robot.model.nv)
     name = config.control.solver if solver is None else type(solver).__name__
     worst = WorstSolver(robot, np.random.default_rng([seed, 6]))
     faulty = FaultySolver(inner, np.random.default_rng([seed, 1]), worst)
-    controller = CartesianController(robot, settings, solver=faulty)
+    controller = CartesianController(robot, settings, solver=untimed(faulty, robot.model.nv))
     return Soak(config.name, controller, faulty, seed, name).run(ticks, progress)
 
 

@@ -19,7 +19,7 @@ from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.robot.kept_distances import kept_by_obstacles
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
-from q2r2_control.verification.fault_injection import FaultySolver, WorstSolver
+from q2r2_control.verification.fault_injection import FaultySolver, WorstSolver, untimed
 
 RADIUS = 0.1  # of a hand [m]
 
@@ -34,7 +34,7 @@ def controller_and_solver() -> tuple[CartesianController, FaultySolver]:
     robot = robot_of_cell()
     settings = ControllerSettings(moving_obstacles=("hand",))
     solver = FaultySolver(DaqpSolver(robot.model.nv), worst=WorstSolver(robot, np.random.default_rng(0)))
-    return CartesianController(robot, settings, solver=solver), solver
+    return CartesianController(robot, settings, solver=untimed(solver, robot.model.nv)), solver
 
 
 def controller_at_home() -> CartesianController:

@@ -16,7 +16,7 @@ from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, StepStatus
 from q2r2_control.verification.contract import Contract
-from q2r2_control.verification.fault_injection import ATTACKS, FaultySolver, WorstSolver
+from q2r2_control.verification.fault_injection import ATTACKS, FaultySolver, WorstSolver, untimed
 from q2r2_control.wording import limit_name
 from tests.control.scenarios import SCENARIOS, crossing
 from tests.control.test_scenarios import controller_of, robot_of
@@ -167,7 +167,7 @@ def test_the_report_names_what_holds_the_arms_back(controller: CartesianControll
 def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack: str, seed: int) -> float:
     """Least margin of a pair at any tick by Coal [m], all of which have a certificate."""
     solver = FaultySolver(DaqpSolver(robot.model.nv), worst=WorstSolver(robot, np.random.default_rng(seed)))
-    controller = CartesianController(robot, settings, solver=solver)
+    controller = CartesianController(robot, settings, solver=untimed(solver, robot.model.nv))
     solver.kept, solver.q = controller.kept_distances, robot.home
     controller.reset(robot.home)
     targets = crossing(0.0, {arm: controller.tool_pose(arm) for arm in robot.arms})

@@ -19,7 +19,7 @@ from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, StepStatus
 from q2r2_control.verification.contract import Contract
-from q2r2_control.verification.fault_injection import ATTACKS, STOPPING_FAULTS, FaultySolver, WorstSolver
+from q2r2_control.verification.fault_injection import ATTACKS, STOPPING_FAULTS, FaultySolver, WorstSolver, untimed
 from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
@@ -45,7 +45,7 @@ def controller_of(name: str) -> tuple[CartesianController, FaultySolver]:
     """Made once: reset starts it anew. The solver's times are made up, so that no outcome depends on the load."""
     settings = ControllerSettings(solve_time_limit=0.05)
     solver = FaultySolver(DaqpSolver(robot_of(name).model.nv))
-    return CartesianController(robot_of(name), settings, solver=solver), solver
+    return CartesianController(robot_of(name), settings, solver=untimed(solver, robot_of(name).model.nv)), solver
 
 
 def at_home(robot: Robot) -> tuple[Array, Array]:

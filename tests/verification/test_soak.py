@@ -20,7 +20,7 @@ from q2r2_control.control.solvers.daqp import DaqpSolver
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference
-from q2r2_control.verification.fault_injection import FINGERS, FaultySolver, WorstSolver, with_contact
+from q2r2_control.verification.fault_injection import FINGERS, FaultySolver, WorstSolver, untimed, with_contact
 from q2r2_control.verification.soak import Soak, SoakReport, run_soak
 from tests.support.object_cell import cell
 
@@ -39,7 +39,7 @@ def robot() -> Robot:
 @cache
 def controller_and_solver() -> tuple[CartesianController, FaultySolver]:
     solver = FaultySolver(DaqpSolver(robot().model.nv), np.random.default_rng(0))
-    return CartesianController(robot(), SETTINGS, solver=solver), solver
+    return CartesianController(robot(), SETTINGS, solver=untimed(solver, robot().model.nv)), solver
 
 
 class Sabotaged:
@@ -198,7 +198,9 @@ def test_hostile_ticks_with_a_hostile_hard_constraint_break_no_promise(constrain
     solver = FaultySolver(
         DaqpSolver(robot().model.nv), np.random.default_rng(1), WorstSolver(robot(), np.random.default_rng(2))
     )
-    controller = CartesianController(robot(), SETTINGS, solver=solver, constraints=[constraint])
+    controller = CartesianController(
+        robot(), SETTINGS, solver=untimed(solver, robot().model.nv), constraints=[constraint]
+    )
     report = Soak("cell", controller, solver, 6).run(2000)
     assert report.passed, report.broken
     assert report.counts["fallbacks_healthy"] > 20

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,13 +31,14 @@ class Guard:
     Args:
         solver: an object with ``solve``, from anywhere.
         nv: number of joints.
+        clock: what a solve is timed by [s].
 
     Attributes:
         failure: why the last answer was not a solution; None if it was one.
     """
 
-    def __init__(self, solver: Solver, nv: int) -> None:
-        self._solver, self._nv = solver, nv
+    def __init__(self, solver: Solver, nv: int, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._solver, self._nv, self._clock = solver, nv, clock
         self.failure: str | None = None
 
     def solve(self, problem: QpProblem) -> QpSolution:
@@ -50,9 +52,9 @@ class Guard:
             self.failure = _fault_of(problem)
             if self.failure is not None:
                 return _FAILED
-            begun = time.perf_counter()
+            begun = self._clock()
             answer: Any = self._solver.solve(_copy_of(problem))
-            measured = time.perf_counter() - begun
+            measured = self._clock() - begun
             v, solve_time = answer.v, answer.solve_time
             self.failure = "no solution" if v is None else self._fault(v, solve_time)
             if self.failure is None:
