@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-import os
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
@@ -221,10 +221,14 @@ class Soak:
 
 
 def _memory_mb() -> float | None:
-    """Resident memory of this process after collecting garbage [MB]; None where the system does not tell."""
+    """Memory of this process after collecting garbage, without files [MB]; None where the system does not tell.
+
+    Pages of libraries become resident whenever one of their functions is first called, however long that takes.
+    """
     gc.collect()
     try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    except (OSError, ValueError, IndexError):
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+    except OSError:
         return None
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+    found = re.search(r"^RssAnon:\s+(\d+) kB", status, re.MULTILINE)
+    return None if found is None else int(found[1]) / 1024
