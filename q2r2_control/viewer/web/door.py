@@ -6,6 +6,7 @@ import http
 import secrets
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import websockets.asyncio.server
@@ -14,9 +15,10 @@ from websockets.http11 import Request, Response
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.page_door import PageDoor, text_response
+from q2r2_control.viewer.web.browser_messages import LONGEST_MESSAGE, BrowserMessages, FilteredConnection
 
 _MOST_CLIENTS = 12
-_LONGEST_MESSAGE = 1 << 20  # from a browser [bytes]
+_CLOSE_TIMEOUT = 1.0  # for a browser to say that it has closed its end [s]
 
 
 class Door(PageDoor):
@@ -26,6 +28,7 @@ class Door(PageDoor):
         """Raises :class:`ConfigError` where the address cannot be bound."""
         super().__init__(host, port, "--web", secrets.token_urlsafe(16))
         self.url = self.url.replace("?token=", "")
+        self.messages = BrowserMessages()  # which of them viser gets
         self._clients = 0
 
     def refusal(self, request: Request, *, with_token: bool = True) -> str | None:
@@ -67,7 +70,8 @@ class Door(PageDoor):
                 finally:
                     self._clients -= 1
 
-            settings |= {"max_size": _LONGEST_MESSAGE, "sock": self.socket}
+            settings |= {"max_size": LONGEST_MESSAGE, "sock": self.socket, "close_timeout": _CLOSE_TIMEOUT}
+            settings["create_connection"] = partial(FilteredConnection, messages=self.messages)
             return serve(counted, process_request=checked, **settings)
 
         setattr(websockets.asyncio.server, "serve", guarded)  # noqa: B010, which a type checker would refuse

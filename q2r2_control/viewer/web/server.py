@@ -87,7 +87,8 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
     scene = CellScene(server, setup)
     limited = LimitedAnswers(answer)
     driving = Driving(server, setup, limited) if setup.driven else None
-    panel = Panel(server, setup, driving, limited)
+    panel = Panel(server, setup, driving, limited, door.messages.take_over)
+    door.messages.watch(server.gui)
     answer(Ready(door.url))
 
     def read() -> None:
