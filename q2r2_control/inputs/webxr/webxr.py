@@ -42,7 +42,7 @@ from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 PORT = 8443
 _READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
-_PATIENCE = 2.0  # for it to end [s]
+_PATIENCE, _LONGEST = 2.0, 10.0  # for it to end while it does nothing, and while it is busy [s]
 _ROOM = 2  # messages to it that wait; a newer one is better than a queue
 _LOG = logging.getLogger(__name__)
 
@@ -186,7 +186,7 @@ class WebXrInput:
                 usb.reverse(self.address[1], remove=True)
             except InputError as error:
                 _LOG.debug("%s", error)
-        process.finish(_PATIENCE)
+        process.finish(_PATIENCE, _LONGEST)
         self._stream.lose("server closed")
         self.url = None
         self._ready.clear()

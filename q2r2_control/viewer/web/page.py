@@ -17,7 +17,7 @@ from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.web.exchange import Frame, PageRequest, PageSetting, PageSetup, PageWatched, Ready
 
 _READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
-_PATIENCE = 2.0  # for it to end [s]
+_PATIENCE, _LONGEST = 2.0, 10.0  # for it to end while it does nothing, and while it is busy [s]
 
 
 def check_viser() -> None:
@@ -118,4 +118,4 @@ class Page:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._process.finish(_PATIENCE)
+        self._process.finish(_PATIENCE, _LONGEST)
