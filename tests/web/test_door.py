@@ -35,7 +35,7 @@ def status(door: Door, path: str = "/", **headers: str) -> int:
 
 def token_of(door: Door) -> str:
     """Empty on loopback."""
-    return urlsplit(door.url).path.strip("/")
+    return urlsplit(door.urls[0]).path.strip("/")
 
 
 def connected(door: Door, origin: str, token: str) -> ClientConnection:
