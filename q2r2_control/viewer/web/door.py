@@ -19,6 +19,7 @@ from q2r2_control.viewer.web.browser_messages import LONGEST_MESSAGE, BrowserMes
 
 _MOST_CLIENTS = 12
 # viser's page is one file: its scripts and styles are in it, it compiles WebAssembly, and it starts workers from blobs.
+# Its sorter of Gaussian splats evaluates text, which is not allowed, since this page shows none.
 _POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
     "connect-src 'self' blob: data:; img-src 'self' blob: data:; font-src 'self' data:; worker-src 'self' blob: data:; "

@@ -21,6 +21,8 @@ export const HELP =
   "1, 2: left or right hand. Space: engage or pause. W S A D E Q: move. I K J L U O: turn. G: gripper. Shift: slowly. " +
   "Gamepad: sticks move, and turn about the vertical; cross tilts; bumpers choose the hand; A engages, B is the gripper.";
 
+const isModified = ({ ctrlKey, metaKey, altKey, key }) => ctrlKey || metaKey || altKey || MODIFIERS.includes(key);
+
 // q after a turn by a small rotation vector, in the room's axes; x y z w.
 function turned([x, y, z, w], [a, b, c]) {
   const [p, q, r] = [a / 2, b / 2, c / 2];
@@ -45,7 +47,7 @@ export class Flying {
 
   press(event) {
     // Such a press is the browser's: its dialogs keep the page from hearing that keys are up, and so does Cmd on a Mac.
-    if (event.ctrlKey || event.metaKey || event.altKey) return this.until.clear();
+    if (isModified(event)) return this.until.clear();
     if (!(event.code in KEYS || event.code in HANDS || BUTTONS.includes(event.code))) return;
     event.preventDefault(); // Space would press the button that began this
     if (event.repeat && !this.holds(event.code)) return; // what has ended begins with a new press only
@@ -57,7 +59,7 @@ export class Flying {
   }
 
   release(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || MODIFIERS.includes(event.key)) this.until.clear();
+    if (isModified(event)) this.until.clear();
     this.until.delete(event.code);
   }
 
