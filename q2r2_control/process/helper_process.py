@@ -84,8 +84,8 @@ class HelperProcess:
     def finish(self, patience: float, longest: float = math.inf) -> None:
         """Wait until it has done what was sent, and has ended.
 
-        One that neither takes nor answers anything for ``patience`` [s], although processors are free, is killed. So is
-        one that is busy for ``longest`` [s]. Nobody waits for a process that was killed.
+        One that neither takes nor answers anything for ``patience`` [s], although processors are free, is killed. The
+        same holds for one that is busy for ``longest`` [s]. Nobody waits for a process that was killed.
         """
         self._ending = True
         self._queue.put(None)

@@ -31,7 +31,7 @@ REFUSED = [
     {"type": "TransformControlsDragStartMessage", "name": "/gizmos/left", "owner": "", "more": 1},
     {"type": "TransformControlsDragStartMessage", "name": ["/gizmos/left"], "owner": ""},
 ]
-# What changes viser's own record of a control, or is none of its values.
+# Updates that would change viser's own record of a control, or give it a value of another kind.
 CHANGES: list[dict[str, Any]] = [
     {"removed": True},
     {"update_cb": []},

@@ -108,7 +108,7 @@ class BrowserMessages:
     def take_over(self, button: viser.GuiButtonHandle, action: Callable[[], None]) -> None:
         """Do ``action`` at each press of ``button``, which viser never hears of.
 
-        Whatever happens to viser's widgets or to the threads that call their callbacks, the press still counts.
+        The press counts in any state of viser's widgets, and however busy the threads are that call their callbacks.
         """
         self._actions[button._impl.uuid] = action
 
@@ -122,7 +122,7 @@ class BrowserMessages:
             return None
         if isinstance(message, GuiUpdateMessage) and not self._is_allowed(message.uuid, message.updates.value):
             return None
-        # What was read, not what was sent: of two fields of one name, viser might read the other one.
+        # The same message anew: of two fields that a browser sends with one name, viser might read the other one.
         encoded: bytes = msgspec.msgpack.encode(message)
         return encoded
 
