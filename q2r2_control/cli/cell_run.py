@@ -101,7 +101,7 @@ class RunOptions:
     steps: tuple[tuple[float, str], ...] = ()  # of scripted work, from when on [s], in words
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
-    page: tuple[str, int] | None = None  # address of the page in the browser
+    page: tuple[str, int, Path | None] | None = None  # address of the page in the browser, and its certificate
 
     @property
     def simulated_time(self) -> bool:
@@ -194,7 +194,9 @@ def _run_pipeline(
     if isinstance(source, DisplayInput):
         HeadsetView(source, pipeline, recorder is not None)
     if page is not None:
-        say(f"page: {page.begin(pipeline, options.name, recorder is not None)}", console)
+        page.begin(pipeline, options.name, recorder is not None)
+        for line in page.lines:
+            say(line, console)
     summary = _run(pipeline, options, recorder, page, console)
     results = () if watch is None else held_to_promises(watch.results(), summary)
     if recorder is not None and results:

@@ -37,7 +37,7 @@ DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
 ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
 RealTime = Annotated[bool, Option("--rt", help="Lock memory and run under SCHED_FIFO, as far as permitted.")]
-WebHost = Annotated[str, Option(metavar="HOST", help="Address of the page; beyond 127.0.0.1 its URL has a token.")]
+WebHost = Annotated[str, Option(metavar="HOST", help="Address of the page; beyond 127.0.0.1: HTTPS and a token.")]
 WebPort = Annotated[int, Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0: any free one.")]
 Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
 Task = Annotated[str | None, Option(help="With --record: what is done, noted in the recording.")]

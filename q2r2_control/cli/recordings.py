@@ -63,13 +63,16 @@ def replay(
 
     cell = None if config is None else load_config(config)
     with ExitStack() as stack:
-        playback = Playback(stack.enter_context(PageView(web_host, web_port))) if web else None
+        page = stack.enter_context(PageView(web_host, web_port)) if web else None
+        playback = None if page is None else Playback(page)
 
         def prepare(pipeline: Pipeline) -> None:
             if viewer:
                 show_window(pipeline)
-            if playback is not None:
-                say(f"page: {playback.begin(pipeline, Path(file).stem)}")
+            if page is not None and playback is not None:
+                playback.begin(pipeline, Path(file).stem)
+                for line in page.lines:
+                    say(line)
 
         with notice_of_compiling():
             result = replay_recording(Path(file), cell, plant, compare=compare, prepare=prepare, paced=viewer)

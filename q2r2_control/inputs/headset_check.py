@@ -58,7 +58,8 @@ class HandMovement:
 class CheckedServer(Protocol):
     """A server that headsets connect to, by an app or by a page at ``url``."""
 
-    url: str | None
+    @property
+    def url(self) -> str | None: ...
 
     @property
     def statistics(self) -> HeadsetStatistics: ...

@@ -14,11 +14,11 @@ from ipaddress import ip_address
 from typing import TypeVar
 
 from q2r2_control.config.strict import Network
+from q2r2_control.inputs.addresses import reachable_addresses
 
 LINES_PERIOD = 1.0  # between two lines about one host [s]
 MAX_WAITING = 4  # newcomers of which it is not yet known whether they may drive, one of each host
 MAX_HOSTS_NAMED = 8  # with lines of their own within LINES_PERIOD; all others share theirs
-EVERY_NETWORK = ("", "0.0.0.0", "::")  # as hosts to listen on
 ONLY_THIS_MACHINE = ("127.0.0.1", "::1", "localhost")
 _OTHERS = "other hosts"
 
@@ -151,7 +151,7 @@ def written(host: str, port: int) -> str:
 
 def app_settings(host: str, port: int) -> str:
     """The app's settings, for a server that listens on ``host``."""
-    return f"address {reachable(host)}, port {port}, protocol ROS2"
+    return f"address {' or '.join(reachable_addresses(host))}, port {port}, protocol ROS2"
 
 
 def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple[str, ...]:
@@ -174,22 +174,6 @@ def is_loopback(host: str) -> bool:
         return ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
-
-
-def reachable(host: str) -> str:
-    """The address by which others reach a server on ``host``."""
-    if host not in EVERY_NETWORK:
-        return host
-    # Addresses for documentation only. Connecting a UDP socket sends nothing; it only picks the way out.
-    ways = [(socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")]
-    for family, elsewhere in ways if host == "::" else ways[:1]:
-        try:
-            with socket.socket(family, socket.SOCK_DGRAM) as probe:
-                probe.connect((elsewhere, 9))
-                return str(probe.getsockname()[0])
-        except OSError:
-            continue
-    return "of this machine (it has no network now)"
 
 
 # Rules 1 to 4 are those of docs/headset.md, "Who drives". A quiet driver gives way only to its own peer, after 37

@@ -5,13 +5,16 @@ from __future__ import annotations
 import http
 import secrets
 import socket
+import ssl
+from collections.abc import Sequence
 from urllib.parse import parse_qs, urlsplit
 
 from websockets import Headers
 from websockets.http11 import Request, Response
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.listener import is_loopback, reachable
+from q2r2_control.inputs.addresses import reachable_addresses
+from q2r2_control.inputs.listener import is_loopback, written
 
 
 def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:
@@ -21,6 +24,27 @@ def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") 
     return Response(status.value, status.phrase, headers, body)
 
 
+def protect(response: Response, policy: str) -> None:
+    """Add the headers of a page: nothing but itself is loaded, it is not kept, and no other site gets its URL."""
+    response.headers["Content-Security-Policy"] = policy
+    response.headers["Cache-Control"] = "no-store"
+    response.headers["Referrer-Policy"] = "no-referrer"  # the URL has the token
+
+
+def tls_context(certificate: str | None) -> ssl.SSLContext | None:
+    """For a PEM file with its key; None without one. Raises :class:`ConfigError`."""
+    if certificate is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate)
+    except (OSError, ssl.SSLError) as error:
+        allowed = "allowed: a PEM file with the certificate and its private key"
+        raise ConfigError(f"--certificate {certificate}: {error}; {allowed}") from error
+    return context
+
+
 class PageDoor:
     """A socket that listens, and the check of every request to it.
 
@@ -28,8 +52,21 @@ class PageDoor:
     here, since the ``Host`` of a loopback address is known. Beyond loopback, a request needs the token of the URL.
     """
 
-    def __init__(self, host: str, port: int, option: str, token: str, scheme: str = "http") -> None:
-        """``option`` is named in errors. Raises :class:`ConfigError` where the address cannot be bound."""
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        option: str,
+        token: str,
+        certificate: str | None = None,
+        addresses: Sequence[str] = (),
+    ) -> None:
+        """``option`` is named in errors, ``addresses`` are in URLs; without them, those of ``host`` are.
+
+        With a ``certificate``, a PEM file with its key, the page is served by HTTPS. Raises :class:`ConfigError` if the
+        address cannot be bound or the certificate cannot be used.
+        """
+        self.tls = tls_context(certificate)
         try:
             ipv6 = ":" in host
             family, both = (socket.AF_INET6, socket.has_dualstack_ipv6()) if ipv6 else (socket.AF_INET, False)
@@ -39,12 +76,11 @@ class PageDoor:
             message = f"{option}: cannot listen on {host} port {port}: {reason}; allowed: a free port"
             raise ConfigError(message) from error
         self.port: int = self.socket.getsockname()[1]
-        self._scheme = scheme
+        self._scheme = "http" if certificate is None else "https"
         self._hosts = {f"{name}:{self.port}" for name in ("localhost", "127.0.0.1", "[::1]", host)}
         self.token = None if is_loopback(host) else token
-        name = reachable(host)
-        query = "" if self.token is None else f"/?token={self.token}"
-        self.url = f"{scheme}://{f'[{name}]' if ':' in name else name}:{self.port}{query}"
+        names = tuple(addresses) or reachable_addresses(host)
+        self.urls = tuple(f"{self._scheme}://{written(name, self.port)}{self._query}" for name in names)
 
     def refusal(self, request: Request, *, with_token: bool = True) -> str | None:
         """Why a request is not answered, or None."""
@@ -57,6 +93,11 @@ class PageDoor:
         if self.token is None or not with_token or self._is_known(request):
             return None
         return "the token of the URL is missing"
+
+    @property
+    def _query(self) -> str:
+        """The part of a URL that knows the token."""
+        return "" if self.token is None else f"/?token={self.token}"
 
     def _is_known(self, request: Request) -> bool:
         tokens = parse_qs(urlsplit(request.path).query).get("token", ())

@@ -7,6 +7,7 @@ while it sent 1 MB, a run left 8 of 8 processes with a ``Queue`` waiting for the
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import signal
@@ -80,26 +81,36 @@ class HelperProcess:
             time.sleep(_NO_ROOM)
         return False
 
-    def finish(self, patience: float) -> None:
+    def finish(self, patience: float, longest: float = math.inf) -> None:
         """Wait until it has done what was sent, and has ended.
 
-        One that neither takes nor answers anything for ``patience`` [s], although processors are free, is killed.
+        One that neither takes nor answers anything for ``patience`` [s], although processors are free, is killed. The
+        same holds for one that is busy for ``longest`` [s]. Nobody waits for a process that was killed.
         """
         self._ending = True
         self._queue.put(None)
-        self._moved = time.monotonic()
+        self._moved = began = time.monotonic()
         while self._listener.is_alive():
             self._listener.join(_LOOKS)
+            now = time.monotonic()
             if self._is_ready_to_run():
-                self._moved = time.monotonic()
-            elif self._listener.is_alive() and time.monotonic() - self._moved > patience:
-                self.fault = f"the process that {self._what} did nothing for {patience:g} s"
+                self._moved = now
+            if self._listener.is_alive() and (now - self._moved > patience or now - began > longest):
+                idle = now - self._moved > patience
+                did = f"did nothing for {patience:g} s" if idle else f"did not end within {longest:g} s"
+                self.fault = f"the process that {self._what} {did}"
                 self.kill()
+                return
 
     def kill(self) -> None:
-        """End it, whatever it does; without a fault."""
+        """End it and the processes that it has started, whatever they do; without a fault.
+
+        A process that it had started would keep its files and ports, and the pipe whose end says that it has ended.
+        """
         self._killed = True
-        self._process.kill()
+        if self._process.returncode is None:  # otherwise another process may have its number by now
+            with suppress(OSError):  # of a group that has ended
+                os.killpg(self.pid, signal.SIGKILL)
         self._queue.put(None)
         self._listener.join(_AFTER_KILL)
 

@@ -35,7 +35,7 @@ class PageClient:
         self.buttons: dict[str, str] = {}  # by label
         self.drawn: set[str] = set()  # names of meshes
         self.pictures: list[bytes] = []  # of cameras, as they came
-        self._send("ViewerCameraMessage", **_CAMERA)  # before which no press counts
+        self.send("ViewerCameraMessage", **_CAMERA)  # before which no press counts
 
     def __enter__(self) -> Self:
         return self
@@ -72,11 +72,16 @@ class PageClient:
 
     def press(self, label: str) -> None:
         """Click the button whose label begins so."""
+        self.send("GuiUpdateMessage", uuid=self.button(label), updates={"value": True})
+
+    def button(self, label: str) -> str:
+        """The identifier of the button whose label begins so."""
         self.wait_until(lambda: any(one.startswith(label) for one in self.buttons))
         (uuid,) = (uuid for one, uuid in self.buttons.items() if one.startswith(label))
-        self._send("GuiUpdateMessage", uuid=uuid, updates={"value": True})
+        return uuid
 
-    def _send(self, kind: str, **fields: Any) -> None:
+    def send(self, kind: str, **fields: Any) -> None:
+        """Send a message of viser's protocol, also one that no browser sends."""
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
     def _hear(self, data: bytes | str) -> None:

@@ -30,7 +30,12 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserContext
         with one_processor():
             playwright = stack.enter_context(sync_playwright())
         context = playwright.chromium.launch_persistent_context(
-            str(folder), executable_path=CHROMIUM, headless=True, args=ARGUMENTS, viewport=VIEW
+            str(folder),
+            executable_path=CHROMIUM,
+            headless=True,
+            args=ARGUMENTS,
+            viewport=VIEW,
+            ignore_https_errors=True,
         )
         yield context
         context.close()

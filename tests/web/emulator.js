@@ -17,6 +17,7 @@ const tremble = () => {
   for (const [hand, place] of Object.entries(window.hands)) {
     const [x, y, z] = place.map((value) => value + NOISE * (Math.random() - 0.5));
     device.controllers[hand].position.set(x, y, z);
+    device.hands[hand].position.set(x, y, z);
   }
   requestAnimationFrame(tremble);
 };

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ssl
 from collections.abc import Iterator
-from http.client import HTTPConnection
+from datetime import UTC, datetime
+from http.client import HTTPConnection, HTTPSConnection, RemoteDisconnected
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
@@ -14,6 +17,7 @@ from websockets.typing import Origin, Subprotocol
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.page_door import is_loopback
+from q2r2_control.inputs.webxr.certificate import own_certificate
 from q2r2_control.viewer.web.door import Door
 
 
@@ -35,7 +39,7 @@ def status(door: Door, path: str = "/", **headers: str) -> int:
 
 def token_of(door: Door) -> str:
     """Empty on loopback."""
-    return urlsplit(door.url).path.strip("/")
+    return urlsplit(door.urls[0]).path.strip("/")
 
 
 def connected(door: Door, origin: str, token: str) -> ClientConnection:
@@ -74,6 +78,29 @@ def test_no_more_pages_than_a_few_connect(door: Door) -> None:
     assert not admitted(door, origin, token)
     for page in pages:
         page.close()
+
+
+def test_beyond_this_machine_the_page_comes_by_tls_and_is_neither_kept_nor_framed(tmp_path: Path) -> None:
+    certificate, _ = own_certificate(tmp_path, ["192.168.1.5", "10.0.0.7"], datetime.now(UTC))
+    far = Door("0.0.0.0", 0, str(certificate), ["192.168.1.5", "10.0.0.7"])
+    token = token_of(far)
+    assert far.urls == tuple(f"https://{address}:{far.port}/{token}" for address in ("192.168.1.5", "10.0.0.7"))
+    with far.guards():
+        server = viser.ViserServer(host="0.0.0.0", port=far.port, verbose=False)
+    trusting = ssl.create_default_context(cafile=str(certificate))
+    connection = HTTPSConnection("127.0.0.1", far.port, context=trusting)
+    connection.request("GET", f"/{token}")
+    response = connection.getresponse()
+    assert response.status == 200
+    assert response.headers["Cache-Control"] == "no-store"
+    assert response.headers["Referrer-Policy"] == "no-referrer"
+    policy = response.headers["Content-Security-Policy"]
+    assert "default-src 'self'" in policy
+    assert "'unsafe-eval'" not in policy
+    connection.close()
+    with pytest.raises((RemoteDisconnected, ConnectionError)):
+        status(far, f"/{token}")  # without TLS
+    server.stop()
 
 
 def test_a_port_that_is_taken_is_one_clear_line() -> None:

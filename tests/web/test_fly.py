@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from playwright.sync_api import Page
 
 from q2r2_control.types import Array
 from tests.web.browser import count, pixels, wait_until
 from tests.web.conftest import Open, Start
+from tests.web.headset_page import Listen
 from tests.web.test_headset import ORANGE, RUN, arms, emulated, said, wait_until_said
 
 STICK_FORWARD = """navigator.getGamepads = () => [{
     mapping: "standard", axes: [0, -1, 0, 0], buttons: Array.from({ length: 17 }, () => ({ pressed: false })) }]"""
+
+
+REPEATING = """code => {
+    const repeat = () => dispatchEvent(new KeyboardEvent("keydown", { code, repeat: true }));
+    window.repeating = setInterval(repeat, 40);
+}"""  # as a keyboard does, which no emulated one does
 
 
 def targets_of_left(page: Page) -> Array:
@@ -32,7 +41,9 @@ def test_keys_and_a_gamepad_engage_an_arm_move_it_and_leave_it_when_the_page_is_
     page.keyboard.up("Space")
     before = targets_of_left(page)
     page.keyboard.down("KeyW")
+    page.evaluate(REPEATING, "KeyW")
     wait_until_said(page, lambda: targets_of_left(page)[0] > before[0] + 0.02)
+    page.evaluate("clearInterval(repeating)")
     page.keyboard.up("KeyW")
     page.evaluate(STICK_FORWARD)
     stood = targets_of_left(page)[0]
@@ -42,3 +53,51 @@ def test_keys_and_a_gamepad_engage_an_arm_move_it_and_leave_it_when_the_page_is_
     wait_until_said(page, lambda: arms(page, "state")[0] == "lost")
     run.interrupt()
     assert run.end()["at_rest"]
+
+
+# The page's own flying hand, in time that the test lets pass: 20 ms a look.
+LOOKS = """async ([events, looks]) => {
+    const { Flying } = await import("/fly.js");
+    let now = performance.now();
+    performance.now = () => now;
+    const flying = new Flying();
+    const before = flying.poses.left[0];
+    for (const [type, init] of events) dispatchEvent(new KeyboardEvent(type, init));
+    const held = [];
+    for (let look = 0; look < looks; look++) {
+        now += 20;
+        held.push(flying.read().left.buttons[1]);
+    }
+    flying.end();
+    delete performance.now;
+    return { moved: flying.poses.left[0] - before, held };
+}"""
+
+
+def flown(page: Page, *events: tuple[str, Mapping[str, object]]) -> float:
+    """How far a hand has gone forward within 4 s of events of the keyboard [m]."""
+    return float(page.evaluate(LOOKS, [events, 200])["moved"])
+
+
+def test_a_key_whose_release_is_never_heard_moves_a_hand_for_a_short_time_only(open_page: Open, listen: Listen) -> None:
+    page = open_page(str(listen().url), "")
+    forward, ctrl = {"code": "KeyW"}, {"code": "ControlLeft", "key": "Control", "ctrlKey": True}
+    down, repeated = ("keydown", forward), ("keydown", forward | {"repeat": True})
+    assert 0.05 < flown(page, down) < 0.12
+    assert 0.05 < flown(page, down, repeated) < 0.12
+    assert flown(page, repeated) == 0.0
+    # Ctrl+W, Cmd+W on a Mac, which never says that W is up, and a modifier that is pressed meanwhile.
+    for modifier in ("ctrlKey", "metaKey", "altKey"):
+        assert flown(page, ("keydown", forward | {modifier: True})) == 0.0
+    assert flown(page, down, ("keydown", ctrl), repeated) == 0.0
+    assert flown(page, down, ("keyup", ctrl | {"ctrlKey": False})) == 0.0
+
+
+def test_a_button_is_held_while_another_key_repeats_and_only_a_press_begins_it_anew(
+    open_page: Open, listen: Listen
+) -> None:
+    page = open_page(str(listen().url), "")
+    space = {"code": "Space"}
+    held = page.evaluate(LOOKS, [[("keydown", space), ("keydown", {"code": "KeyW"})], 60])["held"]
+    assert held[:30] == [True] * 30
+    assert held[-10:] == [False] * 10

@@ -160,6 +160,26 @@ def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: A
     assert run.end()["at_rest"]
 
 
+def test_fingers_found_beside_a_controller_that_was_laid_down_move_no_arm(enter: Any, start: Start) -> None:
+    run = start(*RUN)
+    page = enter(run.url)
+    press(page, LOWER)
+    wait_for(page, "engaged")
+    page.evaluate("headset.primaryInputMode = 'hand'")
+    wait_for(page, "lost", "does not see the hand")
+    page.evaluate("carry([0.0, 0.05, 0.0], 60)")
+    frames(page, 20)
+    wait_for(page, "lost")
+    # The controllers are taken up again, and a press engages.
+    page.evaluate("headset.primaryInputMode = 'controller'")
+    frames(page, 60)
+    wait_for(page, "lost")
+    press(page, LOWER)
+    wait_for(page, "engaged")
+    run.interrupt()
+    assert run.end()["at_rest"]
+
+
 def test_the_first_headset_drives_and_another_is_told_so(enter: Any, start: Start, open_page: Open) -> None:
     run = start(*RUN)
     page = enter(run.url, "ar")

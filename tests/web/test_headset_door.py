@@ -50,7 +50,7 @@ def test_a_certificate_is_renewed_before_it_expires_and_for_another_address(tmp_
     now = datetime(2026, 1, 1, tzinfo=UTC)
 
     def made(address: str, later: int = 0) -> tuple[bytes, str | None]:
-        file, line = own_certificate(tmp_path, address, now + timedelta(days=later))
+        file, line = own_certificate(tmp_path, [address], now + timedelta(days=later))
         assert file.stat().st_mode & 0o077 == 0, "the key is this user's only"
         return file.read_bytes(), line
 
@@ -66,6 +66,25 @@ def test_a_certificate_is_renewed_before_it_expires_and_for_another_address(tmp_
     assert {"10.0.0.7", "127.0.0.1", "localhost"} <= {str(name.value) for name in names}
     (tmp_path / "certificate.pem").write_text("nothing")
     assert "cannot be read" in str(made("10.0.0.7")[1])
+
+
+def test_each_network_of_this_computer_has_its_url_its_code_and_its_name_in_the_certificate(
+    listen: Listen, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    networks = ("192.168.1.5", "10.0.0.7")
+    monkeypatch.setattr("q2r2_control.inputs.webxr.webxr.reachable_addresses", lambda _: networks)
+    lines: list[str] = []
+    source = listen(host="0.0.0.0", say=lines.append)
+    port = source.address[1]
+    token = urlsplit(str(source.url)).query
+    for address in networks:
+        url = f"https://{address}:{port}/?{token}"
+        assert f"webxr: open {url}" in lines
+        (code,) = (line for line in lines if line.startswith(f"{url}\n"))
+        assert "▀" in code or "█" in code
+    pem = (tmp_path / "q2r2_control" / "webxr" / "certificate.pem").read_bytes()
+    names = load_pem_x509_certificate(pem).extensions.get_extension_for_class(SubjectAlternativeName).value
+    assert set(networks) <= {str(name.value) for name in names}
 
 
 def test_a_cable_needs_adb_which_says_what_is_missing(

@@ -6,6 +6,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
+import pytest
 
 from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
@@ -71,8 +72,9 @@ def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open
 
 
 def test_a_replay_has_a_time_line_and_a_page_with_a_token_comes_back_when_it_is_loaded_anew(
-    open_page: Open, start: Start, tmp_path: Path
+    open_page: Open, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))  # where its certificate is made
     loop = pipeline()
     with Recorder(tmp_path, "circle", waits=True) as recorder:
         recorder.begin(About.of(loop, False, {}), loop.robot)
@@ -82,6 +84,7 @@ def test_a_replay_has_a_time_line_and_a_page_with_a_token_comes_back_when_it_is_
     address = ("--web-port", "0", "--web-host", "0.0.0.0")
     run = start("q2r2_control", "replay", str(recorder.file), "--json", "--web", *address)
     url = urlsplit(run.url)
+    assert url.scheme == "https"
     page = open_page(url._replace(netloc=f"127.0.0.1:{url.port}").geturl())
     wait_for(page, "3.0 s")  # the end, where it stands still
     page.reload()

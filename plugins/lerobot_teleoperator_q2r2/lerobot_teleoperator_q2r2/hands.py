@@ -73,7 +73,9 @@ class Q2R2Hands(Teleoperator):
             if isinstance(hands, WebInput):
                 pipeline.change_teleop(web_cell(pipeline.config).teleop)
                 page = attached.enter_context(PageView(self.config.web_host, self.config.web_port))
-                _logger.info("page: %s", page.begin(pipeline, self.name, recorded=False))
+                page.begin(pipeline, self.name, recorded=False)
+                for line in page.lines:
+                    _logger.info("%s", line)
                 attached.callback(pipeline.listeners.remove, page)
             attached.callback(hands.close)
             hands.start()

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import secrets
 import socket
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
 
 from q2r2_control.errors import InputError
+from q2r2_control.inputs.addresses import NO_NETWORK
 
 _VALID = timedelta(days=365)
 _RENEWED = timedelta(days=7)  # before it expires
@@ -28,21 +30,21 @@ def installation_token(folder: Path) -> str:
             _write(file, secrets.token_urlsafe(16).encode())
         return file.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"webxr: {file} cannot be used: {error}; allowed: a file of this user's") from error
+        raise InputError(f"https: {file} cannot be used: {error}; allowed: a file of this user's") from error
 
 
-def own_certificate(folder: Path, address: str, now: datetime) -> tuple[Path, str | None]:
-    """A PEM file with certificate and key for a server at ``address``, and a line where it was made anew.
+def own_certificate(folder: Path, addresses: Sequence[str], now: datetime) -> tuple[Path, str | None]:
+    """A PEM file with certificate and key for a server at ``addresses``, and a line where it was made anew.
 
-    It is made anew where there is none, where it expires within a week, and for another address. Raises
+    It is made anew where there is none, where it expires within a week, and for further addresses. Raises
     :class:`InputError`.
     """
     try:
         from cryptography import x509
     except ImportError as error:
-        raise InputError("webxr: HTTPS needs cryptography: pip install 'q2r2_control[web]'") from error
+        raise InputError("https: it needs cryptography: pip install 'q2r2_control[web]'") from error
     file = folder / "certificate.pem"
-    names = _names(address)
+    names = _names(addresses)
     try:
         if not file.exists():
             why = "first use"
@@ -61,13 +63,16 @@ def own_certificate(folder: Path, address: str, now: datetime) -> tuple[Path, st
     try:
         _write(file, _made(names, now))
     except OSError as error:
-        raise InputError(f"webxr: {file} cannot be written: {error.strerror}; allowed: --certificate FILE") from error
-    return file, f"new certificate, {why}: the headset's browser asks once whether to trust it"
+        raise InputError(
+            f"https: {file} cannot be written: {error.strerror}; allowed: a folder of this user's"
+        ) from error
+    return file, f"new certificate, {why}: each browser asks once whether to trust it"
 
 
-def _names(address: str) -> list[str]:
+def _names(addresses: Sequence[str]) -> list[str]:
     host = socket.gethostname().partition(".")[0]
-    return list(dict.fromkeys((address, f"{host}.local", host, "localhost", "127.0.0.1", "::1")))
+    known = [address for address in addresses if address != NO_NETWORK]
+    return list(dict.fromkeys((*known, f"{host}.local", host, "localhost", "127.0.0.1", "::1")))
 
 
 def _made(names: list[str], now: datetime) -> bytes:
@@ -78,7 +83,7 @@ def _made(names: list[str], now: datetime) -> bytes:
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
     key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"q2r2_control on {names[1]}"[:64])])
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"q2r2_control on {socket.gethostname()}"[:64])])
     made = (
         x509.CertificateBuilder(subject, subject, key.public_key(), x509.random_serial_number())
         .not_valid_before(now - timedelta(days=1))  # a headset's clock may be behind

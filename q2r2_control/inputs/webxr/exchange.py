@@ -27,6 +27,7 @@ class HeadsetPageSetup:
     host: str
     port: int  # 0: any free one
     allow: Sequence[Network] | None  # that may connect; None: all
+    addresses: Sequence[str]  # by which others reach it
     certificate: str | None  # a PEM file with its key; None: http
     token: str
     silence: float  # of the page that drives, after which it is dropped [s]
@@ -37,7 +38,7 @@ class Listening(NamedTuple):
     """The first answer: it listens."""
 
     port: int
-    url: str
+    urls: tuple[str, ...]  # one for each of its addresses
 
 
 class Admitted(NamedTuple):

@@ -6,7 +6,6 @@ import asyncio
 import http
 import json
 import logging
-import ssl
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -20,7 +19,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from q2r2_control.errors import ConfigError, ProtocolError
+from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.connections import TURN
 from q2r2_control.inputs.listener import (
     MAX_HOSTS_NAMED,
@@ -31,7 +30,7 @@ from q2r2_control.inputs.listener import (
     verdicts,
     written,
 )
-from q2r2_control.inputs.page_door import PageDoor, text_response
+from q2r2_control.inputs.page_door import PageDoor, protect, text_response
 from q2r2_control.inputs.webxr.exchange import (
     Admitted,
     CameraPicture,
@@ -101,22 +100,13 @@ class PageServer:
                 loop.call_soon_threadsafe(self._take, request)
             loop.call_soon_threadsafe(ended.set)
 
-        context = None
-        if self._setup.certificate is not None:
-            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-            context.minimum_version = ssl.TLSVersion.TLSv1_2
-            try:
-                context.load_cert_chain(self._setup.certificate)
-            except (OSError, ssl.SSLError) as error:
-                allowed = "allowed: a PEM file with the certificate and its private key"
-                raise ConfigError(f"--certificate {self._setup.certificate}: {error}; {allowed}") from error
         quiet = logging.getLogger("q2r2_control.inputs.webxr.sockets")
         quiet.addHandler(logging.NullHandler())
         quiet.propagate = False
         async with serve(
             self._serve,
             sock=self._door.socket,
-            ssl=context,
+            ssl=self._door.tls,
             process_request=self._answer_request,
             max_size=LONGEST,
             compression=None,
@@ -125,7 +115,7 @@ class PageServer:
             open_timeout=5.0,
             logger=quiet,
         ):
-            self._answer(Listening(self._door.port, self._door.url))
+            self._answer(Listening(self._door.port, self._door.urls))
             Thread(target=pass_on, daemon=True).start()
             watch = asyncio.create_task(self._watch())
             await ended.wait()
@@ -151,9 +141,7 @@ class PageServer:
         if name not in self._files:
             return text_response(http.HTTPStatus.NOT_FOUND, "no such file\n")
         response = text_response(http.HTTPStatus.OK, self._files[name], _KINDS[f".{name.rpartition('.')[2]}"])
-        response.headers["Content-Security-Policy"] = _POLICY
-        response.headers["Cache-Control"] = "no-store"
-        response.headers["Referrer-Policy"] = "no-referrer"  # the URL has the token
+        protect(response, _POLICY)
         return response
 
     async def _serve(self, connection: ServerConnection) -> None:
@@ -312,6 +300,5 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
     """Answer :class:`Listening`, then what the page that drives sends. Raises :class:`ConfigError`."""
     setup: HeadsetPageSetup | None = next(requests, None)
     if setup is not None:
-        scheme = "http" if setup.certificate is None else "https"
-        door = PageDoor(setup.host, setup.port, "--input webxr", setup.token, scheme)
+        door = PageDoor(setup.host, setup.port, "--input webxr", setup.token, setup.certificate, setup.addresses)
         asyncio.run(PageServer(setup, door, answer).run(requests))

@@ -17,10 +17,11 @@ from q2r2_control.config.cell import Config, HeadsetConfig
 from q2r2_control.config.strict import Network
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError, InputError
+from q2r2_control.inputs.addresses import reachable_addresses
 from q2r2_control.inputs.connections import SILENCE_ALLOWED
 from q2r2_control.inputs.hand_stream import HandStream
 from q2r2_control.inputs.headset import watch_of
-from q2r2_control.inputs.listener import is_loopback, reachable
+from q2r2_control.inputs.listener import is_loopback
 from q2r2_control.inputs.samples import HandsWatch
 from q2r2_control.inputs.session import HeadsetStatistics
 from q2r2_control.inputs.webxr import usb
@@ -42,7 +43,7 @@ from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 PORT = 8443
 _READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
-_PATIENCE = 2.0  # for it to end [s]
+_PATIENCE, _LONGEST = 2.0, 10.0  # for it to end while it does nothing, and while it is busy [s]
 _ROOM = 2  # messages to it that wait; a newer one is better than a queue
 _LOG = logging.getLogger(__name__)
 
@@ -72,7 +73,7 @@ class WebXrInput:
     ) -> None:
         """A page that says nothing for ``silence`` [s] is dropped; the gate stops the arms long before."""
         self.address = host, port  # after ``start`` the port that was bound
-        self.url: str | None = None  # after ``start``
+        self.urls: tuple[str, ...] = ()  # after ``start``, one for each address of this computer
         self._clock, self._allow, self._usb, self._certificate, self._say = clock, allow, by_usb, certificate, say
         self._silence = silence
         self._stream = HandStream(watch or HandsWatch())
@@ -125,16 +126,16 @@ class WebXrInput:
             if find_spec(package) is None:
                 raise InputError(f"--input webxr needs {package}: pip install 'q2r2_control[web]'")
         host, port = self.address
-        certificate, token = None, ""
+        certificate, token, addresses = None, "", reachable_addresses(host)
         if not is_loopback(host):  # a browser trusts localhost without
             folder = installation_folder()
             token, certificate = installation_token(folder), self._certificate
             if certificate is None:
-                certificate, line = own_certificate(folder, reachable(host), datetime.now(UTC))
+                certificate, line = own_certificate(folder, addresses, datetime.now(UTC))
                 if line is not None:
                     self._say(f"webxr: {line}")
         pem = None if certificate is None else str(certificate)
-        setup = HeadsetPageSetup(host, port, self._allow, pem, token, self._silence, self._display)
+        setup = HeadsetPageSetup(host, port, self._allow, addresses, pem, token, self._silence, self._display)
         try:
             self._process = HelperProcess("serves the page", "q2r2_control.inputs.webxr.server", self._take, _ROOM)
         except OSError as error:
@@ -143,7 +144,7 @@ class WebXrInput:
         waited = 0.0
         while self._process.alive and waited < _READY and not self._ready.wait(0.1):
             waited += 0.1
-        if self.url is None:
+        if not self.urls:
             fault = self._process.fault or f"webxr: the page was not ready within {_READY:g} s"
             self.close()
             raise InputError(fault)
@@ -159,6 +160,11 @@ class WebXrInput:
     def connected(self) -> bool:
         """Whether a page drives, and no loss is left that ``poll`` has not shown yet."""
         return self._stream.connected and self._process is not None and self._process.alive
+
+    @property
+    def url(self) -> str | None:
+        """The page's first URL; None before :meth:`start`."""
+        return self.urls[0] if self.urls else None
 
     def poll(self, now: float) -> list[HandSample]:
         return self._stream.take()
@@ -181,14 +187,14 @@ class WebXrInput:
         process, self._process = self._process, None
         if process is None:
             return
-        if self._usb and self.url is not None:
+        if self._usb and self.urls:
             try:
                 usb.reverse(self.address[1], remove=True)
             except InputError as error:
                 _LOG.debug("%s", error)
-        process.finish(_PATIENCE)
+        process.finish(_PATIENCE, _LONGEST)
         self._stream.lose("server closed")
-        self.url = None
+        self.urls = ()
         self._ready.clear()
 
     def _take(self, answer: Any) -> None:
@@ -204,25 +210,33 @@ class WebXrInput:
                 self._stream.lose(reason)
             case Logged(level, text):
                 _LOG.log(level, "%s", text)
-            case Listening(port, url):
-                self.address, self.url = (self.address[0], port), url
+            case Listening(port, urls):
+                self.address, self.urls = (self.address[0], port), urls
                 self._ready.set()
 
     def _announce(self) -> None:
         """Say where the page is, as text and as a code for a camera."""
-        assert self.url is not None
         host, port = self.address
-        where = f"http://localhost:{port} on the headset" if self._usb else self.url
-        self._say(f"webxr: open {where}")
+        if self._usb:
+            self._say(f"webxr: open http://localhost:{port} on the headset")
+        for url in () if self._usb else self.urls:
+            self._say(f"webxr: open {url}")
         if is_loopback(host):
             if not self._usb:
                 self._say("webxr: only this machine can reach it; --host 0.0.0.0 admits the network, --usb a cable")
             return
         who = "" if self._allow is None else f" from {', '.join(map(str, self._allow))} (headset.allow)"
-        self._say(f"webxr: whoever has this URL{who} can drive the arms")
+        what = "this URL" if len(self.urls) == 1 else "one of these URLs"
+        self._say(f"webxr: whoever has {what}{who} can drive the arms")
         if find_spec("segno") is not None:
-            import segno
+            for url in self.urls:
+                self._say(_drawn(url) if len(self.urls) == 1 else f"{url}\n{_drawn(url)}")
 
-            drawn = io.StringIO()
-            segno.make(self.url).terminal(drawn, compact=True)
-            self._say(drawn.getvalue().rstrip("\n"))
+
+def _drawn(url: str) -> str:
+    """A code for a camera."""
+    import segno
+
+    drawn = io.StringIO()
+    segno.make(url).terminal(drawn, compact=True)
+    return drawn.getvalue().rstrip("\n")

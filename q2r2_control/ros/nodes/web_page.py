@@ -95,7 +95,7 @@ class WebPage(BaseNode):
         self._trigger_clients: dict[str, Any] = {}
         requests = [PageRequest.STOP, PageRequest.RESET, PageRequest.ENGAGE, PageRequest.PAUSE, PageRequest.HOME]
         self._requests = (*requests, *((PageRequest.RECORD, PageRequest.MARK) if recorded else ()))
-        url = self._page.open(self._robot, self._cell, config.name, self._requests)
+        self._page.open(self._robot, self._cell, config.name, self._requests)
         shown = self._ticks.topics - {hand_pose(hand) for hand in SIDES}
         for topic in ros_topics(tuple(self._robot.arms), {}):
             if topic.name in shown:
@@ -110,7 +110,8 @@ class WebPage(BaseNode):
         self.create_timer(_PICTURE_PERIOD, self._show_pictures, clock=STEADY)
         self.create_timer(_LOOK_PERIOD, self._look, clock=STEADY)
         self.create_tick(_PERIOD, self._show, clock=STEADY)
-        self.get_logger().info(f"page: {url}")
+        for line in self._page.lines:
+            self.get_logger().info(line)
 
     def _listen(self, topic: Topic, take: Callable[[bytes], None], qos: QoSProfile) -> None:
         package, _, kind = topic.type.split("/")
@@ -265,8 +266,12 @@ class WebPage(BaseNode):
         if not self._page.alive:
             return WARN, f"the page is gone: {self._page.fault}", {}
         if self._row is None:
-            return WARN, "waits for joint states, the controller and the arms' nodes", {"url": self._page.url}
-        return OK, f"page: {self._page.url}", {"url": self._page.url}
+            return (
+                WARN,
+                "waits for joint states, the controller and the arms' nodes",
+                {"url": " ".join(self._page.urls)},
+            )
+        return OK, f"page: {' or '.join(self._page.urls)}", {"url": " ".join(self._page.urls)}
 
     def close(self) -> None:
         self._page.__exit__()

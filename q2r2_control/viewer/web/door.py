@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import http
 import secrets
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import websockets.asyncio.server
@@ -13,19 +14,27 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.page_door import PageDoor, text_response
+from q2r2_control.inputs.page_door import PageDoor, protect, text_response
+from q2r2_control.viewer.web.browser_messages import LONGEST_MESSAGE, BrowserMessages, FilteredConnection
 
 _MOST_CLIENTS = 12
-_LONGEST_MESSAGE = 1 << 20  # from a browser [bytes]
+# viser's page is one file: its scripts and styles are in it, it compiles WebAssembly, and it starts workers from blobs.
+# Its sorter of Gaussian splats evaluates text, which is not allowed, since this page shows none.
+_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
+    "connect-src 'self' blob: data:; img-src 'self' blob: data:; font-src 'self' data:; worker-src 'self' blob: data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
+)
+_CLOSE_TIMEOUT = 1.0  # for a browser to say that it has closed its end [s]
 
 
 class Door(PageDoor):
     """The token is the path of the page's URL, since that is where viser's page connects to."""
 
-    def __init__(self, host: str, port: int) -> None:
-        """Raises :class:`ConfigError` where the address cannot be bound."""
-        super().__init__(host, port, "--web", secrets.token_urlsafe(16))
-        self.url = self.url.replace("?token=", "")
+    def __init__(self, host: str, port: int, certificate: str | None = None, addresses: Sequence[str] = ()) -> None:
+        """As of :class:`PageDoor`."""
+        super().__init__(host, port, "--web", secrets.token_urlsafe(16), certificate, addresses)
+        self.messages = BrowserMessages()  # which of them viser gets
         self._clients = 0
 
     def refusal(self, request: Request, *, with_token: bool = True) -> str | None:
@@ -33,6 +42,10 @@ class Door(PageDoor):
         if reason is None and request.headers.get("Upgrade") is not None and self._clients >= _MOST_CLIENTS:
             return f"{_MOST_CLIENTS} pages are open"
         return reason
+
+    @property
+    def _query(self) -> str:
+        return "" if self.token is None else f"/{self.token}"
 
     def _is_known(self, request: Request) -> bool:
         path, _, _ = request.path.partition("?")
@@ -57,6 +70,7 @@ class Door(PageDoor):
                 request.path = "/"  # the page is all that viser serves
                 response: Response | None = answer(connection, request)
                 if response is not None:
+                    protect(response, _POLICY)
                     response.headers["X-Frame-Options"] = "DENY"  # a page around this one could steal a click
                 return response
 
@@ -67,7 +81,9 @@ class Door(PageDoor):
                 finally:
                     self._clients -= 1
 
-            settings |= {"max_size": _LONGEST_MESSAGE, "sock": self.socket}
+            settings |= {"max_size": LONGEST_MESSAGE, "sock": self.socket, "ssl": self.tls}
+            settings |= {"close_timeout": _CLOSE_TIMEOUT}
+            settings["create_connection"] = partial(FilteredConnection, messages=self.messages)
             return serve(counted, process_request=checked, **settings)
 
         setattr(websockets.asyncio.server, "serve", guarded)  # noqa: B010, which a type checker would refuse

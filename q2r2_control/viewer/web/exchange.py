@@ -21,6 +21,8 @@ class PageSetup(ShownRobot):
 
     host: str
     port: int  # 0: any free one
+    addresses: tuple[str, ...]  # by which others reach it
+    certificate: str | None  # a PEM file with its key; None: http
     title: str
     tools: Mapping[str, int]  # of each arm, the frame of its tool in ``model``
     home: Array  # (nv,) [rad]
@@ -55,7 +57,7 @@ class Frame:
 class Ready(NamedTuple):
     """The server's first answer: it listens."""
 
-    url: str
+    urls: tuple[str, ...]  # one for each of its addresses
 
 
 class PageWatched(NamedTuple):

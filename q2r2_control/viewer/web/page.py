@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from importlib.util import find_spec
+from pathlib import Path
 from threading import Event as Flag
 from types import MappingProxyType
 from typing import Any, Self
 
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import ConfigError, InputError
+from q2r2_control.inputs.addresses import reachable_addresses
+from q2r2_control.inputs.listener import is_loopback
+from q2r2_control.inputs.webxr.certificate import installation_folder, own_certificate
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.web.exchange import Frame, PageRequest, PageSetting, PageSetup, PageWatched, Ready
 
 _READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
-_PATIENCE = 2.0  # for it to end [s]
+_PATIENCE, _LONGEST = 2.0, 10.0  # for it to end while it does nothing, and while it is busy [s]
 
 
 def check_viser() -> None:
@@ -29,15 +34,18 @@ def check_viser() -> None:
 class Page:
     """A page and its process, as a context. Nothing in a browser can keep this process waiting."""
 
-    def __init__(self, host: str, port: int, on_answer: Callable[[Any], None]) -> None:
+    def __init__(self, host: str, port: int, on_answer: Callable[[Any], None], certificate: Path | None = None) -> None:
         """Start the process, which takes a second. Raises :class:`ConfigError` where viser is not installed.
 
-        ``on_answer`` gets what browsers ask for, in a thread of its own.
+        ``on_answer`` gets what browsers ask for, in a thread of its own. Beyond this computer the page comes by HTTPS,
+        with your own ``certificate`` or, without one, that of the headset's page.
         """
         check_viser()
         self._host, self._port, self._on_request = host, port, on_answer
         self._ready = Flag()
-        self.url: str | None = None  # None: not begun
+        self.urls: tuple[str, ...] = ()  # one for each address of this computer; empty: not begun
+        self.lines: tuple[str, ...] = ()  # for people: where it is
+        self._certificate = certificate
         self.watched = False  # by any browser
         self._pictures: dict[str, bytes] = {}  # by camera, that wait for a frame
         try:
@@ -59,10 +67,14 @@ class Page:
         replayed: bool = False,
     ) -> str:
         """Serve the page of a cell, see :class:`PageSetup`; returns its URL. Raises :class:`ConfigError`."""
+        addresses = reachable_addresses(self._host)
+        certificate, notes = self._certified(addresses)
         setup = PageSetup(
             **vars(ShownRobot.of(robot, config)),
             host=self._host,
             port=self._port,
+            addresses=addresses,
+            certificate=certificate,
             title=title,
             tools={arm: its.frame_id for arm, its in robot.arms.items()},
             home=robot.home,
@@ -80,9 +92,22 @@ class Page:
         waited = 0.0
         while self._process.alive and waited < _READY and not self._ready.wait(0.1):
             waited += 0.1
-        if self.url is None:
+        if not self.urls:
             raise ConfigError(self.fault or f"--web: the page was not ready within {_READY:g} s")
-        return self.url
+        self.lines = (*notes, *(f"page: {url}" for url in self.urls))
+        return self.urls[0]
+
+    def _certified(self, addresses: Sequence[str]) -> tuple[str | None, tuple[str, ...]]:
+        """The PEM file that HTTPS needs, None on this computer alone, and lines about it; see :meth:`open`."""
+        if is_loopback(self._host):
+            return None, ()
+        if self._certificate is not None:
+            return str(self._certificate), ()
+        try:
+            file, line = own_certificate(installation_folder(), addresses, datetime.now(UTC))
+        except InputError as error:
+            raise ConfigError(f"--web-host {self._host}: {error}") from error
+        return str(file), () if line is None else (f"page: {line}",)
 
     @property
     def alive(self) -> bool:
@@ -107,7 +132,7 @@ class Page:
 
     def _on_answer(self, answer: Any) -> None:
         if isinstance(answer, Ready):
-            self.url = answer.url
+            self.urls = answer.urls
             self._ready.set()
         elif isinstance(answer, PageWatched):
             self.watched = answer.pages > 0
@@ -118,4 +143,4 @@ class Page:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._process.finish(_PATIENCE)
+        self._process.finish(_PATIENCE, _LONGEST)

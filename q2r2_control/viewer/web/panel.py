@@ -6,6 +6,7 @@ import time
 from base64 import b64encode
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from html import escape
 from typing import Any
 
@@ -52,10 +53,16 @@ class Panel:
     """Shows frames, and answers with what the buttons and sliders ask for."""
 
     def __init__(
-        self, server: viser.ViserServer, setup: PageSetup, driving: Driving | None, answer: Callable[[Any], None]
+        self,
+        server: viser.ViserServer,
+        setup: PageSetup,
+        driving: Driving | None,
+        answer: Callable[[Any], None],
+        take_over: Callable[[viser.GuiButtonHandle, Callable[[], None]], None],
     ) -> None:
+        """``take_over`` does an action at each press of a button, whatever pages do to viser's widgets."""
         self._setup, self._driving, self._bindings = setup, driving, setup.config.teleop.bindings
-        self._answer = answer
+        self._answer, self._take_over = answer, take_over
         self._names = {arm: [setup.joint_names[index] for index in joints] for arm, joints in setup.joints.items()}
         self._last: dict[str, Event] = {}  # of each arm
         self._binding: dict[ActiveLimit, None] = {}
@@ -109,7 +116,11 @@ class Panel:
             def ask(_: object, request: PageRequest = request) -> None:
                 self._answer(request)
 
-            gui.add_button(label, color=colour).on_click(ask)
+            button = gui.add_button(label, color=colour)
+            if request is PageRequest.STOP:
+                self._take_over(button, partial(self._answer, request))
+            else:
+                button.on_click(ask)
 
     def _add_time_line(self, gui: viser.GuiApi) -> None:
         gui.add_button("Play, or stand still", color="blue").on_click(lambda _: self._answer(PagePlay()))
@@ -120,7 +131,8 @@ class Panel:
                 self._answer(PageSeek(float(event.target.value)))
 
         self._time_line.on_update(seek)
-        gui.add_button("End the replay", color="red").on_click(lambda _: self._answer(PageRequest.STOP))
+        end = gui.add_button("End the replay", color="red")
+        self._take_over(end, partial(self._answer, PageRequest.STOP))
 
     def _add_slider(
         self,

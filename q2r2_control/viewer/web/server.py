@@ -73,7 +73,7 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
         return
     with suppress(OSError):
         os.nice(_NICENESS)
-    door, newest = Door(setup.host, setup.port), _Newest()
+    door, newest = Door(setup.host, setup.port, setup.certificate, setup.addresses), _Newest()
     with door.guards():
         server = viser.ViserServer(host=setup.host, port=door.port, verbose=False)
     open_pages: set[int] = set()
@@ -87,8 +87,9 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
     scene = CellScene(server, setup)
     limited = LimitedAnswers(answer)
     driving = Driving(server, setup, limited) if setup.driven else None
-    panel = Panel(server, setup, driving, limited)
-    answer(Ready(door.url))
+    panel = Panel(server, setup, driving, limited, door.messages.take_over)
+    door.messages.watch(server.gui)
+    answer(Ready(door.urls))
 
     def read() -> None:
         for frame in requests:

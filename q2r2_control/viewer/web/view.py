@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from q2r2_control.config.bindings import Action
@@ -40,7 +41,7 @@ class PageView(Page):
     come later instead. A page that fails is one line, and the run goes on.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, certificate: Path | None = None) -> None:
         """Start the process, which takes a second. Raises :class:`ConfigError` where viser is not installed."""
         self._due = 0.0  # of the next frame, by the clock on the wall [s]
         self._events: list[Event] = []
@@ -52,7 +53,7 @@ class PageView(Page):
         self._requests: dict[PageRequest, Callable[[], None]] = {}
         self._changes: dict[PageSetting, Callable[[float], None]] = {}
         self._hand_of: Callable[[str], str]  # that drives an arm
-        super().__init__(host, port, self._do)
+        super().__init__(host, port, self._do, certificate)
 
     def begin(self, pipeline: Pipeline, title: str, recorded: bool) -> str:
         """Serve the page of a run that is about to begin; returns its URL. Raises :class:`ConfigError`."""
@@ -119,10 +120,10 @@ class PageView(Page):
         if tick.reference.report.binding:
             self._binding.update(dict.fromkeys(tick.reference.report.binding))
         now = time.monotonic()
-        if now < self._due or self.url is None:
+        if now < self._due or not self.urls:
             return
         if not self.alive:
-            self.url = None
+            self.urls = ()
             _logger.warning("the page is gone, the run goes on: %s", self.fault)
             return
         moved = None if self._plant is None else self._plant.observed_qpos

@@ -3,6 +3,9 @@
 const [SPEED, TURNING] = [0.15, 0.6]; // of a hand [m/s], [rad/s]
 const SLOWLY = 0.25; // with Shift
 const LONGEST = 0.05; // of a frame that a hand moves for [s]
+// A key counts for so long after it was pressed, and after each of its repeats: browsers do not always say that it is up.
+// Chromium on X begins to repeat after 660 ms, and goes on every 40 ms. A page that draws slowly hears it later.
+const [PRESSED, REPEATED] = [750, 600]; // [ms]
 const DEAD = 0.12; // of a stick
 const START = { left: [0.3, 0.2, 1.1], right: [0.3, -0.2, 1.1] }; // x forward, y left, z up [m]
 // Each moves along or turns about an axis: 0 to 2 x y z, 3 to 5 about x y z.
@@ -11,11 +14,14 @@ const KEYS = {
   KeyO: [3, 1], KeyU: [3, -1], KeyK: [4, 1], KeyI: [4, -1], KeyJ: [5, 1], KeyL: [5, -1],
 };
 const LOWER = "Space", UPPER = "KeyG", HANDS = { Digit1: "left", Digit2: "right" };
+const BUTTONS = [LOWER, UPPER], MODIFIERS = ["Control", "Meta", "Alt"];
 const PAD = { a: 0, b: 1, bumpers: { left: 4, right: 5 }, tilt: [[12, 4, 1], [13, 4, -1], [14, 3, -1], [15, 3, 1]] };
 
 export const HELP =
   "1, 2: left or right hand. Space: engage or pause. W S A D E Q: move. I K J L U O: turn. G: gripper. Shift: slowly. " +
   "Gamepad: sticks move, and turn about the vertical; cross tilts; bumpers choose the hand; A engages, B is the gripper.";
+
+const isModified = ({ ctrlKey, metaKey, altKey, key }) => ctrlKey || metaKey || altKey || MODIFIERS.includes(key);
 
 // q after a turn by a small rotation vector, in the room's axes; x y z w.
 function turned([x, y, z, w], [a, b, c]) {
@@ -28,20 +34,37 @@ function turned([x, y, z, w], [a, b, c]) {
 export class Flying {
   constructor() {
     this.hand = "left"; // that moves
-    this.keys = new Set(); // that are held
+    this.until = new Map(); // keys that are held -> when they count no more [ms]
     this.poses = Object.fromEntries(Object.entries(START).map(([hand, place]) => [hand, [...place, 0, 0, 0, 1]]));
     this.then = performance.now();
     this.listening = new AbortController();
     const { signal } = this.listening;
-    addEventListener("keydown", (event) => {
-      if (!(event.code in KEYS || event.code in HANDS || [LOWER, UPPER].includes(event.code))) return;
-      event.preventDefault(); // Space would press the button that began this
-      this.keys.add(event.code);
-      this.hand = HANDS[event.code] ?? this.hand;
-    }, { signal });
-    addEventListener("keyup", (event) => this.keys.delete(event.code), { signal });
-    addEventListener("blur", () => this.keys.clear(), { signal });
+    addEventListener("keydown", (event) => this.press(event), { signal });
+    addEventListener("keyup", (event) => this.release(event), { signal });
+    addEventListener("blur", () => this.until.clear(), { signal });
     for (const type of ["keydown", "keyup"]) addEventListener(type, (event) => (this.slow = event.shiftKey), { signal });
+  }
+
+  press(event) {
+    // Such a press is the browser's: its dialogs keep the page from hearing that keys are up, and so does Cmd on a Mac.
+    if (isModified(event)) return this.until.clear();
+    if (!(event.code in KEYS || event.code in HANDS || BUTTONS.includes(event.code))) return;
+    event.preventDefault(); // Space would press the button that began this
+    if (event.repeat && !this.holds(event.code)) return; // what has ended begins with a new press only
+    const until = performance.now() + (event.repeat ? REPEATED : PRESSED);
+    this.until.set(event.code, until);
+    // Only the last key repeats. The others move no more then, but a dead man among them holds while any key repeats.
+    for (const code of BUTTONS) if (this.holds(code)) this.until.set(code, until);
+    this.hand = HANDS[event.code] ?? this.hand;
+  }
+
+  release(event) {
+    if (isModified(event)) this.until.clear();
+    this.until.delete(event.code);
+  }
+
+  holds(code) {
+    return this.until.get(code) > performance.now();
   }
 
   // Both hands, of which one has moved since the last frame.
@@ -53,7 +76,7 @@ export class Flying {
     const pressed = (button) => Boolean(pad?.buttons[button].pressed);
     for (const [hand, bumper] of Object.entries(PAD.bumpers)) if (pressed(bumper)) this.hand = hand;
     const rates = [0, 0, 0, 0, 0, 0];
-    for (const key of this.keys) if (key in KEYS) rates[KEYS[key][0]] += KEYS[key][1];
+    for (const key in KEYS) if (this.holds(key)) rates[KEYS[key][0]] += KEYS[key][1];
     for (const [button, axis, sign] of PAD.tilt) if (pressed(button)) rates[axis] += sign;
     [1, 0, 3].forEach((stick, axis) => (rates[axis] -= this.stick(pad, stick)));
     rates[5] -= this.stick(pad, 2);
@@ -61,7 +84,7 @@ export class Flying {
     const pose = this.poses[this.hand];
     const place = pose.slice(0, 3).map((value, axis) => value + step[axis]);
     this.poses[this.hand] = [...place, ...turned(pose.slice(3), step.slice(3))];
-    const buttons = [this.keys.has(UPPER) || pressed(PAD.b), this.keys.has(LOWER) || pressed(PAD.a), false];
+    const buttons = [this.holds(UPPER) || pressed(PAD.b), this.holds(LOWER) || pressed(PAD.a), false];
     const none = [false, false, false];
     return Object.fromEntries(
       Object.entries(this.poses).map(([hand, pose]) => [hand, { pose, buttons: hand === this.hand ? buttons : none }]),

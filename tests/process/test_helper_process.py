@@ -1,0 +1,19 @@
+"""A process beside the loop never keeps the run from ending, nor does one that it has started."""
+
+from __future__ import annotations
+
+import pytest
+
+from q2r2_control.process.helper_process import HelperProcess
+from tests.support.processes import alive, wait_until
+
+
+@pytest.mark.parametrize(("busy", "fault"), [(False, "did nothing for 0.5 s"), (True, "did not end within 0.5 s")])
+def test_a_process_that_does_not_end_is_killed_with_those_that_it_started(busy: bool, fault: str) -> None:
+    started: list[int] = []
+    process = HelperProcess("lasts", "tests.support.lasting_helper", started.append)
+    process.send(busy)
+    wait_until(lambda: started)
+    process.finish(patience=60.0 if busy else 0.5, longest=0.5 if busy else 60.0)
+    assert process.fault == f"the process that lasts {fault}"
+    wait_until(lambda: not alive(started[0]) and not process.alive)
