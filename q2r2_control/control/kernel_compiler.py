@@ -39,7 +39,7 @@ class _PartLibrary(JITCodeLibrary):
 
     @property
     def codegen(self) -> Any:
-        """What Numba hands the function's Python objects to; kernels have none."""
+        """This library itself, to which Numba hands the function's Python objects; kernels have none."""
         return self
 
     def set_env(self, name: str, environment: Any) -> None:
@@ -98,7 +98,7 @@ class Kernel(CPUDispatcher):
         self._part_compiler = numba_compiler(function, self.targetdescr, part_options, {}, _PartCompiler)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """What a caller that is being compiled has to know; a kernel needs no more of this one than a part."""
+        """Tell a caller that is being compiled what it has to know; another kernel needs this one as a part only."""
         with global_compiler_lock:
             self._wanted_as_part = Kernel._being_compiled > 0
             return super().get_call_template(args, kws)

@@ -165,9 +165,9 @@ def _words(value: Any) -> list[int]:
     if isinstance(value, tuple):
         return [word for part in value for word in _words(part)]
     if isinstance(value, np.ndarray):
-        # Whoever made the pointer keeps the array: no reference is counted, and nobody is named to count them.
-        nobody = [0, 0]
-        return [*nobody, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides]
+        # The pointer's owner keeps the array: no reference is counted, and both of Numba's owners are left out.
+        owners = [0, 0]
+        return [*owners, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides]
     if isinstance(value, KernelPointer | KernelPointers):
         return [value.address]
     if isinstance(value, float):

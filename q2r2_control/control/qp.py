@@ -75,7 +75,7 @@ class QpSolution:
 
 
 class Solver(Protocol):
-    """Whatever solves a :class:`QpProblem`: ``CartesianController(robot, settings, solver=MySolver())`` uses it.
+    """An object that solves a :class:`QpProblem`: ``CartesianController(robot, settings, solver=MySolver())`` uses it.
 
     Nothing about its answer is trusted. An exception, and an answer that is not usable, is a failed solve: the step
     executes the certified stop.
