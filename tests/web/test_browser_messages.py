@@ -52,7 +52,7 @@ def gui() -> Iterator[viser.GuiApi]:
 
 @pytest.fixture
 def asked() -> list[object]:
-    """What the buttons of the page have asked for."""
+    """The requests of the buttons of the page."""
     return []
 
 
