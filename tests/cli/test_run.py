@@ -71,11 +71,11 @@ CAMERAS = ["above", "left_wrist", "right_wrist"]
 
 @pytest.mark.parametrize(
     ("display", "viser", "shown"),
-    [(True, True, (True, None)), (False, True, (False, ("127.0.0.1", 0))), (False, False, (False, None))],
+    [(True, True, (True, None)), (False, True, (False, ("127.0.0.1", 0, None))), (False, False, (False, None))],
     ids=["display", "no display", "neither"],
 )
 def test_a_demo_at_a_terminal_shows_the_arms_where_there_is_a_way_to(
-    monkeypatch: pytest.MonkeyPatch, display: bool, viser: bool, shown: tuple[bool, tuple[str, int] | None]
+    monkeypatch: pytest.MonkeyPatch, display: bool, viser: bool, shown: tuple[bool, tuple[str, int, None] | None]
 ) -> None:
     def run_cell(config: Config, options: RunOptions) -> None:
         assert (options.window, options.page) == shown
