@@ -83,7 +83,7 @@ def _with_solver(config: Config, name: str) -> Config:
 
 
 def _apart_mm(run: MotionRun, other: MotionRun, robot: Robot) -> float | None:
-    """The largest distance of a tool from where it is in the ``other`` run at the same tick [mm]."""
+    """The largest distance between a tool's positions in this run and in the ``other`` one, at the same tick [mm]."""
     ticks = min(len(run.q), len(other.q))
     if not ticks:
         return None

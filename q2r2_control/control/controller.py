@@ -84,9 +84,10 @@ class CartesianController(WatchedPairs):
             raise ConfigError(f"solver = {shown(solver)}: allowed: a solver's name, a Solver, or None: control.solver")
         super().__init__(robot, settings)
         self._nv = robot.model.nv
-        own = None if isinstance(solver, str) else solver
-        guarded = own if own is None or isinstance(own, Guard) else Guard(own, self._nv)
-        self._solver = solver_of(settings, self._nv) if guarded is None else guarded
+        if solver is None or isinstance(solver, str):
+            self._solver = solver_of(settings, self._nv)
+        else:
+            self._solver = solver if isinstance(solver, Guard) else Guard(solver, self._nv)
         self._qp = StepProblem(robot, settings, tasks, constraints)
         self._tools: TaskData = self._data_pointer.value.tasks
         self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step

@@ -23,14 +23,14 @@ class _PartLibrary(JITCodeLibrary):
     """Code of a kernel that is compiled on behalf of another one: only linked into that one, and not run by itself."""
 
     def finalize(self) -> None:
-        """Leave the code as it is; what it calls is linked by the whole kernel."""
+        """Mark the library as complete. The whole kernel links, optimises and translates it."""
         self._raise_if_finalized()
         self._finalized = True
 
     def _get_module_for_linking(self) -> Any:
         for function in self._final_module.functions:
             if not function.is_declaration and function.linkage.name == "external":
-                function.linkage = "linkonce_odr"  # several whole kernels may link it
+                function.linkage = "linkonce_odr"  # several whole kernels may link this function
         return self._final_module
 
     def get_pointer_to_function(self, name: str) -> int:

@@ -19,32 +19,29 @@ from numba.core.imputils import lower_getattr_generic
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 
-# No type checker knows what Numba sets at run time.
+# Numba defines these names at run time, where type checkers cannot see them.
 extending: Any = numba.extending
 
 
-class _Pointer(types.Type):
+class _Address(types.Type):
+    """Type of an address in a kernel. Two are the same type if the values behind them are of the same type."""
+
+    def __init__(self, pointee: Any) -> None:
+        self.pointee = pointee
+        super().__init__(name=f"{type(self).__name__}({pointee})")
+
+    @property
+    def key(self) -> Any:
+        """The type of the value, since two named tuples with other fields may have the same name."""
+        return self.pointee
+
+
+class _Pointer(_Address):
     """Kernels' type of a :class:`KernelPointer`."""
 
-    def __init__(self, pointee: Any) -> None:
-        self.pointee = pointee
-        super().__init__(name=f"KernelPointer({pointee})")
 
-    @property
-    def key(self) -> Any:
-        return self.pointee  # whose name does not tell of its fields
-
-
-class _Pointers(types.Type):
+class _Pointers(_Address):
     """Kernels' type of :class:`KernelPointers`."""
-
-    def __init__(self, pointee: Any) -> None:
-        self.pointee = pointee
-        super().__init__(name=f"KernelPointers({pointee})")
-
-    @property
-    def key(self) -> Any:
-        return self.pointee
 
 
 for _kind in (_Pointer, _Pointers):

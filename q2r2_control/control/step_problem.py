@@ -78,7 +78,8 @@ class GivenSolution:
         """``x``: the velocities (nv,) [rad/s], and whatever follows them; anything else is no solution."""
         self._v: Array | None = None
         try:
-            numbers = np.array(x, dtype=np.float64)
+            given = np.asarray(x)
+            numbers = np.array(given, dtype=np.float64) if given.dtype.kind != "c" else np.zeros(0)
         except Exception:  # of any kind that a stranger's object raises
             return
         if numbers.ndim == 1 and len(numbers) >= nv and np.isfinite(numbers[:nv]).all():

@@ -205,7 +205,8 @@ class Robot:
     def checked(self, name: str, values: npt.ArrayLike) -> Array:
         """A copy of ``values``, one for each joint (nv,). Raises :class:`RobotError` that says their ``name``."""
         try:
-            array = np.array(values, dtype=np.float64)
+            given = np.asarray(values)
+            array = np.array(given, dtype=np.float64) if given.dtype.kind != "c" else np.empty(0)
         except (TypeError, ValueError, OverflowError):
             array = np.empty(0)
         if array.shape != (self.model.nv,) or not np.isfinite(array).all():

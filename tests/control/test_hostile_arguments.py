@@ -95,6 +95,12 @@ def test_no_given_solution_ends_a_tick_with_an_exception(
     contract.check(controller.advance(hostile, {}, 0.002), 0.002)
 
 
+def test_complex_numbers_are_refused_and_not_cut_to_their_real_parts(controller: CartesianController) -> None:
+    with pytest.raises(RobotError, match="finite numbers"):
+        controller.reset(np.zeros(14, dtype=complex))
+    assert controller.advance(np.zeros(14, dtype=complex), {}, 0.002).report.unsolved == 1
+
+
 def test_targets_that_are_no_mapping_are_refused_and_nothing_moves(
     contract: Contract, controller: CartesianController, hostile: Any
 ) -> None:

@@ -102,7 +102,7 @@ def double(x):
 
 @pytest.fixture
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache of a test's own, and no kernel but the test's."""
+    """Use a cache folder and a list of kernels that belong to the test alone."""
     monkeypatch.setattr(kernel_cache, "_FOLDER", str(tmp_path / "machine_code"))
     monkeypatch.setattr(jit, "_kernels", [])
     return tmp_path

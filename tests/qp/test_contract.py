@@ -29,7 +29,7 @@ SHORTEST = ("crossing", "circle", SLOWLY_OUT)  # what runs with the other short 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One run: the targets followed, then let go of."""
+    """One run, in which the tools follow their targets and then hold."""
 
     references: list[Reference]  # while there were targets
     error: float  # of the tool that is farther from its target, root mean square [m]

@@ -76,7 +76,7 @@ CORNERS: dict[str, Callable[[Robot], Corner]] = {
 
 
 def moved(controller: CartesianController, way: pin.Motion) -> dict[str, pin.SE3]:
-    """Targets, a ``way`` from where the tools are."""
+    """Targets that are a ``way`` (3,) [m] away from the tools' poses."""
     poses = {arm: controller.tool_pose(arm) for arm in ROBOT.arms}
     turn = pin.exp3(way.angular)
     return {arm: pin.SE3(turn @ pose.rotation, pose.translation + way.linear) for arm, pose in poses.items()}
@@ -127,7 +127,8 @@ def test_a_joint_at_its_limit_that_still_runs_towards_it_brakes_as_hard_as_it_ca
             reference = driven.drive(DT, driven.start)
             unsolved += reference.report.unsolved
         assert sign * reference.v[joint] == pytest.approx(abs(v[joint]) - TICKS * braking[joint] * DT, abs=1e-6)
-    # OSQP gives up at an elbow that is folded into its own arm: 48 rows contradict each other. The arm brakes as well.
+    # OSQP finds no solution in some ticks in which an elbow is folded into its own arm and 48 rows contradict each
+    # other. The arm then brakes, as it does with a solution.
     assert unsolved <= (0.15 if solver == "osqp" else 0.0) * TICKS * len(joints)
 
 

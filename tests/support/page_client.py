@@ -35,7 +35,8 @@ class PageClient:
         self.buttons: dict[str, str] = {}  # by label
         self.drawn: set[str] = set()  # names of meshes
         self.pictures: list[bytes] = []  # of cameras, as they came
-        self.send("ViewerCameraMessage", **_CAMERA)  # before which no press counts
+        # The page counts no press of a browser that has sent no camera yet.
+        self.send("ViewerCameraMessage", **_CAMERA)
 
     def __enter__(self) -> Self:
         return self

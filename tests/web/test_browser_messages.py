@@ -133,7 +133,8 @@ def test_stop_works_whatever_another_page_sends(page: Callable[[], PageClient], 
             for updates in CHANGES:
                 hostile.send("GuiUpdateMessage", uuid=hostile.button(label), updates=updates)
         hostile.send("ShareUrlRequest")
-        hostile.press("Bring both arms home")  # after which the server has read all of the above
+        # When this press arrives, the server has read all messages before it.
+        hostile.press("Bring both arms home")
         wait_until(lambda: asked)
         honest.press("Pause")
         honest.press("Stop")

@@ -68,11 +68,11 @@ def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any])
 
 @contextmanager
 def printing_to_stderr() -> Iterator[None]:
-    """Print on stderr what is printed on stdout, by libraries too: that is where results are, as one JSON object."""
+    """Send the output to stderr, also that of compiled libraries, since stdout carries the result as JSON."""
     try:
         sys.stdout.flush()
         stdout = os.dup(1)
-    except (OSError, ValueError, AttributeError):  # there is none to keep clean
+    except (OSError, ValueError, AttributeError):  # the process has no stdout
         yield
         return
     try:

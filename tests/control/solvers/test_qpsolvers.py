@@ -40,7 +40,7 @@ def silence(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
 
 
 def _driven(controller: CartesianController, ticks: int) -> tuple[Array, int]:
-    """Postures of a run in which the tools are sent to each other, and how many ticks were unsolved."""
+    """Send the tools to each other; returns the postures of the run and the number of unsolved ticks."""
     home = {arm: controller.tool_pose(arm) for arm in ROBOT.arms}
     contract, q, unsolved = Contract(controller), [], 0
     for tick in range(ticks):
