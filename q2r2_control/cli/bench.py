@@ -180,7 +180,7 @@ def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
         yield name, worst, f"{margin.sense} {margin.allowed:.2g}", margin.checked, margin.violations
     if (grown := report.memory_growth_mb) is not None:
         broken = int(grown > MEMORY_ALLOWED)
-        yield "memory growth after a tenth of it", f"{grown:.2f} MB", f"<= {MEMORY_ALLOWED:g}", 1, broken
+        yield "steady memory growth after a tenth", f"{grown:.2f} MB", f"<= {MEMORY_ALLOWED:g}", 1, broken
 
 
 def _soak_notes(report: SoakReport, options: str) -> Iterator[str]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import gc
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ COUNTED = {
     "grasps": "grasps and releases",
     "changes": "changes of settings",
 }
-_SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
+_LOOKS = (0.1, 0.4, 0.7, 1.0)  # shares of the ticks after which the memory is measured
 MEMORY_ALLOWED = 5.0  # [MB]
 
 
@@ -77,7 +78,7 @@ class SoakReport:
     simulated_s: float
     counts: dict[str, int]  # see :data:`COUNTED`
     margins: list[Margin]
-    memory_growth_mb: float | None  # None where the system does not tell
+    memory_growth_mb: float | None  # see steady_growth; None where the system does not tell
     broken: list[Violation]  # the first of each promise, in the order of their ticks
 
     @property
@@ -128,14 +129,14 @@ class Soak:
 
     def run(self, ticks: int, progress: Callable[[str], None] = lambda what: None) -> SoakReport:
         """Run ``ticks`` ticks."""
-        before = None
+        looks, memory = [round(share * ticks) for share in _LOOKS], list[float | None]()
         for tick, (segment, since) in enumerate(self._ticks(ticks)):
-            if tick == int(_SETTLED * ticks):
-                before = _memory_mb()
+            if tick in looks:
+                memory.append(_memory_mb())
             if tick % max(ticks // 20, 1) == 0:
                 progress(f"tick {tick} of {ticks}")
             self._tick(tick, segment, since)
-        after = _memory_mb()
+        memory.append(_memory_mb())
         return SoakReport(
             cell=self._cell,
             solver=self._solver_name,
@@ -143,7 +144,7 @@ class Soak:
             ticks=ticks,
             simulated_s=self._simulated,
             margins=list(self._contract.margins.values()),
-            memory_growth_mb=None if before is None or after is None else after - before,
+            memory_growth_mb=steady_growth(memory),
             counts=dict(self._counts),
             broken=list(self._broken.values()),
         )
@@ -218,6 +219,24 @@ class Soak:
             name = self._contract.margins[key].name
             found = Violation(name, tick, str(segment), since, self._q, self._v, poses, repr(dt), error)
             self._broken.setdefault(key, found)
+
+
+def steady_growth(memory: Sequence[float | None]) -> float | None:
+    """How much a leak may have added to the ``memory`` from the first of these measurements to the last [MB].
+
+    A leak adds as much in each of the equal spans between them. The heap also grows until it has room for the largest
+    tick, which adds to some spans and not to the others. The least of them therefore counts, once for each span.
+
+    Args:
+        memory: Two or more measurements [MB], None where the system did not tell.
+
+    Returns:
+        The growth [MB]; None if a measurement is missing.
+    """
+    known = [value for value in memory if value is not None]
+    if len(known) < len(memory):
+        return None
+    return (len(known) - 1) * min(after - before for before, after in pairwise(known))
 
 
 def _memory_mb() -> float | None:

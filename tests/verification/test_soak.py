@@ -21,7 +21,7 @@ from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference
 from q2r2_control.verification.fault_injection import FINGERS, FaultySolver, WorstSolver, untimed, with_contact
-from q2r2_control.verification.soak import Soak, SoakReport, run_soak
+from q2r2_control.verification.soak import Soak, SoakReport, run_soak, steady_growth
 from tests.support.object_cell import cell
 
 pytestmark = pytest.mark.slow
@@ -307,3 +307,15 @@ def test_leaving_penetration_the_separation_never_decreases() -> None:
         if tick:
             assert distance >= min(least, SETTINGS.min_distance) - 1e-9, tick
         least = distance
+
+
+@pytest.mark.parametrize(
+    ("memory", "growth"),
+    [((100.0, 103.0, 106.0, 109.0), 9.0), ((142.0, 145.0, 147.5, 147.1), -1.2), ((100.0, None, 100.0, 100.0), None)],
+    ids=["a leak", "a heap that settles", "unknown"],
+)
+def test_memory_that_grows_on_counts_and_a_heap_that_settles_does_not(
+    memory: tuple[float | None, ...], growth: float | None
+) -> None:
+    found = steady_growth(memory)
+    assert found == (None if growth is None else pytest.approx(growth))
