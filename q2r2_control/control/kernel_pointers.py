@@ -53,11 +53,11 @@ class KernelPointer:
 
     __slots__ = ("address", "kind", "memory", "value")
 
-    def __init__(self, value: Any, memory: npt.NDArray[np.int64]) -> None:
+    def __init__(self, value: Any, memory: npt.NDArray[np.int64], kind: _Pointer) -> None:
         self.value = value  # whose arrays have to stay
         self.memory = memory
         self.address = memory.ctypes.data
-        self.kind = _Pointer(numba.typeof(value))
+        self.kind = kind
 
     def __reduce__(self) -> Any:
         return pointer_to, (self.value,)  # a copy has an address of its own
@@ -176,6 +176,29 @@ def _words(value: Any) -> list[int]:
     )
 
 
+def _form(value: Any) -> Any:
+    """All of ``value`` that Numba's type for it depends on: a key that is found faster than that type."""
+    if isinstance(value, tuple):
+        return type(value), *[_form(part) for part in value]
+    if isinstance(value, np.ndarray):
+        return value.dtype, value.ndim, value.flags.num
+    return value.kind if isinstance(value, KernelPointer | KernelPointers) else type(value)
+
+
+_kinds: dict[Any, _Pointer] = {}  # by the form of the value, since a controller has hundreds of pointers
+
+
+def _kind_of_pointer_to(value: Any, size: int) -> _Pointer:
+    """Kernels' type of a pointer to ``value``, which has ``size`` bytes."""
+    form = _form(value)
+    if form not in _kinds:
+        kind, context = _Pointer(numba.typeof(value)), cpu_target.target_context
+        if size != context.get_abi_sizeof(context.get_data_type(kind.pointee)):
+            raise TypeError(f"Numba {numba.__version__} lays out {type(value).__name__} in another way than expected")
+        _kinds[form] = kind
+    return _kinds[form]
+
+
 def pointer_to(value: Any) -> KernelPointer:
     """Put ``value``, a named tuple of arrays, numbers and more of its kind, behind a pointer.
 
@@ -183,10 +206,7 @@ def pointer_to(value: Any) -> KernelPointer:
         TypeError: if a part of ``value`` is anything else.
     """
     memory = np.array(_words(value), dtype=np.int64)
-    context = cpu_target.target_context
-    if memory.nbytes != context.get_abi_sizeof(context.get_data_type(numba.typeof(value))):
-        raise TypeError(f"Numba {numba.__version__} lays out {type(value).__name__} in another way than expected")
-    return KernelPointer(value, memory)
+    return KernelPointer(value, memory, _kind_of_pointer_to(value, memory.nbytes))
 
 
 def pointers_to(values: list[Any]) -> KernelPointers:

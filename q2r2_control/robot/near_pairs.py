@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.home_search import find_home, mirrored_home
 from q2r2_control.robot.pairs import link_of
@@ -36,15 +37,14 @@ def spreads_of(robot: Robot, pairs: Sequence[Pair]) -> dict[Pair, Interval]:
     geometry.removeAllCollisionPairs()
     for pair in pairs:
         geometry.addCollisionPair(pin.CollisionPair(*map(geometry.getGeometryId, pair)))
-    data, geometry_data = robot.model.createData(), geometry.createData()
+    distances = CoalDistances(robot.model, geometry)
     random = np.random.default_rng(0).uniform(robot.position_lower, robot.position_upper, (_POSTURES, robot.model.nv))
     spreads: dict[Pair, Interval] = {}
     for q in (robot.home, *random):
-        pin.computeDistances(robot.model, data, geometry, geometry_data, q)
         now: dict[Pair, float] = {}
-        for (a, b), found in zip(pairs, geometry_data.distanceResults, strict=True):
+        for (a, b), distance in zip(pairs, distances.at(q).tolist(), strict=True):
             links = link_of(a), link_of(b)
-            now[links] = min(float(found.min_distance), now.get(links, math.inf))
+            now[links] = min(distance, now.get(links, math.inf))
         for links, distance in now.items():
             least, greatest = spreads.get(links, (math.inf, -math.inf))
             spreads[links] = min(least, distance), max(greatest, distance)

@@ -14,6 +14,7 @@ import pinocchio as pin
 
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.errors import ConfigError
+from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
 from q2r2_control.robot.held_objects import HeldObject
 from q2r2_control.robot.pairs import LinkClass, Role
@@ -54,13 +55,7 @@ def distances_with(robot: Robot, obstacles: Mapping[str, MovingObstacle]) -> Cal
     geometry = with_obstacle_bodies(robot, obstacles)
     for number, (name, obstacle) in enumerate(obstacles.items(), geometry.ngeoms - len(obstacles)):
         geometry.geometryObjects[number] = body_of(name, obstacle)
-    data, placed = robot.model.createData(), geometry.createData()
-
-    def distances(q: Array) -> Array:
-        pin.computeDistances(robot.model, data, geometry, placed, q)
-        return np.array([result.min_distance for result in placed.distanceResults], dtype=np.float64)
-
-    return distances
+    return CoalDistances(robot.model, geometry).at
 
 
 def roles_with_obstacles(robot: Robot, names: Iterable[str]) -> dict[str, Role]:

@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.description import LinkTree, joint_end, parse_srdf
 from q2r2_control.types import Array
 
@@ -168,13 +169,12 @@ def remove_overlapping_own_pairs(
     Such shapes overlap by construction. ``own_links`` has one set of links an arm, from its base to its tool. A pair
     with the other arm or with an obstacle stays, however it lies.
     """
-    data, geometry_data = model.createData(), geometry.createData()
+    distances = CoalDistances(model, geometry)
     names = pair_names(geometry)
     within_one_arm = [any(set(map(link_of, pair)) <= links for links in own_links) for pair in names]
     touching = np.array(within_one_arm, dtype=bool)
     for q in postures:
-        pin.computeDistances(model, data, geometry, geometry_data, q)
-        touching &= np.array([result.min_distance <= 0 for result in geometry_data.distanceResults], dtype=bool)
+        touching &= distances.at(q) <= 0.0
     removed = tuple(pair for pair, touches in zip(names, touching, strict=True) if touches)
     keep_pairs(geometry, lambda a, b: (a, b) not in removed)
     return removed

@@ -16,6 +16,7 @@ import pinocchio as pin
 from scipy.optimize import Bounds, minimize
 
 from q2r2_control.errors import RobotError
+from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.pairs import distance_gradient, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -82,14 +83,13 @@ class _Search:
         # Of each pair, the postures to go downhill from and their distances, nearest first.
         self._starts = np.zeros((len(self.names), _STARTS, self._model.nv))
         self._at = np.full((len(self.names), _STARTS), np.inf)
-        self._data, self._geometry_data = self._model.createData(), self._geometry.createData()
+        self._distances = CoalDistances(self._model, self._geometry)
 
     def look_at(self, postures: Array) -> None:
         """Take the distances at ``postures`` (n, nv)."""
         distances = np.empty((len(postures), len(self._left)))
         for i, q in enumerate(postures):
-            pin.computeDistances(self._model, self._data, self._geometry, self._geometry_data, q)
-            distances[i] = [result.min_distance for result in self._geometry_data.distanceResults]
+            distances[i] = self._distances.at(q)
         for p, column in zip(self._left, distances.T, strict=True):
             found = np.concatenate([self._at[p], column])
             best = np.argsort(found, kind="stable")[:_STARTS]
@@ -110,12 +110,13 @@ class _Search:
 
     def _downhill(self, k: int, q: Array) -> float:
         """Least distance of the pair of number ``k`` among those left."""
+        data, geometry_data = self._distances.data, self._distances.geometry_data
 
         def distance(posture: Array) -> tuple[float, Array]:
-            pin.computeJointJacobians(self._model, self._data, posture)
-            pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._geometry_data)
-            found = pin.computeDistance(self._geometry, self._geometry_data, k)
-            gradient = distance_gradient(self._model, self._data, self._geometry, self._geometry_data, k)
+            pin.computeJointJacobians(self._model, data, posture)
+            pin.updateGeometryPlacements(self._model, data, self._geometry, geometry_data)
+            found = pin.computeDistance(self._geometry, geometry_data, k)
+            gradient = distance_gradient(self._model, data, self._geometry, geometry_data, k)
             return float(found.min_distance), gradient
 
         options = {"maxiter": _STEPS, "ftol": _FLAT}
@@ -126,7 +127,7 @@ class _Search:
         self._geometry.removeAllCollisionPairs()
         for p in self._left:
             self._geometry.addCollisionPair(self._pairs[p])
-        self._geometry_data = self._geometry.createData()
+        self._distances = CoalDistances(self._model, self._geometry)
 
 
 def srdf_of(robot: Robot, approaches: Sequence[PairReach], clearance: float, samples: int) -> str:

@@ -17,6 +17,7 @@ from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.cell_parts import check_position
+from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
@@ -142,7 +143,7 @@ class Robot:
         self.ignored_pairs = self._monitor(tree, exclusions, list(own_links.values()))
         self.objects = HeldObjects(self.collision_model, {}, ())
         self._data: pin.Data = self.model.createData()
-        self._collision_data: pin.GeometryData = self.collision_model.createData()
+        self._distances = CoalDistances(self.model, self.collision_model)
 
     @classmethod
     def from_config(cls, config: Config) -> Robot:
@@ -234,9 +235,7 @@ class Robot:
 
     def distance_values(self, q: npt.ArrayLike) -> Array:
         """The numbers of :meth:`distances` alone (pairs,) [m]."""
-        q = self.checked("q", q)
-        pin.computeDistances(self.model, self._data, self.collision_model, self._collision_data, q)
-        return np.array([result.min_distance for result in self._collision_data.distanceResults], dtype=np.float64)
+        return self._distances.at(self.checked("q", q))
 
     def closest_points(self, q: npt.ArrayLike, pair: tuple[str, str]) -> Array | None:
         """The nearest points (2, 3) [m] of a monitored pair in the world at ``q`` (nv,); None where it is none."""
@@ -244,9 +243,9 @@ class Robot:
         names = pair_names(self.collision_model)
         if pair not in names:
             return None
-        q = self.checked("q", q)
-        pin.updateGeometryPlacements(self.model, self._data, self.collision_model, self._collision_data, q)
-        result = pin.computeDistance(self.collision_model, self._collision_data, names.index(pair))
+        q, geometry_data = self.checked("q", q), self._distances.geometry_data
+        pin.updateGeometryPlacements(self.model, self._data, self.collision_model, geometry_data, q)
+        result = pin.computeDistance(self.collision_model, geometry_data, names.index(pair))
         return np.array([result.getNearestPoint1(), result.getNearestPoint2()])
 
     def _monitor(

@@ -14,6 +14,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ContactPair
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.control.solvers.guard import Guard
+from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.pairs import distance_gradient
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -31,9 +32,8 @@ class WorstSolver:
     """Makes the answers of one attack after another. Distances and their gradients are Coal's and Pinocchio's."""
 
     def __init__(self, robot: Robot, random: np.random.Generator) -> None:
-        self._robot, self._random = robot, random
-        self._data = robot.model.createData()
-        self._geometry: pin.GeometryData = robot.collision_model.createData()
+        self._random = random
+        self._distances = CoalDistances(robot.model, robot.collision_model)
         self._signs = np.ones(robot.model.nv)
         self._last = np.zeros(robot.model.nv)
         self._left = 0
@@ -57,14 +57,14 @@ class WorstSolver:
 
     def _gradient(self, q: Array, kept: Array) -> Array:
         """Of the distance of a pair with one of the least margins, with respect to ``q`` (nv,) [m/rad]."""
-        model, data, geometries = self._robot.model, self._data, self._robot.collision_model
+        model, geometries = self._distances.model, self._distances.geometry
+        data, geometry_data = self._distances.data, self._distances.geometry_data
         pin.computeJointJacobians(model, data, q)
-        pin.updateGeometryPlacements(model, data, geometries, self._geometry)
-        pin.computeDistances(geometries, self._geometry)
-        results = self._geometry.distanceResults
-        margins = np.array([result.min_distance for result in results]) - kept
+        pin.updateGeometryPlacements(model, data, geometries, geometry_data)
+        pin.computeDistances(geometries, geometry_data)
+        margins = self._distances.measured() - kept
         nearest = int(np.argsort(margins)[min(self._rank, len(margins) - 1, _CANDIDATES - 1)])
-        return distance_gradient(model, data, geometries, self._geometry, nearest)
+        return distance_gradient(model, data, geometries, geometry_data, nearest)
 
 
 # Solver failures after which the certified stop is due. A solution of absurd numbers is cut to the limits instead.

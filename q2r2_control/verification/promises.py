@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import pinocchio as pin
 
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.geometry.pair_distance import deeper_at_corners
 from q2r2_control.control.safety.safety_data import ROUNDING
+from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.finger_bodies import collision_model_at
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
@@ -90,11 +90,13 @@ class MeasuredDistances:
         self._pairs = {frozenset(pair): index for index, pair in enumerate(pair_names(robot.collision_model))}
         self._objects = {frozenset(pair) for pair in robot.objects.pair_names()}
         self.kept = kept
-        self._robot, self._data = robot, robot.model.createData()
+        self._robot = robot
         self._at_corners = deeper_at_corners(collision_model_of(robot), kept)
-        self._fingers: tuple[pin.GeometryModel, pin.GeometryData] | None = None  # None: all of their way
-        self._held_model = robot.objects.geometry
-        self._held_data: pin.GeometryData = self._held_model.createData()
+        self._fingers: CoalDistances | None = None  # None: all of their way
+        objects = robot.objects.geometry.copy()
+        for pair in robot.collision_model.collisionPairs:  # which come before those of objects
+            objects.removeCollisionPair(pair)
+        self._of_objects = CoalDistances(robot.model, objects)
         self.forget()
 
     def forget(self) -> None:
@@ -105,7 +107,7 @@ class MeasuredDistances:
     def set_openings(self, openings: Mapping[str, Interval]) -> None:
         """Between which openings each arm's gripper is; of an arm that is not named, all of the way."""
         model = collision_model_at(self._robot.collision_model, self._robot.finger_bodies, openings)
-        self._fingers = model, model.createData()
+        self._fingers = CoalDistances(self._robot.model, model)
 
     def least_of(self, postures: Array) -> float:
         """Least margin of a pair at any of ``postures`` (s, nv) [m]."""
@@ -145,16 +147,10 @@ class MeasuredDistances:
         """The same of the pairs of held objects that are apart, or have to be [m]."""
         if not np.isfinite(self.held).any():
             return np.zeros(0)
-        pin.computeDistances(self._robot.model, self._data, self._held_model, self._held_data, q)
-        results = list(self._held_data.distanceResults)[-len(self.held) :]
-        values = np.array([result.min_distance for result in results], dtype=np.float64)
+        values = self._of_objects.at(q)
         seen = np.isfinite(self.held) & ((values > 0.0) | (self.held >= 0.0))  # Coal's depth is another quantity
         return (values - self.held)[seen]
 
     def _values(self, q: Array) -> Array:
         """As :meth:`Robot.distance_values`, with fingers at the openings that the controller counts with."""
-        if self._fingers is None:
-            return self._robot.distance_values(q)
-        model, data = self._fingers
-        pin.computeDistances(self._robot.model, self._data, model, data, q)
-        return np.array([result.min_distance for result in data.distanceResults], dtype=np.float64)
+        return self._robot.distance_values(q) if self._fingers is None else self._fingers.at(q)

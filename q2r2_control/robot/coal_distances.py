@@ -1,0 +1,28 @@
+"""Distances of all pairs of a geometry model as Coal measures them, for checks that do not trust the kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.types import Array
+
+
+class CoalDistances:
+    """Measures every collision pair of a geometry model, in the order of its pairs."""
+
+    def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
+        self.model, self.geometry = model, geometry
+        self.data: pin.Data = model.createData()
+        self.geometry_data: pin.GeometryData = geometry.createData()
+        # They stay where they are, and to look each of them up again would take longer than to measure.
+        self._results = list(self.geometry_data.distanceResults)
+
+    def at(self, q: Array) -> Array:
+        """Distances (pairs,) [m] at ``q`` (nv,); negative where the shapes of a pair overlap."""
+        pin.computeDistances(self.model, self.data, self.geometry, self.geometry_data, q)
+        return self.measured()
+
+    def measured(self) -> Array:
+        """Distances (pairs,) [m] that Coal measured last with ``geometry_data``."""
+        return np.array([result.min_distance for result in self._results], dtype=np.float64)
