@@ -81,7 +81,7 @@ def capsules_around(shape: coal.CollisionGeometry, name: str, count: int) -> lis
     """
     vertices = _vertices(shape, name)
     if count == 1 or not isinstance(shape, coal.BVHModelBase):
-        return [_cached_capsule(vertices.tobytes())]
+        return [enclosing_capsule(vertices)]
     triangles = np.array(
         [[one[0], one[1], one[2]] for one in map(shape.tri_indices, range(shape.num_tris))], dtype=np.int64
     )
@@ -95,7 +95,13 @@ def enclosing_capsule(points: Array) -> Capsule:
     radius beyond the least one. For an axis with radius r, a point at height t and distance rho from it is inside when
     the segment covers a height within sqrt(r^2 - rho^2) of t.
     """
-    points = _corners(np.asarray(points, dtype=float))
+    return _cached_capsule(np.array(points, dtype=float, order="C").tobytes())
+
+
+@lru_cache(maxsize=256)
+def _cached_capsule(found: bytes) -> Capsule:
+    """Both arms of a cell usually share their meshes, and a program that builds a robot often builds it again."""
+    points = _corners(np.frombuffer(found).reshape(-1, 3))
     centre = points.mean(axis=0)
     scale = max(float(np.abs(points - centre).max()), 1e-9)
     frame, view = _best_view(points - centre, np.linalg.svd(points - centre, full_matrices=True)[2], scale)
@@ -105,12 +111,6 @@ def enclosing_capsule(points: Array) -> Capsule:
     radius, ends = _fit(view, result.x)
     start, end = ends * scale @ frame + centre
     return radius * scale + _ROUNDING, start, end
-
-
-@lru_cache(maxsize=64)
-def _cached_capsule(points: bytes) -> Capsule:
-    """Both arms of a cell usually share their meshes."""
-    return enclosing_capsule(np.frombuffer(points).reshape(-1, 3))
 
 
 @lru_cache(maxsize=64)
