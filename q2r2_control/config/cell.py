@@ -42,6 +42,11 @@ from q2r2_control.config.strict import Network, StrictModel, network_of, validat
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 
+try:
+    from yaml import CSafeLoader as _SafeLoader  # libyaml reads a cell ten times as fast
+except ImportError:  # a PyYAML that was built without libyaml
+    from yaml import SafeLoader as _SafeLoader  # type: ignore[assignment]
+
 AUTO: Literal["auto"] = "auto"  # the loop's rate is chosen when a run in real time begins
 HIGHEST_FITTING_RATE_HZ = 1000.0
 
@@ -291,7 +296,7 @@ def _within_driver_limits(config: Config) -> Config:
     return config.model_copy(update={"control": control.model_copy(update=narrower)})
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(_SafeLoader):
     """Stricter than plain YAML 1.1, where a later key silently replaces an earlier one and 1e-3 is a text."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:

@@ -148,7 +148,7 @@ def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, va
         ("name: x\narms:\n\tleft: {}\n", "not YAML: .*line 3"),
         ("name: x\nname: y\n", "key 'name' is given twice .*line 2"),
         ("name: x\narms:\n  left: {model: a, model: b}\n", "key 'model' is given twice .*line 3"),
-        ("name: x\narms: *nowhere\n", "undefined alias 'nowhere'"),
+        ("name: x\narms: *nowhere\n", "undefined alias.*line 2, column 7"),
         ("name: !!python/object/apply:os.system [ls]\n", "not YAML"),
         ("name: &a [*a]\narms: *a\n", "plain keys and values"),
         ("name: x\nwhen: 2001-99-99\n", "month"),
