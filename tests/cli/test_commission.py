@@ -89,6 +89,7 @@ def refused(cell: Path, answers: list[str]) -> str:
     return lines[-1]
 
 
+@pytest.mark.slow
 def test_a_cell_that_shows_all_it_has_to_is_signed_off_and_may_run(
     cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:

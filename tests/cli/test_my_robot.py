@@ -18,6 +18,7 @@ from tests.support.modules import blocks_of
 PAGE = "docs/my_robot.md"
 
 
+@pytest.mark.slow
 def test_its_yaml_and_its_commands_lead_from_a_urdf_to_arms_that_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
