@@ -21,7 +21,8 @@ from tests.support.headset_server import eventually
 Q = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
 ANSWERS = 50
 STILL, ONES = (0.0,) * 7, (1.0,) * 7
-MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.005, 1, Q)
+IO = {"Gripper.Opening": 1.0}
+MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.005, 1, Q, io=IO, outputs=frozenset(IO))
 
 
 class LongMotion(ArmSession):

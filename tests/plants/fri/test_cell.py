@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import ReasonKind
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.answers import ReferencePath
-from q2r2_control.plants.fri.cabinet import Trip
+from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import SimulatedArm, SimulatedArms
 from q2r2_control.plants.fri.wire import Joints, Session, joints_of
 from q2r2_control.plants.mujoco import MujocoPlant
@@ -84,6 +85,22 @@ def test_missing_messages_are_said_once_a_run_for_each_cabinet(
         pipeline.run(1.0, realtime=False)
         lines = [entry.getMessage() for entry in caplog.records]
         assert sorted(line.partition(":")[0] for line in lines if "10 messages lost and 0 unreadable" in line) == said
+
+
+def test_a_cabinet_without_the_grippers_output_is_named_once_and_gets_no_write(
+    config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
+    pipeline = make_loop(config, grippers=dict.fromkeys(SIDES, GripperIoConfig(output="Gripper.Opening")))
+    assert isinstance(pipeline.plant, VirtualCabinets)
+    whole = pipeline.plant.cabinets["left"]
+    pipeline.plant.cabinets["left"] = Cabinet(whole.settings, whole.arm)
+    plant = started(pipeline)
+    pipeline.run(1.0, realtime=False)
+    told = [entry.getMessage() for entry in caplog.records if "Gripper.Opening" in entry.getMessage()]
+    lacks = "has no analog output Gripper.Opening, so that the gripper is not commanded"
+    assert told == [f"left: cabinet {lacks}; outputs that its application registers: none"]
+    assert trips(plant) == []
+    assert all(cabinet.session is Session.COMMANDING_ACTIVE for cabinet in plant.cabinets.values())
 
 
 @pytest.mark.parametrize(
