@@ -36,7 +36,7 @@ _MISSES = 10  # answers in a row that may be late while the client commands
 _NEAR = 1e-3  # how far the first command may be from the cabinet's own position [rad]
 _ROUNDING = 1e-6  # relative, of the limits
 _T1_SPEED = 0.25  # of a tool, in T1 [m/s]
-_LONGEST_TORQUE_PERIOD = 0.005  # between two messages of an application that overlays torques [s]
+_LONGEST_TORQUE_PERIOD = 0.005  # between two answers to an application that overlays torques [s]
 _LARGEST_LOAD_ERROR = 2.0  # of a joint's external torque before torques are overlaid [Nm]
 
 
@@ -111,10 +111,10 @@ class CabinetSettings:
     command: CommandKind = CommandKind.POSITION
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for torques at a send period that Sunrise does not allow."""
-        if self.command is CommandKind.TORQUE and self.period > _LONGEST_TORQUE_PERIOD:
+        """Raises ConfigError for torques that come less often than Sunrise allows."""
+        if self.command is CommandKind.TORQUE and self.answer_period > _LONGEST_TORQUE_PERIOD * (1.0 + _ROUNDING):
             allowed = f"allowed with torques: {1e3 * _LONGEST_TORQUE_PERIOD:g} ms or less"
-            raise ConfigError(f"a cabinet's send period of {1e3 * self.period:g} ms: {allowed}")
+            raise ConfigError(f"a cabinet that is answered every {1e3 * self.answer_period:g} ms: {allowed}")
 
     @property
     def answer_period(self) -> float:
@@ -128,7 +128,7 @@ class Cabinet:
     def __init__(
         self, settings: CabinetSettings, arm: CabinetArm, outputs: Mapping[str, IoValue] | None = None
     ) -> None:
-        """``outputs``: those that the application registers, with their values at the start; a client may write them."""
+        """``outputs`` are those that the application registers for a client, with their values at the start."""
         self.settings, self.arm = settings, arm
         self.session, self.safety, self.operation = Session.MONITORING_WAIT, Safety.NORMAL, Operation.AUTOMATIC
         self.load_fits = True  # the load data are those of the tool, without which no client may command
@@ -255,6 +255,8 @@ class Cabinet:
                 self.stop(Trip.LATE)
             elif not self._bears_the_load or answer is None or answer.q is None:
                 return
+            elif self.settings.command is CommandKind.TORQUE and answer.tau is None:
+                return  # torques have to come before they count, too
             elif _apart(answer.q, self._held) <= _NEAR:
                 self.session = Session.COMMANDING_ACTIVE
                 self._follow(answer)

@@ -223,9 +223,9 @@ def test_an_answer_may_write_only_outputs_that_the_cabinet_lists(
     assert (message.io, message.outputs) == ({"measured": 1.0, **outputs}, {"opening"})
 
 
-def test_torques_need_a_send_period_that_sunrise_allows() -> None:
-    with pytest.raises(ConfigError, match="period of 6 ms: allowed with torques: 5 ms or less"):
-        replace(TORQUE, period=0.006)
+def test_torques_have_to_come_as_often_as_sunrise_asks_for() -> None:
+    with pytest.raises(ConfigError, match="answered every 6 ms: allowed with torques: 5 ms or less"):
+        replace(TORQUE, period=0.003, multiplier=2)
 
 
 def test_torques_are_not_overlaid_before_the_load_data_explain_what_the_arm_bears() -> None:
@@ -233,11 +233,12 @@ def test_torques_are_not_overlaid_before_the_load_data_explain_what_the_arm_bear
     arm.external_tau = (0.0, 2.1, *(0.0,) * 5)
     cabinet = Cabinet(TORQUE, arm)
     cabinet.start_overlay()
-    assert run(cabinet, 300, client.answer).session is Session.COMMANDING_WAIT
+    tau = (1.0,) * 7
+    assert run(cabinet, 300, lambda message: client.answer(message, tau=tau)).session is Session.COMMANDING_WAIT
     arm.external_tau = (0.0, -1.9, *(0.0,) * 5)
-    message = run(cabinet, 2, lambda message: client.answer(message, tau=(1.0,) * 7))
-    assert message.session is Session.COMMANDING_ACTIVE
-    assert message.commanded_tau == (1.0,) * 7
+    assert run(cabinet, 10, client.answer).session is Session.COMMANDING_WAIT, "nor before torques come"
+    message = run(cabinet, 2, lambda message: client.answer(message, tau=tau))
+    assert (message.session, message.commanded_tau) == (Session.COMMANDING_ACTIVE, tau)
 
 
 def test_after_a_stop_the_overlay_has_to_be_started_again_and_the_safety_stop_be_over() -> None:
