@@ -22,6 +22,7 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, tasks_named
 from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.plants.fri.answering import address_for
 from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
 from q2r2_control.plants.fri.wire import CommandKind, Operation, Safety, Session, in_words
@@ -106,6 +107,9 @@ def fri_cabinet(
         float, Option(min=0, max=5000, help="Of the joint impedance under torques; it has to be 0 [Nm/rad].")
     ] = 0.0,
     fri: Annotated[int, Option(min=1, max=2, help="Version of FRI.")] = 2,
+    source_port: Annotated[
+        int | None, Option(min=0, max=65535, help="Messages come from it, not from the client's; 0: any free one.")
+    ] = None,
     start_after: Annotated[float, Option(min=0, help="An overlay is started after so long with a client [s].")] = 0.5,
     drop_every: Annotated[float | None, Option(help="The pendant ends a session as often as this [s].")] = None,
     safety_stop_every: Annotated[
@@ -142,14 +146,17 @@ def fri_cabinet(
     arms = SimulatedArms(robot, cell, stiffness)
     if missing := [arm for arm in robot.arms if arm not in cell.fri]:
         raise ConfigError(f"{config}: fri.{missing[0]}: missing; allowed: the cabinet of each arm")
-    cabinets, clients = {}, {}
+    cabinets, origins, clients = {}, {}, {}
     for arm, its in cell.fri.items():
         every = right_period if arm == "right" and right_period is not None else period
         cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every, multiplier)
-        clients[str(arm)] = "127.0.0.1", its.port
+        client = clients[str(arm)] = address_for(its.address) or "127.0.0.1", its.port
+        # As KUKA's, from the port of its client; two programs cannot have the same one at the same address.
+        port = 0 if its.address == client[0] else its.port
+        origins[str(arm)] = its.address, port if source_port is None else source_port
     grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if isinstance(its.gripper, GripperIoConfig)}
     network = Network(loss, duplicate, 1e-3 * jitter, cut)
-    server = CabinetServer(arms, cabinets, clients, grippers, network, seed)
+    server = CabinetServer(arms, cabinets, origins, clients, grippers, network, seed)
     for cabinet in server.cabinets.values():
         cabinet.load_fits = not wrong_load
         cabinet.operation = Operation.T1 if t1 else Operation.AUTOMATIC

@@ -21,8 +21,8 @@ from tests.cli.command import q2r2
 CELL = "config/dual_iiwa7_fri.yaml"
 
 
-def test_without_a_client_the_cabinets_wait() -> None:
-    done = q2r2("fri-cabinet", CELL, "--duration", "0.3", "--json")
+def test_without_a_client_the_cabinets_wait(fri_cell: str) -> None:
+    done = q2r2("fri-cabinet", fri_cell, "--duration", "0.3", "--json")
     assert done.exit_code == 0
     waiting = {"state": "monitoring wait", "missed": 0, "trips": []}
     assert json.loads(done.stdout)["cabinets"] == {"left": waiting, "right": waiting}
@@ -90,6 +90,29 @@ def test_the_messages_say_how_many_of_them_there_are_to_one_answer(fri_cell: str
         assert read_monitoring(client.recv(LONGEST)).multiplier == 3
 
 
+@pytest.mark.parametrize("arguments", [(), ("--source-port", "0")], ids=["client's port", "any port"])
+def test_messages_come_from_the_cabinets_address_and_its_clients_port_unless_another_is_asked_for(
+    fri_cell: str, arguments: tuple[str, ...]
+) -> None:
+    port = load_config(fri_cell).fri["left"].port
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.bind(("127.0.0.1", port))
+        client.settimeout(30.0)
+        assert q2r2("fri-cabinet", fri_cell, "--duration", "0.1", *arguments).exit_code == 0
+        address, source = client.recvfrom(LONGEST)[1]
+    assert address == "127.0.0.2"
+    assert (source == port) is (not arguments)
+
+
+def test_a_port_of_a_cabinet_that_another_program_has_is_one_line(fri_cell: str) -> None:
+    port = load_config(fri_cell).fri["right"].port
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.3", port))
+        done = q2r2("fri-cabinet", fri_cell, "--duration", "0.1")
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    assert f"the right cabinet cannot send from 127.0.0.3, port {port}: Address already in use" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -106,7 +129,7 @@ def test_a_wrong_option_is_one_line(arguments: tuple[str, ...], told: str) -> No
 
 def test_a_wrong_cabinet_is_named_with_what_is_allowed(tmp_path: Path) -> None:
     text = Path(CELL).read_text(encoding="utf-8")
-    for wrong, told in (("address: 127.0.0.1", "address: here"), ("version: null", "version: 3")):
+    for wrong, told in (("address: 127.0.0.2", "address: here"), ("version: null", "version: 3")):
         file = tmp_path / "cell.yaml"
         file.write_text(text.replace(wrong, told), encoding="utf-8")
         done = q2r2("check", str(file))

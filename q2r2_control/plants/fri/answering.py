@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from ipaddress import ip_address
 from subprocess import TimeoutExpired
 
 from q2r2_control.errors import PlantError
@@ -182,11 +183,18 @@ class _Answering:
             self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))
 
 
+def address_for(cabinet: str) -> str:
+    """Address of this computer that a ``cabinet`` on this computer sends to; empty for one elsewhere: all networks."""
+    if not ip_address(cabinet).is_loopback:
+        return ""
+    return "::1" if ":" in cabinet else "127.0.0.1"
+
+
 def open_socket(address: str, port: int) -> socket.socket:
     """A socket for one cabinet: loopback where it is on this computer, else all of its networks. Raises OSError."""
     opened = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        opened.bind((address if address in ("127.0.0.1", "::1") else "", port))
+        opened.bind((address_for(address), port))
     except OSError:
         opened.close()
         raise
