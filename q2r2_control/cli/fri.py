@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from json import loads
+from tempfile import TemporaryFile
 from typing import Annotated, Any
 
 from rich.console import Console
@@ -32,6 +33,7 @@ from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
 _JUDGED_EVERY = 0.005  # tasks: seldom enough that no cabinet is late for it [s]
+_LOOKS, _LONGEST_LINES = 0.05, 1 << 16  # between two looks at what the cabinets' process has said [s, bytes]
 _SAFETY_STOP = 1.0  # how long one lasts [s]
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
@@ -193,13 +195,27 @@ def fri_cabinet(
     print_report(data, (figure_table("cabinets", ("arm", "state", "missed [answers]", "ends"), rows),), json)
 
 
+def wait_for_states(child: subprocess.Popen[str], lines: int, count: int) -> None:
+    """Look into the file ``lines`` until the cabinets' process has said of ``count`` arms that they send.
+
+    Raises :class:`PlantError` where the process has ended instead.
+    """
+    said = ""  # read by position: the process writes at the file's own
+    while said.count(in_words(Session.MONITORING_WAIT)) < count:
+        if child.poll() is not None:
+            raise PlantError(f"the cabinets that stand in have ended: {said.strip() or 'without a word'}")
+        time.sleep(_LOOKS)
+        said = os.pread(lines, _LONGEST_LINES, 0).decode()
+
+
 @contextmanager
 def rehearsal(
     config: str, mode: CommandMode, tasks: Sequence[AssemblyTask], period: float, rt: bool
 ) -> Iterator[list[TaskResult]]:
     """Cabinets of a cell in a process of their own; at the end, results of the ``tasks`` as they measured them.
 
-    ``period`` between two messages [ms]. Raises :class:`PlantError` where they ended a session or say nothing.
+    They can be heard when the context begins. ``period`` is the time between two messages [ms]. Raises
+    :class:`PlantError` where they cannot begin, ended a session or say nothing.
     """
     words = [
         "fri-cabinet",
@@ -212,19 +228,21 @@ def rehearsal(
         *(["--rt"] if rt else ()),
         *(word for task in tasks for word in ("--task", task.name)),
     ]
-    child = subprocess.Popen(
-        [sys.executable, "-m", "q2r2_control", *words],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
     results: list[TaskResult] = []
-    try:
-        yield results
-    finally:
-        child.send_signal(signal.SIGINT)
-        said, _ = child.communicate()
+    with TemporaryFile() as lines:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "q2r2_control", *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=lines,
+            text=True,
+        )
+        try:
+            wait_for_states(child, lines.fileno(), len(load_config(config).fri))
+            yield results
+        finally:
+            child.send_signal(signal.SIGINT)
+            said, _ = child.communicate()
     try:
         told = loads(said)
     except ValueError:

@@ -67,7 +67,7 @@ class VirtualCabinets:
         self.thinking = 0.0  # time that passes between the beginning of a tick and its command [s]
         self._mode = CommandMode.POSITION
 
-    def begin(self, mode: CommandMode) -> None:
+    def begin(self, mode: CommandMode, stopped: Callable[[], bool]) -> None:
         self._mode = mode
 
     def reset(self, q: Array | None = None) -> None:
