@@ -202,6 +202,41 @@ def test_arms_go_on_although_each_tick_takes_longer_than_the_loop_allows_for(con
         assert summary.arms[arm].engaged_s > 1.5
 
 
+def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_afterwards(config: Config) -> None:
+    blocks, begins_within, period = 0.2, 0.015, 0.005
+    pipeline = make_loop(config, (period, period))
+    plant = started(pipeline)
+    sent: dict[str, list[tuple[float, Joints]]] = {arm: [] for arm in SIDES}
+    plant.on_message = lambda arm, t: sent[arm].append((t, plant.cabinets[arm].commanded))
+    newest: list[Tick] = []  # before the tick that blocks
+    decelerations: list[np.ndarray] = []
+
+    def block(tick: Tick) -> None:
+        if plant.thinking > 0.0:
+            plant.thinking = 0.0
+            pipeline.freeze(blocks)
+        elif not newest and np.abs(tick.reference.v).max() > 0.4:
+            newest.append(tick)
+            decelerations.append(np.array(tick.command.deceleration))
+            plant.thinking = blocks
+
+    pipeline.listeners.append(block)
+    summary = pipeline.run(3.0, realtime=False)
+    assert trips(plant) == []
+    begin, rest = newest[0].now, float((np.abs(newest[0].reference.v) / decelerations[0]).max())
+    assert begins_within + rest < 0.8 * blocks
+    for arm in SIDES:
+        speeds = {t: np.subtract(now, before) / period for (_, before), (t, now) in pairwise(sent[arm])}
+        fastest = [float(np.abs(v).max()) for t, v in speeds.items() if begin + begins_within < t < begin + blocks]
+        assert (np.diff(fastest) < 1e-6).all(), "it gets slower from then on"
+        late = [
+            np.abs(v).max() for t, v in speeds.items() if begin + begins_within + period + rest < t < begin + blocks
+        ]
+        assert len(late) > 10
+        assert max(late) < 1e-6, "and stands still for the rest of the time"
+        assert summary.arms[arm].engaged_s > 2.0
+
+
 def test_a_loop_that_is_always_too_late_says_so(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
