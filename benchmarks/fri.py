@@ -126,6 +126,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     robot = Robot.from_config(config)
     plant = FriPlant.from_config(robot, config)
     plant.answers = deque()  # all of them
+    plant.longest_wait = plant.longest_session_wait = _MARGIN
     with notice_of_compiling():
         pipeline = Pipeline(config, robot, ScriptedInput("circle"), plant, mode)
     pipeline.listeners.append(way := ToolWay(robot))

@@ -26,6 +26,7 @@ from q2r2_control.process.helper_process import leave_signals_to_the_run, reason
 from q2r2_control.process.scheduling import few_garbage_collections, how_it_ended, real_time, thread_priority
 
 _TAKEN, _TOO_LATE = b"1", b"0"  # a word about commands
+_BEGUN = b"2"  # the first word: the cabinets are heard
 _LARGEST = 1 << 16  # of what is passed on [bytes]
 _POLL = 0.05  # of looking whether the arms of a loop that has ended stand still [s]
 _PATIENCE = 5.0  # with a process that is to end [s]
@@ -48,12 +49,15 @@ class AnsweringProcess:
     """The loop's end."""
 
     def __init__(self, lines: Sequence[Line]) -> None:
-        """With a line to each cabinet, of which this process may close its sockets then."""
+        """With a line to each cabinet, of which this process may close its sockets then.
+
+        Returns when the process hears the cabinets: a busy computer takes seconds to start one. Raises
+        :class:`PlantError` where it cannot begin.
+        """
         # States that nobody reads may fill their link; a word about commands must not wait for that.
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states.setblocking(False)
-        self._commands.settimeout(_LONGEST_WORD)
         links = commands.fileno(), states.fileno()
         with commands, states:
             code, files = f"from {__name__} import main; main{links}", [*links, *(line.file for line in lines)]
@@ -62,6 +66,12 @@ class AnsweringProcess:
         # An answer goes before the loop, where that has a priority.
         priority = thread_priority()
         self._commands.send(pickle.dumps((priority and priority + 1, list(lines))))
+        word = b""
+        with suppress(ConnectionError):
+            word = self._commands.recv(_LARGEST)
+        if word != _BEGUN:
+            raise self._end(word)
+        self._commands.settimeout(_LONGEST_WORD)
 
     def send(self, commands: dict[str, ArmCommand]) -> bool:
         """Whether commands, by arm, came before every answer that they were for; else none of them is followed.
@@ -143,6 +153,7 @@ class _Answering:
             with suppress(OSError):
                 while True:  # what came while this process began is too old to be answered
                     opened.recv(LONGEST + 1)
+        self._commands.send(_BEGUN)
         ended = False
         while not (ended and all(session.is_still(time.monotonic()) for session in self._sessions.values())):
             for file in select.select(files, (), (), _POLL)[0]:

@@ -78,9 +78,11 @@ class FriPlant:
         lines = self._lines()
         grippers = {arm: its.gripper for arm, its in self._cabinets.items() if isinstance(its.gripper, GripperIoConfig)}
         self.cell = FriCell(self._robot, [line.session.state for line in lines], self._period, self._longest, grippers)
-        self._answering = AnsweringProcess(lines)
-        for line in lines:
-            socket.close(line.file)  # the process has it
+        try:
+            self._answering = AnsweringProcess(lines)
+        finally:
+            for line in lines:
+                socket.close(line.file)  # the process has it
         self.grippers = self._modbus_grippers()
         for gripper in self.grippers.values():
             gripper.start()
