@@ -11,6 +11,7 @@ import sys
 import time
 from array import array
 from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from multiprocessing import get_context
@@ -63,6 +64,11 @@ def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) 
         if begin < until or any(start < end and stop > begin for start, stop in stills):
             count, until = count + 1, max(until, end)
     return count
+
+
+def undisturbed(answers: list[tuple[float, float]], stills: list[tuple[float, float]]) -> list[float]:
+    """How long those answers took during which no processor stood still [s]; both from when to when [s]."""
+    return [end - begin for begin, end in answers if not any(start < end and stop > begin for start, stop in stills)]
 
 
 class ToolWay:
@@ -142,7 +148,9 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     watching.shutdown()
     arrived, took = np.array(plant.answers).T
     period = max(state.period for state in plant.states().values())
-    late = [(came, came + its) for came, its in zip(arrived, took, strict=True) if its > period]
+    answers = [(came, came + its) for came, its in zip(arrived, took, strict=True)]
+    late = [its for its in answers if its[1] - its[0] > period]
+    calm = undisturbed(answers, moments)
     errors = way.errors(range(round(_LONGEST_DELAY * config.nominal_rate_hz)))
     direct_error, direct_errors = measure_directly(mode, min(duration, 30.0))  # the circles repeat
     return {
@@ -150,7 +158,9 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
         "error_after_delay_mm_rms": min(errors),
         "direct_error_mm_rms": direct_error,
         "answers": len(took),
-        "answer_ms": dict(zip(("p50", "p99", "max"), 1e3 * np.percentile(took, (50, 99, 100)), strict=True)),
+        "answer_ms": _percentiles_ms(took),
+        "undisturbed_answers": len(calm),
+        "undisturbed_answer_ms": _percentiles_ms(calm),
         "late_answers": len(late),
         "late_answers_in_stand_stills": held_up(late, moments),
         "stand_stills_ms": sorted((round(1e3 * (b - a), 1) for a, b in moments), reverse=True),
@@ -160,6 +170,10 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
         "direct_errors_mm_rms": direct_errors,
         "cabinets": json.loads(said)["cabinets"],
     }
+
+
+def _percentiles_ms(times: Sequence[float]) -> dict[str, float]:
+    return dict(zip(("p50", "p99", "max"), 1e3 * np.percentile(times, (50, 99, 100)), strict=True))
 
 
 def main(
@@ -179,9 +193,11 @@ def main(
     ]
     errors = "RMS error [mm]", "without cabinets [mm]"
     columns = ("arm", "engaged [s]", *errors, "missed [answers]", "session ends before the run's")
-    times = data["answer_ms"]
+    times, calm = data["answer_ms"], data["undisturbed_answer_ms"]
     notes = [
         f"answers after {times['p50']:.2f} ms in the median, {times['p99']:.2f} ms at 99 %",
+        f"of the {data['undisturbed_answers']} of {data['answers']} answers during which this machine kept no processor"
+        f" waiting: {calm['p50']:.2f} ms in the median, {calm['p99']:.2f} ms at 99 %",
         f"{data['late_answers']} answers after more than a period, {data['late_answers_in_stand_stills']} of them since"
         " this machine kept a processor waiting",
         f"it did so for {max(data['stand_stills_ms'], default=0.0):.1f} ms at most",

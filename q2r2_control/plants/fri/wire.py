@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Container
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -121,7 +122,7 @@ class Monitoring:
     drives: Drives = Drives.ACTIVE
     io: dict[str, IoValue] = field(default_factory=dict)  # inputs and outputs that the application registered
     outputs: frozenset[str] = frozenset()  # those of ``io`` that a client may write
-    commanded_tau: Joints | None = None  # by the cabinet's controller, with the client's overlay
+    commanded_tau: Joints | None = None  # by the cabinet's controller, with the client's overlay; written, never read
 
     def output(self, name: str, value: IoValue) -> IoValue | None:
         """``value`` as the cabinet's output ``name`` takes it; None if the cabinet has no such output of that kind.
@@ -172,8 +173,7 @@ def read_monitoring(datagram: bytes) -> Monitoring:
         operation=_member(Operation, robot.operation),
         drives=_member(Drives, min(robot.drives, default=Drives.ACTIVE)),
         io=_io_of(data.io),
-        outputs=frozenset(_name_of(io) for io in data.io if io.direction == _OUT),
-        commanded_tau=_joints(data, "commanded_tau"),
+        outputs=frozenset([_name_of(io.name) for io in data.io if io.direction == _OUT]),
     )
 
 
@@ -288,11 +288,11 @@ def _member(kind: type[IntEnum], value: int) -> Any:
 def _io_of(values: Any) -> dict[str, IoValue]:
     """Values by name: booleans, numbers of bits, and analog ones."""
     kinds: tuple[Any, ...] = (lambda io: bool(io.digital), lambda io: io.digital, lambda io: io.analog)
-    return {_name_of(io): kinds[io.type](io) for io in values if 0 <= io.type < len(kinds)}
+    return {_name_of(io.name): kinds[io.type](io) for io in values if 0 <= io.type < len(kinds)}
 
 
-def _name_of(io: Any) -> str:
-    name: bytes = io.name
+@lru_cache(maxsize=64)
+def _name_of(name: bytes) -> str:
     return name.decode(errors="replace")
 
 
