@@ -39,15 +39,22 @@ _FIRST = 90  # a priority above all others
 # A thread that sleeps so long and wakes up later by more was kept waiting [s]. It sleeps when a halt begins: this finds
 # each halt of their sum, 1 ms, half of the shortest period that is measured.
 _SLEEP, _STILL = 0.0005, 0.0005
-_MARGIN = 30.0  # for the begin of a run [s]
+_WAIT = 60.0  # for the cabinets, on a busy computer [s]
+_end: Any = None  # of a watching process: when its watch ends, by the monotonic clock [s]
 
 
-def stand_stills(processor: int, duration: float) -> list[tuple[float, float]]:
-    """From when to when a processor kept even its first thread waiting, which only sleeps, in ``duration`` [s]."""
+def watch_until(end: Any) -> None:
+    """In a process that is going to watch: until the shared ``end.value`` [s]."""
+    global _end
+    _end = end
+
+
+def stand_stills(processor: int) -> list[tuple[float, float]]:
+    """From when to when a processor kept even its first thread waiting, which only sleeps, until the watch ends [s]."""
     os.sched_setaffinity(0, {processor})
-    found, end = [], time.monotonic() + duration
+    found = []
     with real_time(_FIRST):
-        while (before := time.monotonic()) < end:
+        while (before := time.monotonic()) < _end.value:
             time.sleep(_SLEEP)
             if (now := time.monotonic()) - before > _SLEEP + _STILL:
                 found.append((before + _SLEEP, now))
@@ -123,8 +130,10 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
         *options,
     ]
     processors = sorted(os.sched_getaffinity(0))
-    watching = ProcessPoolExecutor(len(processors), get_context("spawn"))
-    stills = [watching.submit(stand_stills, each, duration + _MARGIN) for each in processors if rt]
+    context = get_context("spawn")
+    end = context.RawValue("d", math.inf)
+    watching = ProcessPoolExecutor(len(processors), context, watch_until, (end,))
+    stills = [watching.submit(stand_stills, each) for each in processors if rt]
     cabinets = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert cabinets.stderr is not None
     cabinets.stderr.readline()  # that they have begun
@@ -132,7 +141,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     robot = Robot.from_config(config)
     plant = FriPlant.from_config(robot, config)
     plant.answers = deque()  # all of them
-    plant.longest_wait = plant.longest_session_wait = _MARGIN
+    plant.longest_wait = plant.longest_session_wait = _WAIT
     with notice_of_compiling():
         pipeline = Pipeline(config, robot, ScriptedInput("circle"), plant, mode)
     pipeline.listeners.append(way := ToolWay(robot))
@@ -142,6 +151,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
                 stack.enter_context(real_time())
             summary = pipeline.run(duration)
     finally:
+        end.value = time.monotonic()
         cabinets.send_signal(signal.SIGINT)
         said, _ = cabinets.communicate()
     moments = [moment for each in stills for moment in each.result()]

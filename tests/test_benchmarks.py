@@ -45,7 +45,7 @@ def test_every_benchmark_says_what_it_asks(script: str) -> None:
 @pytest.mark.slow
 @pytest.mark.soak
 def test_answers_are_told_apart_by_whether_a_processor_stood_still_meanwhile() -> None:
-    bench = load_script(FOLDER / "fri.py")
+    bench = load_script("benchmarks/fri.py")
     answers, stills = [(0.0, 0.001), (0.010, 0.013), (0.020, 0.028)], [(0.012, 0.014), (0.030, 0.031)]
     assert bench.undisturbed(answers, stills) == pytest.approx([0.001, 0.008])
     assert bench.held_up(answers, stills) == 1

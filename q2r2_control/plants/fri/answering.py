@@ -23,9 +23,10 @@ from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import LONGEST, read_monitoring
 from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of, start_python
-from q2r2_control.process.scheduling import few_garbage_collections, how_it_ended, real_time, thread_priority
+from q2r2_control.process.scheduling import few_garbage_collections, how_it_ended, real_time, reserve, thread_priority
 
 _TAKEN, _TOO_LATE = b"1", b"0"  # a word about commands
+_RESERVED = 0.0015, 0.002  # of a processor for answers, which take 0.2 ms each, in every so many [s]
 _BEGUN = b"2"  # the first word: the cabinets are heard
 _LARGEST = 1 << 16  # of what is passed on [bytes]
 _POLL = 0.05  # of looking whether the arms of a loop that has ended stand still [s]
@@ -135,6 +136,7 @@ def main(commands: int, states: int) -> None:
             with ExitStack() as stack:
                 if priority:
                     stack.enter_context(real_time(priority))
+                    reserve(*_RESERVED)
                 stack.enter_context(few_garbage_collections())
                 _Answering(from_loop, to_loop, lines).run()
         except Exception as error:

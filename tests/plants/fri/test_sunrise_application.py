@@ -16,7 +16,7 @@ TEXT = FILE.read_text(encoding="utf-8")
 
 
 def choices(name: str) -> list[str]:
-    """What an operator may choose from at the smartPAD."""
+    """The answers that an operator may choose from at the smartPAD."""
     found = re.search(rf"{name} = {{(.*?)}};", TEXT)
     assert found is not None
     return re.findall(r'"(.*?)"', found[1])
