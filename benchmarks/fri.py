@@ -11,6 +11,7 @@ import sys
 import time
 from array import array
 from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from multiprocessing import get_context
@@ -38,15 +39,22 @@ _FIRST = 90  # a priority above all others
 # A thread that sleeps so long and wakes up later by more was kept waiting [s]. It sleeps when a halt begins: this finds
 # each halt of their sum, 1 ms, half of the shortest period that is measured.
 _SLEEP, _STILL = 0.0005, 0.0005
-_MARGIN = 30.0  # for the begin of a run [s]
+_WAIT = 60.0  # for the cabinets, on a busy computer [s]
+_end: Any = None  # of a watching process: when its watch ends, by the monotonic clock [s]
 
 
-def stand_stills(processor: int, duration: float) -> list[tuple[float, float]]:
-    """From when to when a processor kept even its first thread waiting, which only sleeps, in ``duration`` [s]."""
+def watch_until(end: Any) -> None:
+    """In a process that is going to watch: until the shared ``end.value`` [s]."""
+    global _end
+    _end = end
+
+
+def stand_stills(processor: int) -> list[tuple[float, float]]:
+    """From when to when a processor kept even its first thread waiting, which only sleeps, until the watch ends [s]."""
     os.sched_setaffinity(0, {processor})
-    found, end = [], time.monotonic() + duration
+    found = []
     with real_time(_FIRST):
-        while (before := time.monotonic()) < end:
+        while (before := time.monotonic()) < _end.value:
             time.sleep(_SLEEP)
             if (now := time.monotonic()) - before > _SLEEP + _STILL:
                 found.append((before + _SLEEP, now))
@@ -63,6 +71,11 @@ def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) 
         if begin < until or any(start < end and stop > begin for start, stop in stills):
             count, until = count + 1, max(until, end)
     return count
+
+
+def undisturbed(answers: list[tuple[float, float]], stills: list[tuple[float, float]]) -> list[float]:
+    """How long those answers took during which no processor stood still [s]; both from when to when [s]."""
+    return [end - begin for begin, end in answers if not any(start < end and stop > begin for start, stop in stills)]
 
 
 class ToolWay:
@@ -117,8 +130,10 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
         *options,
     ]
     processors = sorted(os.sched_getaffinity(0))
-    watching = ProcessPoolExecutor(len(processors), get_context("spawn"))
-    stills = [watching.submit(stand_stills, each, duration + _MARGIN) for each in processors if rt]
+    context = get_context("spawn")
+    end = context.RawValue("d", math.inf)
+    watching = ProcessPoolExecutor(len(processors), context, watch_until, (end,))
+    stills = [watching.submit(stand_stills, each) for each in processors if rt]
     cabinets = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert cabinets.stderr is not None
     cabinets.stderr.readline()  # that they have begun
@@ -126,6 +141,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     robot = Robot.from_config(config)
     plant = FriPlant.from_config(robot, config)
     plant.answers = deque()  # all of them
+    plant.longest_wait = plant.longest_session_wait = _WAIT
     with notice_of_compiling():
         pipeline = Pipeline(config, robot, ScriptedInput("circle"), plant, mode)
     pipeline.listeners.append(way := ToolWay(robot))
@@ -135,13 +151,16 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
                 stack.enter_context(real_time())
             summary = pipeline.run(duration)
     finally:
+        end.value = time.monotonic()
         cabinets.send_signal(signal.SIGINT)
         said, _ = cabinets.communicate()
     moments = [moment for each in stills for moment in each.result()]
     watching.shutdown()
     arrived, took = np.array(plant.answers).T
     period = max(state.period for state in plant.states().values())
-    late = [(came, came + its) for came, its in zip(arrived, took, strict=True) if its > period]
+    answers = [(came, came + its) for came, its in zip(arrived, took, strict=True)]
+    late = [its for its in answers if its[1] - its[0] > period]
+    calm = undisturbed(answers, moments)
     errors = way.errors(range(round(_LONGEST_DELAY * config.nominal_rate_hz)))
     direct_error, direct_errors = measure_directly(mode, min(duration, 30.0))  # the circles repeat
     return {
@@ -149,7 +168,9 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
         "error_after_delay_mm_rms": min(errors),
         "direct_error_mm_rms": direct_error,
         "answers": len(took),
-        "answer_ms": dict(zip(("p50", "p99", "max"), 1e3 * np.percentile(took, (50, 99, 100)), strict=True)),
+        "answer_ms": _percentiles_ms(took),
+        "undisturbed_answers": len(calm),
+        "undisturbed_answer_ms": _percentiles_ms(calm),
         "late_answers": len(late),
         "late_answers_in_stand_stills": held_up(late, moments),
         "stand_stills_ms": sorted((round(1e3 * (b - a), 1) for a, b in moments), reverse=True),
@@ -159,6 +180,10 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
         "direct_errors_mm_rms": direct_errors,
         "cabinets": json.loads(said)["cabinets"],
     }
+
+
+def _percentiles_ms(times: Sequence[float]) -> dict[str, float]:
+    return dict(zip(("p50", "p99", "max"), 1e3 * np.percentile(times, (50, 99, 100)), strict=True))
 
 
 def main(
@@ -178,9 +203,11 @@ def main(
     ]
     errors = "RMS error [mm]", "without cabinets [mm]"
     columns = ("arm", "engaged [s]", *errors, "missed [answers]", "session ends before the run's")
-    times = data["answer_ms"]
+    times, calm = data["answer_ms"], data["undisturbed_answer_ms"]
     notes = [
         f"answers after {times['p50']:.2f} ms in the median, {times['p99']:.2f} ms at 99 %",
+        f"of the {data['undisturbed_answers']} of {data['answers']} answers during which this machine kept no processor"
+        f" waiting: {calm['p50']:.2f} ms in the median, {calm['p99']:.2f} ms at 99 %",
         f"{data['late_answers']} answers after more than a period, {data['late_answers_in_stand_stills']} of them since"
         " this machine kept a processor waiting",
         f"it did so for {max(data['stand_stills_ms'], default=0.0):.1f} ms at most",

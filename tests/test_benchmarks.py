@@ -44,6 +44,13 @@ def test_every_benchmark_says_what_it_asks(script: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.soak
+def test_answers_are_told_apart_by_whether_a_processor_stood_still_meanwhile() -> None:
+    bench = load_script("benchmarks/fri.py")
+    answers, stills = [(0.0, 0.001), (0.010, 0.013), (0.020, 0.028)], [(0.012, 0.014), (0.030, 0.031)]
+    assert bench.undisturbed(answers, stills) == pytest.approx([0.001, 0.008])
+    assert bench.held_up(answers, stills) == 1
+
+
 def test_the_loop_s_benchmark_times_every_stage() -> None:
     cases = json.loads(run("loop_times.py", "--ticks", "100", "--rounds", "1", "--record", "--json"))["cases"]
     assert set(cases) == {"kinematic position", "mujoco position", "mujoco torque"}

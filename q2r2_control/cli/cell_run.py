@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from q2r2_control.cli.output import (
+    SCRIPTS_WAIT_S,
     as_json_text,
     late_line,
     notice_of_compiling,
@@ -28,7 +29,7 @@ from q2r2_control.inputs.base import is_simulated, make_input
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.base import Plant, WindowedPlant, make_plant
+from q2r2_control.plants.base import Plant, WaitingPlant, WindowedPlant, make_plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.scheduling import real_time
@@ -101,6 +102,7 @@ class RunOptions:
     steps: tuple[tuple[float, str], ...] = ()  # of scripted work, from when on [s], in words
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
+    longest_wait: float = SCRIPTS_WAIT_S  # for a plant that waits for a person, such as one at a cabinet [s]
     page: tuple[str, int, Path | None] | None = None  # address of the page in the browser, and its certificate
 
     @property
@@ -153,6 +155,8 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, pa
     source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
     robot = Robot.from_config(config)
     plant = make_plant(options.plant, robot, config)
+    if isinstance(plant, WaitingPlant):
+        plant.longest_wait = plant.longest_session_wait = options.longest_wait
     try:
         if options.window:
             _open_window(plant)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from json import loads
+from tempfile import TemporaryFile
 from typing import Annotated, Any
 
 from rich.console import Console
@@ -22,6 +23,7 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, tasks_named
 from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.plants.fri.answering import address_for
 from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import CabinetServer, Network, SimulatedArms, settings_of
 from q2r2_control.plants.fri.wire import CommandKind, Operation, Safety, Session, in_words
@@ -31,6 +33,7 @@ from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
 _JUDGED_EVERY = 0.005  # tasks: seldom enough that no cabinet is late for it [s]
+_LOOKS, _LONGEST_LINES = 0.05, 1 << 16  # between two looks at what the cabinets' process has said [s, bytes]
 _SAFETY_STOP = 1.0  # how long one lasts [s]
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
@@ -106,6 +109,9 @@ def fri_cabinet(
         float, Option(min=0, max=5000, help="Of the joint impedance under torques; it has to be 0 [Nm/rad].")
     ] = 0.0,
     fri: Annotated[int, Option(min=1, max=2, help="Version of FRI.")] = 2,
+    source_port: Annotated[
+        int | None, Option(min=0, max=65535, help="Messages come from it, not from the client's; 0: any free one.")
+    ] = None,
     start_after: Annotated[float, Option(min=0, help="An overlay is started after so long with a client [s].")] = 0.5,
     drop_every: Annotated[float | None, Option(help="The pendant ends a session as often as this [s].")] = None,
     safety_stop_every: Annotated[
@@ -142,14 +148,17 @@ def fri_cabinet(
     arms = SimulatedArms(robot, cell, stiffness)
     if missing := [arm for arm in robot.arms if arm not in cell.fri]:
         raise ConfigError(f"{config}: fri.{missing[0]}: missing; allowed: the cabinet of each arm")
-    cabinets, clients = {}, {}
+    cabinets, origins, clients = {}, {}, {}
     for arm, its in cell.fri.items():
         every = right_period if arm == "right" and right_period is not None else period
         cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every, multiplier)
-        clients[str(arm)] = "127.0.0.1", its.port
+        client = clients[str(arm)] = address_for(its.address) or "127.0.0.1", its.port
+        # As KUKA's, from the port of its client; two programs cannot have the same one at the same address.
+        port = 0 if its.address == client[0] else its.port
+        origins[str(arm)] = its.address, port if source_port is None else source_port
     grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if isinstance(its.gripper, GripperIoConfig)}
     network = Network(loss, duplicate, 1e-3 * jitter, cut)
-    server = CabinetServer(arms, cabinets, clients, grippers, network, seed)
+    server = CabinetServer(arms, cabinets, origins, clients, grippers, network, seed)
     for cabinet in server.cabinets.values():
         cabinet.load_fits = not wrong_load
         cabinet.operation = Operation.T1 if t1 else Operation.AUTOMATIC
@@ -186,13 +195,27 @@ def fri_cabinet(
     print_report(data, (figure_table("cabinets", ("arm", "state", "missed [answers]", "ends"), rows),), json)
 
 
+def wait_for_states(child: subprocess.Popen[str], lines: int, count: int) -> None:
+    """Look into the file ``lines`` until the cabinets' process has said of ``count`` arms that they send.
+
+    Raises :class:`PlantError` where the process has ended instead.
+    """
+    said = ""  # read by position: the process writes at the file's own
+    while said.count(in_words(Session.MONITORING_WAIT)) < count:
+        if child.poll() is not None:
+            raise PlantError(f"the cabinets that stand in have ended: {said.strip() or 'without a word'}")
+        time.sleep(_LOOKS)
+        said = os.pread(lines, _LONGEST_LINES, 0).decode()
+
+
 @contextmanager
 def rehearsal(
     config: str, mode: CommandMode, tasks: Sequence[AssemblyTask], period: float, rt: bool
 ) -> Iterator[list[TaskResult]]:
     """Cabinets of a cell in a process of their own; at the end, results of the ``tasks`` as they measured them.
 
-    ``period`` between two messages [ms]. Raises :class:`PlantError` where they ended a session or say nothing.
+    They can be heard when the context begins. ``period`` is the time between two messages [ms]. Raises
+    :class:`PlantError` where they cannot begin, ended a session or say nothing.
     """
     words = [
         "fri-cabinet",
@@ -205,19 +228,21 @@ def rehearsal(
         *(["--rt"] if rt else ()),
         *(word for task in tasks for word in ("--task", task.name)),
     ]
-    child = subprocess.Popen(
-        [sys.executable, "-m", "q2r2_control", *words],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
     results: list[TaskResult] = []
-    try:
-        yield results
-    finally:
-        child.send_signal(signal.SIGINT)
-        said, _ = child.communicate()
+    with TemporaryFile() as lines:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "q2r2_control", *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=lines,
+            text=True,
+        )
+        try:
+            wait_for_states(child, lines.fileno(), len(load_config(config).fri))
+            yield results
+        finally:
+            child.send_signal(signal.SIGINT)
+            said, _ = child.communicate()
     try:
         told = loads(said)
     except ValueError:

@@ -8,11 +8,10 @@ from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 from typer import Exit, Option
 
-from q2r2_control.cli.output import ConfigFile, Json, print_report, say
+from q2r2_control.cli.output import ConfigFile, Json, Wait, longest_wait, print_report
 from q2r2_control.config.cell import load_config
 from q2r2_control.events import Reason
 from q2r2_control.plants.fri.plant import FriPlant
@@ -113,6 +112,7 @@ def listen(plant: FriPlant, duration: float, asked: Callable[[], bool] = lambda:
 def fri_check(
     config: ConfigFile,
     duration: Annotated[float, Option(min=1, max=3600, help="[s].")] = 10.0,
+    wait: Wait = None,
     json: Json = False,
 ) -> None:
     """Listen to the cabinets of a cell and say what they send; exit 1 where an arm could not be commanded.
@@ -122,8 +122,8 @@ def fri_check(
     """
     cell, stop = load_config(config), StopRequest()
     plant = FriPlant(Robot.from_config(cell), cell)
-    plant.begin(CommandMode.POSITION)
-    say("waits for the cabinets", Console(stderr=True))
+    plant.begin(CommandMode.POSITION, lambda: stop.asked)
+    plant.longest_wait = longest_wait(wait)
     with stop_on_signals(stop.ask), real_time(), few_garbage_collections():
         try:
             plant.reset()

@@ -14,13 +14,13 @@ from rich.console import Console
 from rich.table import Table
 from typer import Option
 
-from q2r2_control.cli.output import ConfigFile, Json, print_report, say
+from q2r2_control.cli.output import ConfigFile, Json, Wait, longest_wait, print_report, say
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.robot.mounts import fit_move
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import SIDES, Array, CommandMode
+from q2r2_control.types import SIDES, Array
 from q2r2_control.viewer.tables import figure_table
 from q2r2_control.wording import sentence
 
@@ -88,6 +88,7 @@ def mounts(
         Option(min=_FEWEST, max=20, help="That both tips touch, far apart and not on a line.  [default: 3]"),
     ] = None,
     tip: Tip = (0.0, 0.0, 0.0),
+    wait: Wait = None,
     json: Json = False,
 ) -> None:
     """Find where the right arm's base is: guide both tips by hand to the same points, one after the other.
@@ -111,8 +112,7 @@ def mounts(
             f"{config}: fri: missing; allowed: each arm's cabinet, as {{port: 30200}}, or --postures FILE"
         )
     plant = FriPlant(robot, cell)
-    plant.begin(CommandMode.POSITION)
-    say("waits for the cabinets", console)
+    plant.longest_wait = longest_wait(wait)
     try:
         plant.reset()
         report = measure_mount(plant, cell, robot, points or _FEWEST, np.array(tip), console)

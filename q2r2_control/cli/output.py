@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -33,12 +34,19 @@ from q2r2_control.wording import sentence
 _LATE, _OFTEN = 2e4, 0.2
 # Time without a word about kernels that are being compiled, and between two lines about them [s].
 _SILENT_S, _BETWEEN_LINES_S = 3.0, 5.0
+SCRIPTS_WAIT_S = 60.0  # for cabinets, where nobody is at a terminal who could end the wait
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
 ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
 RealTime = Annotated[bool, Option("--rt", help="Lock memory and run under SCHED_FIFO, as far as permitted.")]
 WebHost = Annotated[str, Option(metavar="HOST", help="Address of the page; beyond 127.0.0.1: HTTPS and a token.")]
 WebPort = Annotated[int, Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0: any free one.")]
+Wait = Annotated[
+    float | None,
+    Option(
+        min=0, metavar="SECONDS", help="For KUKA's cabinets to be there; by default 60, and without end at a terminal."
+    ),
+]
 Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
 Task = Annotated[str | None, Option(help="With --record: what is done, noted in the recording.")]
 Solver = Annotated[
@@ -130,6 +138,13 @@ def positive(option: str, value: float | None) -> float | None:
     if value is not None and not (math.isfinite(value) and value > 0.0):
         raise ConfigError(f"{option} {value:g}: allowed: a positive number of seconds")
     return value
+
+
+def longest_wait(asked: float | None) -> float:
+    """The time to wait for cabinets [s]: as ``asked``; else without end if a person at a terminal can end it."""
+    if asked is not None:
+        return asked
+    return math.inf if sys.stderr.isatty() else SCRIPTS_WAIT_S
 
 
 def summary_table(summary: RunSummary) -> Table:

@@ -25,9 +25,11 @@ from q2r2_control.cli.output import (
     RealTime,
     Solver,
     Task,
+    Wait,
     WebHost,
     WebPort,
     as_json_text,
+    longest_wait,
     notes_of,
     notice_of_compiling,
     positive,
@@ -52,6 +54,7 @@ from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, trajectory_named
 from q2r2_control.plants.mujoco_cameras import window_fault
+from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.types import CommandMode
@@ -104,6 +107,7 @@ def run(
     force: Annotated[bool, Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
     i_know: Annotated[bool, Option("--i-know", help="Run real cabinets without q2r2 commission.")] = False,
     full_speed: Annotated[bool, Option("--full-speed", help="Run real cabinets faster than a tenth.")] = False,
+    wait: Wait = None,
     json: Json = False,
 ) -> None:
     """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
@@ -135,6 +139,8 @@ def run(
     if fast and duration is None:
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
     _check_times(fast, rt)
+    if wait is not None and not hasattr(load_class(PLANTS, plant or cell.plant), "longest_wait"):
+        raise ConfigError(f"--wait cannot be used with --plant {plant or cell.plant}, which waits for nobody")
     options = RunOptions(
         name=cell.name,
         input=source,
@@ -150,6 +156,7 @@ def run(
         real_time=rt,
         record=record,
         notes=notes_of(task, operator, record),
+        longest_wait=longest_wait(wait),
     )
     done = run_cell(cell, options)
     print_summary(done, json)
@@ -194,7 +201,8 @@ def demo(
 ) -> None:
     """Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted hands.
 
-    At a terminal the arms are shown in MuJoCo's window, or in a browser where there is no display.
+    At a terminal the arms are shown in MuJoCo's window, or in a browser where there is no display. With --plant fri all
+    processes have real-time priority where that is permitted, as with --rt: cabinets do not wait for a busy computer.
     Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
     With --record, whether all succeeded is in the recording, of which q2r2 report makes plots.
     With --seeds, exit code 1 where a task succeeded in less than 19 of 20 trials.
@@ -234,14 +242,14 @@ def demo(
         table=table,
         window=viewer,
         page=(web_host, web_port, None) if web else None,
-        real_time=rt,
+        real_time=rt or plant == "fri",  # cabinets wait for nobody, and a busy computer has other programs
         tasks=chosen,
         steps=work.steps,
         record=record,
         notes={"task": "; ".join(task.about for task in chosen)},
     )
     if plant == "fri":
-        with rehearsal(_FRI_CONFIG, mode, chosen, period, rt) as results:
+        with rehearsal(_FRI_CONFIG, mode, chosen, period, rt=True) as results:
             done = run_cell(with_solver(with_controls(load_config(_FRI_CONFIG)), solver), options)
         done = replace(done, tasks=held_to_promises(results, done.summary))
     else:

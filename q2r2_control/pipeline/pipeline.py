@@ -275,7 +275,7 @@ class Pipeline(RequestedRun):
         self._grippers = dict.fromkeys(self.robot.arms, OPEN)  # commanded
         sessions = self._sessions = self.plant if isinstance(self.plant, SessionPlant) else None
         if sessions is not None:
-            sessions.begin(self.drive.mode)
+            sessions.begin(self.drive.mode, lambda: self._stopping)
         self.plant.reset()
         self._state = check_state(self.plant.state(), self.robot)  # the newest one
         self._clock = self.make_clock(realtime)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -80,8 +80,8 @@ class SessionPlant(Protocol):
 
     realtime_only: bool
 
-    def begin(self, mode: CommandMode) -> None:
-        """Commands of this ``mode`` are to come after the next ``reset``."""
+    def begin(self, mode: CommandMode, stopped: Callable[[], bool]) -> None:
+        """Commands of this ``mode`` are to come after the next ``reset``, which ends its wait if ``stopped()``."""
 
     def due(self, now: float) -> tuple[float, float]:
         """In a tick at ``now`` [s]: how long the reference follows its certified stop, and moves on then [s].
@@ -100,6 +100,14 @@ class SessionPlant(Protocol):
 
     def sessions(self) -> dict[str, str]:
         """Of each arm, its session in words."""
+
+
+@runtime_checkable
+class WaitingPlant(Protocol):
+    """The attributes of a plant that waits in a reset for a person, besides those of :class:`Plant`, for ``--wait``."""
+
+    longest_wait: float  # for the robot to be there, without which a reset raises :class:`PlantError` [s]
+    longest_session_wait: float  # for all sessions from the same moment; without them a run begins all the same [s]
 
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:

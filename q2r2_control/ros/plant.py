@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Callable
 
 import numpy as np
 import rclpy
@@ -54,13 +55,15 @@ class RosPlant:
         self._fingers, self._kind = Fingers(robot, config), TrajectoryOutput(self._period, robot)
         self._openings = dict.fromkeys(self._fingers.arms, 1.0)  # none is measured before a run
         self._context: Context | None = None
+        self._stopped: Callable[[], bool] = lambda: False  # whether nobody wants to wait for the robot any more
 
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> RosPlant:
         return cls(robot, config)
 
-    def begin(self, mode: CommandMode) -> None:
-        """Commands of this ``mode`` are to come after the next :meth:`reset`; there is one."""
+    def begin(self, mode: CommandMode, stopped: Callable[[], bool]) -> None:
+        """See :meth:`SessionPlant.begin`; there is one mode."""
+        self._stopped = stopped
 
     def reset(self, q: Array | None = None) -> None:
         """Hear the robot. Raises :class:`PlantError` where it is not there, others command it, or for ``q``."""
@@ -89,7 +92,7 @@ class RosPlant:
         others = CommandWatch(node, JointTrajectory, [self._publisher.topic_name])
         others.begin()
         began = time.monotonic()
-        while (waits := time.monotonic() - began) < _WAIT:
+        while (waits := time.monotonic() - began) < _WAIT and not self._stopped():
             self._executor.spin_once(timeout_sec=0.01)
             if waits > _QUIET and self._joints.state is not None and self._publisher.listeners:
                 break

@@ -40,7 +40,7 @@ GOOD = CabinetReport(
 @pytest.fixture
 def cell(tmp_path: Path) -> Path:
     """One whose cabinets are real, and do not answer. Most of a test's time goes by ticks, so they are few."""
-    text = find_resource("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8").replace("127.0.0.1", "192.0.2.1")
+    text = find_resource("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8").replace("127.0.0.2", "192.0.2.1")
     text = text.replace("loop_rate_hz: 500.0", "loop_rate_hz: 250.0")
     (file := tmp_path / "my_cell.yaml").write_text(text, encoding="utf-8")
     return file

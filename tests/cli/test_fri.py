@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -12,17 +13,21 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from q2r2_control.cli.fri import Pendant
+from q2r2_control.cli.fri import Pendant, rehearsal, wait_for_states
 from q2r2_control.config.cell import load_config
+from q2r2_control.errors import PlantError
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm, Trip
+from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.plants.fri.wire import LONGEST, Safety, Session, read_monitoring
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import CommandMode
 from tests.cli.command import q2r2
 
 CELL = "config/dual_iiwa7_fri.yaml"
 
 
-def test_without_a_client_the_cabinets_wait() -> None:
-    done = q2r2("fri-cabinet", CELL, "--duration", "0.3", "--json")
+def test_without_a_client_the_cabinets_wait(fri_cell: str) -> None:
+    done = q2r2("fri-cabinet", fri_cell, "--duration", "0.3", "--json")
     assert done.exit_code == 0
     waiting = {"state": "monitoring wait", "missed": 0, "trips": []}
     assert json.loads(done.stdout)["cabinets"] == {"left": waiting, "right": waiting}
@@ -90,12 +95,82 @@ def test_the_messages_say_how_many_of_them_there_are_to_one_answer(fri_cell: str
         assert read_monitoring(client.recv(LONGEST)).multiplier == 3
 
 
+@pytest.mark.parametrize("arguments", [(), ("--source-port", "0")], ids=["client's port", "any port"])
+def test_messages_come_from_the_cabinets_address_and_its_clients_port_unless_another_is_asked_for(
+    fri_cell: str, arguments: tuple[str, ...]
+) -> None:
+    port = load_config(fri_cell).fri["left"].port
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.bind(("127.0.0.1", port))
+        client.settimeout(30.0)
+        assert q2r2("fri-cabinet", fri_cell, "--duration", "0.1", *arguments).exit_code == 0
+        address, source = client.recvfrom(LONGEST)[1]
+    assert address == "127.0.0.2"
+    assert (source == port) is (not arguments)
+
+
+def test_a_rehearsal_begins_when_all_cabinets_send(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "lines"
+    file.touch()
+    looks = iter(("0.000 s  left: monitoring wait\n", "a line\n", "0.004 s  right: monitoring wait\n"))
+
+    def sleep(_: float) -> None:
+        with file.open("a", encoding="utf-8") as lines:
+            lines.write(next(looks))
+
+    monkeypatch.setattr("q2r2_control.cli.fri.time.sleep", sleep)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, text=True) as child:
+        with file.open("rb") as lines:
+            wait_for_states(child, lines.fileno(), 2)
+        child.communicate("\n")
+    assert next(looks, None) is None
+
+
+def test_a_rehearsal_whose_cabinets_cannot_begin_says_why(fri_cell: str) -> None:
+    port = load_config(fri_cell).fri["left"].port
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.2", port))
+        with (
+            pytest.raises(PlantError, match=f"stand in have ended: q2r2: the left cabinet cannot send from .*{port}"),
+            rehearsal(fri_cell, CommandMode.POSITION, (), 10.0, False),
+        ):
+            pass
+
+
+def test_a_run_says_that_it_waits_for_a_cabinet_and_ctrl_c_ends_the_wait(fri_cell: str) -> None:
+    words = ("run", fri_cell, "--input", "scripted", "--trajectory", "circle", "--wait", "600")
+    command = (sys.executable, "-m", "q2r2_control", *words)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        said = iter(process.stderr.readline, "")
+        try:
+            assert any(line.startswith("waits: left: no FRI message from cabinet 127.0.0.2 on port") for line in said)
+        finally:
+            process.send_signal(signal.SIGINT)
+        *_, last = said
+    assert process.returncode == 2
+    assert last.startswith("q2r2: left: no FRI message from")
+    assert "the wait was stopped after" in last
+    plant = FriPlant.from_config(Robot.from_config(config := load_config(fri_cell)), config)
+    assert plant.is_released(), "nothing keeps the ports"
+
+
+def test_a_port_of_a_cabinet_that_another_program_has_is_one_line(fri_cell: str) -> None:
+    port = load_config(fri_cell).fri["right"].port
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.3", port))
+        done = q2r2("fri-cabinet", fri_cell, "--duration", "0.1")
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    assert f"the right cabinet cannot send from 127.0.0.3, port {port}: Address already in use" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
         (("config/dual_iiwa7.yaml",), "fri.left: missing; allowed: the cabinet of each arm"),
         ((CELL, "--mode", "velocity"), "--mode velocity: allowed: position, torque"),
         ((CELL, "--duration", "-1"), "--duration"),
+        ((CELL, "--mode", "torque"), "answered every 10 ms: allowed with torques: 5 ms or less"),
     ],
 )
 def test_a_wrong_option_is_one_line(arguments: tuple[str, ...], told: str) -> None:
@@ -106,7 +181,7 @@ def test_a_wrong_option_is_one_line(arguments: tuple[str, ...], told: str) -> No
 
 def test_a_wrong_cabinet_is_named_with_what_is_allowed(tmp_path: Path) -> None:
     text = Path(CELL).read_text(encoding="utf-8")
-    for wrong, told in (("address: 127.0.0.1", "address: here"), ("version: null", "version: 3")):
+    for wrong, told in (("address: 127.0.0.2", "address: here"), ("version: null", "version: 3")):
         file = tmp_path / "cell.yaml"
         file.write_text(text.replace(wrong, told), encoding="utf-8")
         done = q2r2("check", str(file))
@@ -118,3 +193,9 @@ def test_a_demo_on_another_plant_is_refused() -> None:
     done = q2r2("demo", "--plant", "kinematic")
     assert done.exit_code == 2
     assert "--plant 'kinematic': allowed: mujoco, fri" in done.stderr
+
+
+def test_a_wait_for_a_simulated_plant_is_refused() -> None:
+    done = q2r2("run", "config/dual_iiwa7.yaml", "--input", "scripted", "--wait", "5")
+    assert done.exit_code == 2
+    assert "--wait cannot be used with --plant mujoco" in done.stderr

@@ -57,9 +57,9 @@ def test_a_line_says_of_each_gripper_by_modbus_whether_it_answers_and_none_is_mo
 
 
 def test_a_cabinet_that_says_nothing_is_one_line(fri_cell: str) -> None:
-    done = q2r2("fri-check", fri_cell)
+    done = q2r2("fri-check", fri_cell, "--wait", "0.1")
     assert done.exit_code == 2
-    assert "left: no FRI message from cabinet 127.0.0.1 on port" in done.stderr.splitlines()[-1]
+    assert "left: no FRI message from cabinet 127.0.0.2 on port" in done.stderr.splitlines()[-1]
 
 
 def test_a_cell_without_cabinets_is_one_line() -> None:

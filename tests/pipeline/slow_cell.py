@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pinocchio as pin
 
 from q2r2_control.config.cell import Config
-from q2r2_control.pipeline.slow_run import SlowRun
+from q2r2_control.pipeline.slow_run import Moment, SlowRun
 from q2r2_control.plants.fri.cabinet import StillArm
 from q2r2_control.plants.fri.cabinet_server import settings_of
 from q2r2_control.plants.fri.wire import CommandKind, Joints, Session
@@ -59,8 +59,12 @@ def slow_run(
     arm: type[WeighedArm] = WeighedArm,
     truth: Robot | None = None,
     prepare: Callable[[PendantCabinets], None] = lambda cabinets: None,
+    listener: Callable[[Moment], None] | None = None,
 ) -> SlowRun:
-    """Of ``config``; the arms are the ``truth``'s, and all ``arm``. ``prepare`` is done with the cabinets first."""
+    """Of ``config``; the arms are the ``truth``'s, and all ``arm``. ``prepare`` is done with the cabinets first.
+
+    ``listener`` gets each tick's moment.
+    """
 
     def plant(robot: Robot, slow: Config) -> PendantCabinets:
         settings = {side: settings_of(robot, side, CommandKind.POSITION, 2, 0.01) for side in robot.arms}
@@ -71,4 +75,4 @@ def slow_run(
         prepare(made)
         return made
 
-    return SlowRun(config, plant, realtime=False)
+    return SlowRun(config, plant, realtime=False, listener=listener)

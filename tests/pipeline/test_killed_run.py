@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
+from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +13,13 @@ import pytest
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.fri import CabinetConfig
 from q2r2_control.errors import PlantError
-from q2r2_control.pipeline.killed_run import measure_kill
+from q2r2_control.pipeline import killed_run
+from q2r2_control.pipeline.killed_run import main, measure_kill
+from q2r2_control.pipeline.slow_run import Moment
 from q2r2_control.plants.fri.cabinet import Trip
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES
+from tests.pipeline.slow_cell import slow_run
 from tests.plants.fri.conftest import free_ports
 from tests.plants.fri.waiting_cabinets import waiting_cabinets
 
@@ -32,10 +38,48 @@ def test_arms_of_a_killed_run_come_to_rest_within_their_certified_stop(config: C
         assert 0.0 < report.stopped_mm < report.allowed_mm
 
 
-def test_arms_that_hardly_go_up_are_not_killed_and_it_says_where_to_begin(config: Config) -> None:
+class LeadingThread:
+    """It stands in for :class:`HelperProcess`: arms behind virtual cabinets, in simulated time."""
+
+    def __init__(self, what: str, module: str, on_answer: Callable[[Moment], None]) -> None:
+        self.fault: str | None = None
+        self.killed_too_early = False
+        self._on_answer = on_answer
+
+    def send(self, config: Config) -> None:
+        self._thread = Thread(target=self._lead, args=(config,))
+        self._thread.start()
+
+    def _lead(self, config: Config) -> None:
+        try:
+            main(iter((config,)), self._on_answer)
+        except PlantError as error:
+            self.fault = str(error)
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def kill(self) -> None:
+        self.killed_too_early = self.alive
+        self._thread.join()
+
+
+def test_arms_that_hardly_go_up_are_not_killed_and_it_says_where_to_begin(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     slow = config.model_copy(update={"control": config.control.model_copy(update={"max_linear_speed": 0.005})})
-    with waiting_cabinets(Robot.from_config(slow), slow), pytest.raises(PlantError, match="100 mm of room above it"):
+    led: list[LeadingThread] = []
+
+    def leads(*arguments: Any) -> LeadingThread:
+        led.append(LeadingThread(*arguments))
+        return led[-1]
+
+    monkeypatch.setattr(killed_run, "HelperProcess", leads)
+    monkeypatch.setattr(killed_run, "SlowRun", lambda config, plant, listener: slow_run(config, listener=listener))
+    with pytest.raises(PlantError, match="100 mm of room above it"):
         measure_kill(slow, lambda: np.zeros(14), led=0.3)
+    assert not led[0].killed_too_early
 
 
 def test_a_run_that_cannot_begin_says_why(config: Config) -> None:

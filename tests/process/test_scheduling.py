@@ -6,6 +6,8 @@ import ctypes
 import errno
 import gc
 import os
+import platform
+import struct
 import subprocess
 import sys
 import threading
@@ -16,6 +18,7 @@ import pytest
 from q2r2_control.process.scheduling import (
     few_garbage_collections,
     real_time,
+    reserve,
     schedule_process_as_others,
     schedule_process_first,
 )
@@ -95,6 +98,30 @@ def test_the_real_system_is_left_as_it_was_and_other_threads_are_not_put_first()
         thread.join()
     assert policies == [before]
     assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == before
+
+
+@pytest.mark.parametrize(("machine", "granted", "number"), [("x86_64", True, 314), ("aarch64", False, 274)])
+def test_a_reservation_is_asked_for_in_nanoseconds_and_a_refusal_is_told(
+    monkeypatch: pytest.MonkeyPatch, machine: str, granted: bool, number: int
+) -> None:
+    asked: list[tuple[int, int, bytes, int]] = []
+
+    class Linux:
+        def syscall(self, *arguments: int) -> int:
+            asked.append(arguments)  # type: ignore[arg-type]
+            return 0 if granted else -1
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Linux())
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    assert reserve(0.0015, 0.002) is granted
+    attributes = struct.unpack("=IIQiIQQQ", asked[0][2])
+    assert (asked[0][:2], asked[0][3], len(asked)) == ((number, 0), 0, 1)
+    assert attributes == (48, 6, 1, 0, 0, 1_500_000, 2_000_000, 2_000_000)
+
+
+def test_a_machine_without_a_known_call_has_no_reservations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "riscv64")
+    assert not reserve(0.001, 0.002)
 
 
 def test_all_threads_of_a_process_are_scheduled_first_and_as_others_again(monkeypatch: pytest.MonkeyPatch) -> None:

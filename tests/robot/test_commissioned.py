@@ -11,7 +11,7 @@ from q2r2_control.config.cell import Config, parse_config
 from q2r2_control.robot.commissioned import fingerprint, not_commissioned, sign_off_file, slowed
 
 TEXT = Path("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
-REAL = TEXT.replace("127.0.0.1", "192.170.10.2")
+REAL = TEXT.replace("127.0.0.2", "192.170.10.2")
 
 
 def cell(old: str = "", new: str = "", text: str = REAL) -> Config:

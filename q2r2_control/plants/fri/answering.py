@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from ipaddress import ip_address
 from subprocess import TimeoutExpired
 
 from q2r2_control.errors import PlantError
@@ -22,9 +23,11 @@ from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import LONGEST, read_monitoring
 from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of, start_python
-from q2r2_control.process.scheduling import few_garbage_collections, how_it_ended, real_time, thread_priority
+from q2r2_control.process.scheduling import few_garbage_collections, how_it_ended, real_time, reserve, thread_priority
 
 _TAKEN, _TOO_LATE = b"1", b"0"  # a word about commands
+_RESERVED = 0.0015, 0.002  # of a processor for answers, which take 0.2 ms each, in every so many [s]
+_BEGUN = b"2"  # the first word: the cabinets are heard
 _LARGEST = 1 << 16  # of what is passed on [bytes]
 _POLL = 0.05  # of looking whether the arms of a loop that has ended stand still [s]
 _PATIENCE = 5.0  # with a process that is to end [s]
@@ -47,12 +50,15 @@ class AnsweringProcess:
     """The loop's end."""
 
     def __init__(self, lines: Sequence[Line]) -> None:
-        """With a line to each cabinet, of which this process may close its sockets then."""
+        """With a line to each cabinet, of which this process may close its sockets then.
+
+        Returns when the process hears the cabinets: a busy computer takes seconds to start one. Raises
+        :class:`PlantError` where it cannot begin.
+        """
         # States that nobody reads may fill their link; a word about commands must not wait for that.
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states.setblocking(False)
-        self._commands.settimeout(_LONGEST_WORD)
         links = commands.fileno(), states.fileno()
         with commands, states:
             code, files = f"from {__name__} import main; main{links}", [*links, *(line.file for line in lines)]
@@ -61,6 +67,12 @@ class AnsweringProcess:
         # An answer goes before the loop, where that has a priority.
         priority = thread_priority()
         self._commands.send(pickle.dumps((priority and priority + 1, list(lines))))
+        word = b""
+        with suppress(ConnectionError):
+            word = self._commands.recv(_LARGEST)
+        if word != _BEGUN:
+            raise self._end(word)
+        self._commands.settimeout(_LONGEST_WORD)
 
     def send(self, commands: dict[str, ArmCommand]) -> bool:
         """Whether commands, by arm, came before every answer that they were for; else none of them is followed.
@@ -124,6 +136,7 @@ def main(commands: int, states: int) -> None:
             with ExitStack() as stack:
                 if priority:
                     stack.enter_context(real_time(priority))
+                    reserve(*_RESERVED)
                 stack.enter_context(few_garbage_collections())
                 _Answering(from_loop, to_loop, lines).run()
         except Exception as error:
@@ -142,6 +155,7 @@ class _Answering:
             with suppress(OSError):
                 while True:  # what came while this process began is too old to be answered
                     opened.recv(LONGEST + 1)
+        self._commands.send(_BEGUN)
         ended = False
         while not (ended and all(session.is_still(time.monotonic()) for session in self._sessions.values())):
             for file in select.select(files, (), (), _POLL)[0]:
@@ -182,11 +196,18 @@ class _Answering:
             self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))
 
 
+def address_for(cabinet: str) -> str:
+    """Address of this computer that a ``cabinet`` on this computer sends to; empty for one elsewhere: all networks."""
+    if not ip_address(cabinet).is_loopback:
+        return ""
+    return "::1" if ":" in cabinet else "127.0.0.1"
+
+
 def open_socket(address: str, port: int) -> socket.socket:
     """A socket for one cabinet: loopback where it is on this computer, else all of its networks. Raises OSError."""
     opened = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        opened.bind((address if address in ("127.0.0.1", "::1") else "", port))
+        opened.bind((address_for(address), port))
     except OSError:
         opened.close()
         raise

@@ -7,11 +7,12 @@ kits; where those are silent, such as in how long a client may miss, it is stric
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
 
-from q2r2_control.errors import ProtocolError
+from q2r2_control.errors import ConfigError, ProtocolError
 from q2r2_control.plants.fri.wire import (
     JOINTS,
     CommandKind,
@@ -35,6 +36,8 @@ _MISSES = 10  # answers in a row that may be late while the client commands
 _NEAR = 1e-3  # how far the first command may be from the cabinet's own position [rad]
 _ROUNDING = 1e-6  # relative, of the limits
 _T1_SPEED = 0.25  # of a tool, in T1 [m/s]
+_LONGEST_TORQUE_PERIOD = 0.005  # between two answers to an application that overlays torques [s]
+_LARGEST_LOAD_ERROR = 2.0  # of a joint's external torque before torques are overlaid [Nm]
 
 
 class Trip(StrEnum):
@@ -50,6 +53,7 @@ class Trip(StrEnum):
     ACCELERATION = "commanded velocities were too far apart"
     TORQUE = "a commanded torque was beyond its limit"
     T1 = "the tool was commanded faster than 250 mm/s, in T1"
+    OUTPUT = "an answer wrote an output that the cabinet does not have"
     SAFETY = "safety stop"
     STOPPED = "stopped at the pendant"
 
@@ -106,6 +110,12 @@ class CabinetSettings:
     multiplier: int = 1  # one answer is due for so many messages
     command: CommandKind = CommandKind.POSITION
 
+    def __post_init__(self) -> None:
+        """Raises ConfigError for torques that come less often than Sunrise allows."""
+        if self.command is CommandKind.TORQUE and self.answer_period > _LONGEST_TORQUE_PERIOD * (1.0 + _ROUNDING):
+            allowed = f"allowed with torques: {1e3 * _LONGEST_TORQUE_PERIOD:g} ms or less"
+            raise ConfigError(f"a cabinet that is answered every {1e3 * self.answer_period:g} ms: {allowed}")
+
     @property
     def answer_period(self) -> float:
         """Between two answers [s]."""
@@ -115,12 +125,15 @@ class CabinetSettings:
 class Cabinet:
     """In each period: :meth:`send`, and :meth:`receive` for each datagram that comes before the next."""
 
-    def __init__(self, settings: CabinetSettings, arm: CabinetArm) -> None:
+    def __init__(
+        self, settings: CabinetSettings, arm: CabinetArm, outputs: Mapping[str, IoValue] | None = None
+    ) -> None:
+        """``outputs`` are those that the application registers for a client, with their values at the start."""
         self.settings, self.arm = settings, arm
         self.session, self.safety, self.operation = Session.MONITORING_WAIT, Safety.NORMAL, Operation.AUTOMATIC
         self.load_fits = True  # the load data are those of the tool, without which no client may command
         self.inputs: dict[str, IoValue] = {}  # for the client
-        self.outputs: dict[str, IoValue] = {}  # by the client, whatever the session's state
+        self.outputs = dict(outputs or {})  # by the client, whatever the session's state
         self.trips: list[Trip] = []  # of all sessions, in order
         self._sent = 0  # messages so far
         self._heard: int | None = None  # counter of the client's newest message
@@ -129,7 +142,8 @@ class Cabinet:
         self._misses = 0  # in a row
         self.missed = 0  # of a client that commanded and answered again: not those of one that has ended
         self._overlay = False  # the application asks for the client's command
-        self._commanded: Joints = arm.q  # by the cabinet's own motion, or by the client
+        self._held: Joints = arm.q  # by the cabinet's own motion, a hold of its position
+        self.commanded: Joints = arm.q  # by that motion, or by the client
         self._velocity: Joints = (0.0,) * JOINTS
         self._tau: Joints | None = None
 
@@ -156,7 +170,7 @@ class Cabinet:
             self.trips.append(trip)
             self.session = Session.MONITORING_READY
         self._overlay, self._velocity, self._tau = False, (0.0,) * JOINTS, None
-        self._commanded = self.arm.q
+        self._held = self.commanded = self.arm.q
 
     def safety_stop(self, stop: Safety) -> None:
         """A stop that the safety controller asks for; ``NORMAL`` ends it."""
@@ -168,8 +182,9 @@ class Cabinet:
         """Begin a period at ``stamp`` [s]: judge the last answer, move the arm, and say how things are."""
         if self._sent and self._sent % self.settings.multiplier == 0:
             self._judge()
-        self.arm.advance(self.settings.period, self._commanded, self._tau)
+        self.arm.advance(self.settings.period, self.commanded, self._tau)
         self._sent += 1
+        commands = self.session >= Session.COMMANDING_WAIT
         self.message = Monitoring(
             version=self.settings.version,
             counter=self._sent,
@@ -182,13 +197,15 @@ class Cabinet:
             stamp=stamp,
             tau=self.arm.tau,
             external_tau=self.arm.external_tau,
-            commanded_q=self._commanded if self.settings.version == 1 else None,
-            ipo_q=self._commanded if self.session >= Session.COMMANDING_WAIT else None,
-            command=self.settings.command if self.session >= Session.COMMANDING_WAIT else CommandKind.NONE,
+            commanded_q=self.commanded if self.settings.version == 1 else None,
+            ipo_q=self._held if commands else None,
+            command=self.settings.command if commands else CommandKind.NONE,
             safety=self.safety,
             operation=self.operation,
-            drives=Drives.ACTIVE if self.session >= Session.COMMANDING_WAIT else Drives.OFF,
-            io=dict(self.inputs),
+            drives=Drives.ACTIVE if commands else Drives.OFF,
+            io=self.inputs | self.outputs,
+            outputs=frozenset(self.outputs),
+            commanded_tau=self._commanded_tau,
         )
         return self.message
 
@@ -203,7 +220,22 @@ class Cabinet:
             self.stop(Trip.VERSION)
         elif command.reflected == self._sent and (self._heard is None or command.counter != self._heard):
             self._heard, self._answer = command.counter, command
-            self.outputs |= command.io
+            if all(self.message.output(name, value) == value for name, value in command.io.items()):
+                self.outputs |= command.io
+            else:
+                self.stop(Trip.OUTPUT)
+
+    @property
+    def _commanded_tau(self) -> Joints:
+        """Torques of the arm's motors: what they bear, and the client's overlay."""
+        overlay = self._tau or (0.0,) * JOINTS
+        return tuple(borne + added for borne, added in zip(self.arm.tau, overlay, strict=True))
+
+    @property
+    def _bears_the_load(self) -> bool:
+        """Whether the load data explain the torques of an arm that is to be overlaid with torques."""
+        torques = self.settings.command is CommandKind.TORQUE
+        return self.load_fits and not (torques and max(map(abs, self.arm.external_tau)) > _LARGEST_LOAD_ERROR)
 
     def _judge(self) -> None:
         answer, self._answer = self._answer, None
@@ -221,9 +253,11 @@ class Cabinet:
         elif self.session is Session.COMMANDING_WAIT:
             if self.quality < Quality.GOOD:
                 self.stop(Trip.LATE)
-            elif not self.load_fits or answer is None or answer.q is None:
+            elif not self._bears_the_load or answer is None or answer.q is None:
                 return
-            elif _apart(answer.q, self._commanded) <= _NEAR:
+            elif self.settings.command is CommandKind.TORQUE and answer.tau is None:
+                return  # torques have to come before they count, too
+            elif _apart(answer.q, self._held) <= _NEAR:
                 self.session = Session.COMMANDING_ACTIVE
                 self._follow(answer)
         else:
@@ -238,9 +272,9 @@ class Cabinet:
             self.stop(trip)
             return
         assert answer.q is not None
-        moved = (new - old for new, old in zip(answer.q, self._commanded, strict=True))
+        moved = (new - old for new, old in zip(answer.q, self.commanded, strict=True))
         self._velocity = tuple(way / self.settings.answer_period for way in moved)
-        self._commanded, self._tau = answer.q, answer.tau
+        self.commanded, self._tau = answer.q, answer.tau
 
     def _guard(self, answer: FriCommand) -> Trip | None:
         """The reason why an answer cannot be followed; a missed one before it gives no more time."""
@@ -256,10 +290,10 @@ class Cabinet:
             return Trip.POSITION
         if self.operation is Operation.T1:
             longest = _T1_SPEED * period * (1.0 + _ROUNDING)
-            if self.arm.tool_way(self._commanded, answer.q) > longest:
+            if self.arm.tool_way(self.commanded, answer.q) > longest:
                 return Trip.T1
         for new, old, before, velocity, acceleration in zip(
-            answer.q, self._commanded, self._velocity, limits.velocity, limits.acceleration, strict=True
+            answer.q, self.commanded, self._velocity, limits.velocity, limits.acceleration, strict=True
         ):
             now = (new - old) / period
             if abs(now) > velocity * (1.0 + _ROUNDING):

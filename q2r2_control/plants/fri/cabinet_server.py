@@ -16,9 +16,19 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.fri import GripperIoConfig
+from q2r2_control.errors import ConfigError
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings
-from q2r2_control.plants.fri.wire import JOINTS, LONGEST, CommandKind, Joints, Session, joints_of, write_monitoring
+from q2r2_control.plants.fri.wire import (
+    JOINTS,
+    LONGEST,
+    CommandKind,
+    IoValue,
+    Joints,
+    Session,
+    joints_of,
+    write_monitoring,
+)
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
@@ -112,8 +122,7 @@ class SimulatedArms:
 
     def work_gripper(self, arm: str, gripper: GripperIoConfig, cabinet: Cabinet) -> None:
         """Let a cabinet's output command the arm's gripper, whose opening its input shows."""
-        if gripper.output in cabinet.outputs:
-            self.openings[arm] = min(max(float(cabinet.outputs[gripper.output]), 0.0), 1.0)
+        self.openings[arm] = min(max(float(cabinet.outputs[gripper.output]), 0.0), 1.0)
         if gripper.input is not None:
             cabinet.inputs[gripper.input] = self.plant.gripper_openings()[arm]
 
@@ -133,6 +142,11 @@ class SimulatedArms:
             joints = self.robot.arms[name].joints
             tau[joints] += back[joints] if arm.overlay is None else spring[joints] + arm.overlay
         return Command(CommandMode.TORQUE, q, v, tau, self.openings)
+
+
+def outputs_of(gripper: GripperIoConfig | None) -> dict[str, IoValue]:
+    """Outputs that the application of a cabinet registers for ``gripper``, which is open at the start."""
+    return {} if gripper is None else {gripper.output: True if gripper.digital else 1.0}
 
 
 def settings_of(
@@ -161,16 +175,23 @@ class CabinetServer:
         self,
         cell: SimulatedArms,
         cabinets: Mapping[str, CabinetSettings],
+        origins: Mapping[str, tuple[str, int]],
         clients: Mapping[str, tuple[str, int]],
         grippers: Mapping[str, GripperIoConfig],
         network: Network,
         seed: int = 0,
     ) -> None:
-        """``clients``: address and port of each arm's. Datagrams go out from loopback where a client is there."""
+        """``origins``: address and port of each arm's cabinet, port 0: any free one; ``clients``: those of its client.
+
+        Raises :class:`ConfigError` for an origin that cannot be bound, such as one that another program has.
+        """
         self.cell, self._clients, self._grippers, self._network = cell, dict(clients), dict(grippers), network
-        self.cabinets = {arm: Cabinet(settings, cell.arms[arm]) for arm, settings in cabinets.items()}
+        self.cabinets = {
+            arm: Cabinet(settings, cell.arms[arm], outputs_of(self._grippers.get(arm)))
+            for arm, settings in cabinets.items()
+        }
         self._random = np.random.default_rng(seed)
-        self._sockets = {arm: _opened(address) for arm, (address, _) in self._clients.items()}
+        self._sockets = {arm: _opened(arm, *origins[arm]) for arm in self.cabinets}
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._serial = 0
         self._sent_at: dict[str, float] = {}  # the newest message of each arm [s]
@@ -253,8 +274,15 @@ def _sent(opened: socket.socket, datagram: bytes, client: tuple[str, int]) -> No
         return
 
 
-def _opened(client: str) -> socket.socket:
-    opened = socket.socket(socket.AF_INET6 if ":" in client else socket.AF_INET, socket.SOCK_DGRAM)
-    opened.bind((client if client in ("127.0.0.1", "::1") else "", 0))
+def _opened(arm: str, address: str, port: int) -> socket.socket:
+    opened = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        opened.bind((address, port))
+    except OSError as error:
+        opened.close()
+        allowed = "allowed: a loopback address as 127.0.0.2, and a port that is free"
+        raise ConfigError(
+            f"the {arm} cabinet cannot send from {address}, port {port}: {error.strerror}; {allowed}"
+        ) from error
     opened.setblocking(False)
     return opened

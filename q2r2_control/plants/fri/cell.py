@@ -20,7 +20,7 @@ from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.plants.fri.session import DELAY
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
-from q2r2_control.plants.fri.wire import JOINTS, CommandKind, joints_of
+from q2r2_control.plants.fri.wire import JOINTS, CommandKind, Monitoring, joints_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Command, CommandMode, RobotState
 
@@ -68,11 +68,20 @@ class FriCell:
         """A newer state of an arm's session. One warning a run says that messages of its cabinet are missing."""
         if state.newest is not None and self.states[state.arm].newest is None:
             self._heard_since[state.arm] = state.arrival
+            self._say_missing_output(state.arm, state.source, state.newest)
         self.states[state.arm] = state
         if state.arm in self._heard_since and state.lost + state.unreadable >= _MISSING:
             time = state.arrival - self._heard_since.pop(state.arm)
             missing = f"{state.lost} messages lost and {state.unreadable} unreadable in {time:.1f} s"
             _logger.warning("%s: %s: %s; q2r2 fri-check measures the network", state.arm, state.source, missing)
+
+    def _say_missing_output(self, arm: str, source: str, newest: Monitoring) -> None:
+        gripper = self._grippers.get(arm)
+        if gripper is None or newest.output(gripper.output, False if gripper.digital else 0.0) is not None:
+            return
+        kind, names = "boolean" if gripper.digital else "analog", ", ".join(sorted(newest.outputs)) or "none"
+        lacks = f"has no {kind} output {gripper.output}, so that the gripper is not commanded"
+        _logger.warning("%s: %s %s; outputs that its application registers: %s", arm, source, lacks, names)
 
     def due(self, now: float) -> tuple[float, float]:
         """In a tick at ``now`` [s]: how long the reference has to brake first, and to go on then [s]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections import deque
+from collections.abc import Callable, Iterable
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.fri import GripperIoConfig, ModbusGripperConfig
@@ -15,13 +16,13 @@ from q2r2_control.plants.fri.answering import AnsweringProcess, Line, open_socke
 from q2r2_control.plants.fri.cell import FriCell
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.session_state import SessionState
+from q2r2_control.plants.fri.waiting import CabinetWait
 from q2r2_control.plants.fri.wire import JOINTS, CommandKind
 from q2r2_control.plants.modbus_gripper import ModbusGripper
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
-_WAIT = 5.0  # for each cabinet's first message, and for its session, without which a run begins all the same [s]
 _KEPT = 100_000  # answers; the garbage collector goes through all of them in mid-run
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
@@ -31,6 +32,8 @@ class FriPlant:
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
     realtime_only = True
+    # In a reset, for each cabinet's first message, and for all to command. A run begins without the latter, too [s].
+    longest_wait = longest_session_wait = 5.0
 
     def __init__(self, robot: Robot, config: Config) -> None:
         """Raises :class:`ConfigError` unless every arm has a cabinet and seven joints, and a gripper its package.
@@ -47,7 +50,8 @@ class FriPlant:
         if self._longest < 2.0 * self._period:
             allowed = "allowed with cabinets: two ticks of loop_rate_hz or more, such as 0.01"
             raise ConfigError(f"control.max_substep = {self._longest:g}: {allowed}")
-        self._mode, self._torque_rate_limit = CommandMode.POSITION, config.impedance.torque_rate_limit
+        self._torque_rate_limit = config.impedance.torque_rate_limit
+        self.begin(CommandMode.POSITION)
         self.grippers = self._modbus_grippers()
         self._answering: AnsweringProcess | None = None
         # The newest: when each message arrived, by the monotonic clock, and how long until its answer was sent [s].
@@ -62,9 +66,9 @@ class FriPlant:
         """Of the cabinets."""
         return [cabinet.address for cabinet in self._cabinets.values()]
 
-    def begin(self, mode: CommandMode) -> None:
-        """Commands of this ``mode`` are to come after the next :meth:`reset`."""
-        self._mode = mode
+    def begin(self, mode: CommandMode, stopped: Callable[[], bool] = lambda: False) -> None:
+        """See :meth:`SessionPlant.begin`."""
+        self._mode, self._stopped = mode, stopped
 
     def reset(self, q: Array | None = None) -> None:
         """Hear the cabinets. Raises :class:`PlantError` where one says nothing, and for ``q``: arms are not placed."""
@@ -74,27 +78,37 @@ class FriPlant:
         lines = self._lines()
         grippers = {arm: its.gripper for arm, its in self._cabinets.items() if isinstance(its.gripper, GripperIoConfig)}
         self.cell = FriCell(self._robot, [line.session.state for line in lines], self._period, self._longest, grippers)
-        self._answering = AnsweringProcess(lines)
-        for line in lines:
-            socket.close(line.file)  # the process has it
+        try:
+            self._answering = AnsweringProcess(lines)
+        finally:
+            for line in lines:
+                socket.close(line.file)  # the process has it
         self.grippers = self._modbus_grippers()
         for gripper in self.grippers.values():
             gripper.start()
-        deadline = time.monotonic() + _WAIT
         try:
-            self.due(time.monotonic())
-            while not self.cell.is_heard and time.monotonic() < deadline:
-                time.sleep(0.01)
-                self.due(time.monotonic())
-            if not self.cell.is_heard:
-                problem = self.cell.fault()
-                raise PlantError("no cabinet was heard" if problem is None else sentence(problem))
+            self._wait()
         except PlantError:
             self.close()
             raise
-        while self.cell.fault() is not None and time.monotonic() < deadline:
-            time.sleep(0.01)
+
+    def _wait(self) -> None:
+        """Wait for the cabinets. Raises :class:`PlantError` where one says nothing."""
+        waiting = CabinetWait(self._stopped)
+
+        def looked(ready: Callable[[], bool]) -> bool:
             self.due(time.monotonic())
+            return ready()
+
+        def states() -> Iterable[SessionState]:
+            return self.cell.states.values()
+
+        if not waiting.until(lambda: looked(lambda: self.cell.is_heard), states, self.longest_wait):
+            problem = self.cell.fault()
+            why = "no cabinet was heard" if problem is None else sentence(problem)
+            ended = "the wait was stopped" if waiting.was_stopped else "waited for that"
+            raise PlantError(f"{why}; {ended} after {waiting.passed:.1f} s")
+        waiting.until(lambda: looked(lambda: self.cell.fault() is None), states, self.longest_session_wait)
 
     def is_released(self) -> bool:
         """Whether no process answers the cabinets, on this computer, so that nothing moves the arms any more."""

@@ -214,14 +214,16 @@ class ArmSession:
             if message.session is Session.IDLE:
                 return None
             mirrored = message.commanded_q or message.q  # which FRI 1 expects, and FRI 2 does without
-            return FriCommand(counter, reflected, mirrored if message.version == 1 else None, io=self._outputs)
+            return FriCommand(counter, reflected, mirrored if message.version == 1 else None, io=self._io(message))
         if self._times is None:
             self._times = AnswerTimes(message.period * message.multiplier, DELAY)
         if message.session is Session.COMMANDING_WAIT or not self._begun:
-            # The first command has to equal the cabinet's own position, and the reference begins there.
+            # The first command has to equal the cabinet's own position, and the reference begins there. In a session
+            # that another client has begun, the arm is no longer where the cabinet's own motion holds it.
+            own = message.ipo_q if message.session is Session.COMMANDING_WAIT else message.commanded_q
             self._cease()
             self._begun = True
-            self.path = ReferencePath(now, np.array(message.ipo_q or message.q))
+            self.path = ReferencePath(now, np.array(own or message.q))
             self.state.rest = joints_of(self.path.rest)
             self._times.restart()
         if self.state.wanted is CommandKind.TORQUE:
@@ -234,7 +236,12 @@ class ArmSession:
             time = self._times.at(*question)
         state.answered, state.lag = max(state.answered, time), now - DELAY - time
         state.expected = self._clock.expected
-        return FriCommand(counter, reflected, joints_of(self.path.at(time)), io=self._outputs)
+        return FriCommand(counter, reflected, joints_of(self.path.at(time)), io=self._io(message))
+
+    def _io(self, message: Monitoring) -> dict[str, IoValue]:
+        """Values for the outputs that the cabinet has; others are not written."""
+        fitting = {name: message.output(name, value) for name, value in self._outputs.items()}
+        return {name: value for name, value in fitting.items() if value is not None}
 
     def _torque(self, message: Monitoring, now: float) -> FriCommand | None:
         """The newest overlay, or one that brakes, with the cabinet's own position as KUKA's example clients have it."""
@@ -248,7 +255,7 @@ class ArmSession:
         tau = np.clip(wanted, -self._torque_limit, self._torque_limit)
         self._tau_sent = np.clip(tau, self._tau_sent - change, self._tau_sent + change)
         q = message.ipo_q or message.q
-        return FriCommand(self._answers, message.counter, q, joints_of(self._tau_sent), self._outputs)
+        return FriCommand(self._answers, message.counter, q, joints_of(self._tau_sent), self._io(message))
 
 
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:

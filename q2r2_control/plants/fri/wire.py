@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from collections.abc import Container
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -91,6 +93,12 @@ class CommandKind(IntEnum):
     CARTESIAN_POSE = 4
 
 
+# Control modes of an arm, overlays of its motion, and directions of inputs and outputs, as numbers of the protocol.
+_POSITION_CONTROL, _CONTROL_MODES = 0, {CommandKind.WRENCH: 1, CommandKind.TORQUE: 2}
+_NO_OVERLAY, _JOINT_OVERLAY = 0, 1
+_IN, _OUT = 0, 1
+
+
 @dataclass(frozen=True, slots=True)
 class Monitoring:
     """One message of a cabinet. Joints are A1 .. A7 [rad, Nm]; None: the message has none."""
@@ -112,7 +120,19 @@ class Monitoring:
     safety: Safety = Safety.NORMAL
     operation: Operation = Operation.AUTOMATIC
     drives: Drives = Drives.ACTIVE
-    io: dict[str, IoValue] = field(default_factory=dict)
+    io: dict[str, IoValue] = field(default_factory=dict)  # inputs and outputs that the application registered
+    outputs: frozenset[str] = frozenset()  # those of ``io`` that a client may write
+    commanded_tau: Joints | None = None  # by the cabinet's controller, with the client's overlay; written, never read
+
+    def output(self, name: str, value: IoValue) -> IoValue | None:
+        """``value`` as the cabinet's output ``name`` takes it; None if the cabinet has no such output of that kind.
+
+        KUKA's own clients raise an exception for an output that the cabinet does not list.
+        """
+        theirs = self.io.get(name) if name in self.outputs else None
+        if theirs is None or isinstance(theirs, float) is not isinstance(value, float):
+            return None
+        return type(theirs)(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +173,7 @@ def read_monitoring(datagram: bytes) -> Monitoring:
         operation=_member(Operation, robot.operation),
         drives=_member(Drives, min(robot.drives, default=Drives.ACTIVE)),
         io=_io_of(data.io),
+        outputs=frozenset([_name_of(io.name) for io in data.io if io.direction == _OUT]),
     )
 
 
@@ -160,7 +181,7 @@ def write_monitoring(monitoring: Monitoring) -> bytes:
     """The datagram of a cabinet's message, for one that stands in for a cabinet."""
     message = MonitoringMessage()
     _set_header(message, _MONITORING, monitoring.counter, monitoring.reflected)
-    message.robot.joints, message.robot.control = JOINTS, 0
+    message.robot.joints, message.robot.control = JOINTS, _CONTROL_MODES.get(monitoring.command, _POSITION_CONTROL)
     message.robot.safety, message.robot.operation = monitoring.safety, monitoring.operation
     message.robot.drives.extend([monitoring.drives] * JOINTS)
     connection = message.connection
@@ -168,11 +189,13 @@ def write_monitoring(monitoring: Monitoring) -> bytes:
     connection.period, connection.multiplier = round(1e3 * monitoring.period), monitoring.multiplier
     message.data.stamp.sec = int(monitoring.stamp)
     message.data.stamp.nanosec = int(1e9 * (monitoring.stamp % 1.0))
-    for name in ("q", "tau", "external_tau", "commanded_q"):
+    for name in ("q", "tau", "external_tau", "commanded_q", "commanded_tau"):
         _set_joints(message.data, name, getattr(monitoring, name))
     _set_joints(message.ipo, "q", monitoring.ipo_q)
     message.ipo.command_mode = monitoring.command
-    _set_io(message.data.io, monitoring.io, direction=0)
+    message.ipo.overlay = _JOINT_OVERLAY if monitoring.command is not CommandKind.NONE else _NO_OVERLAY
+    message.ipo.tracking = float(monitoring.session is Session.COMMANDING_ACTIVE)
+    _set_io(message.data.io, monitoring.io, monitoring.outputs)
     return _datagram(message, monitoring.version)
 
 
@@ -191,7 +214,7 @@ def write_command(command: FriCommand, version: int) -> bytes:
     _set_header(message, _COMMAND, command.counter, command.reflected)
     _set_joints(message.data, "q", command.q)
     _set_joints(message.data, "tau", command.tau)
-    _set_io(message.data.io, command.io, direction=1)
+    _set_io(message.data.io, command.io, command.io)
     return _datagram(message, version)
 
 
@@ -265,12 +288,17 @@ def _member(kind: type[IntEnum], value: int) -> Any:
 def _io_of(values: Any) -> dict[str, IoValue]:
     """Values by name: booleans, numbers of bits, and analog ones."""
     kinds: tuple[Any, ...] = (lambda io: bool(io.digital), lambda io: io.digital, lambda io: io.analog)
-    return {io.name.decode(errors="replace"): kinds[io.type](io) for io in values if 0 <= io.type < len(kinds)}
+    return {_name_of(io.name): kinds[io.type](io) for io in values if 0 <= io.type < len(kinds)}
 
 
-def _set_io(message: Any, values: dict[str, IoValue], direction: int) -> None:
+@lru_cache(maxsize=64)
+def _name_of(name: bytes) -> str:
+    return name.decode(errors="replace")
+
+
+def _set_io(message: Any, values: dict[str, IoValue], outputs: Container[str]) -> None:
     for name, value in values.items():
-        io = message.add(name=name.encode(), direction=direction)
+        io = message.add(name=name.encode(), direction=_OUT if name in outputs else _IN)
         if isinstance(value, float):
             io.type, io.analog = 2, value
         else:

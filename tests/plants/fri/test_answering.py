@@ -21,7 +21,8 @@ from tests.support.headset_server import eventually
 Q = (0.0, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)
 ANSWERS = 50
 STILL, ONES = (0.0,) * 7, (1.0,) * 7
-MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.005, 1, Q)
+IO = {"Gripper.Opening": 1.0}
+MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.005, 1, Q, io=IO, outputs=frozenset(IO))
 
 
 class LongMotion(ArmSession):
@@ -39,6 +40,13 @@ class LongMotion(ArmSession):
         return self._left <= 0
 
 
+class BrokenOnTheWay(ArmSession):
+    """The process cannot read it."""
+
+    def __setstate__(self, state: object) -> None:
+        raise ValueError("it came broken")
+
+
 class Between:
     """The process, with this test as its cabinet and its loop."""
 
@@ -51,20 +59,12 @@ class Between:
         self.process = AnsweringProcess([Line(session, "127.0.0.1", file)])
         socket.close(file)
         self.states: list[SessionState] = []
-        self.cabinet.settimeout(0.2)
-        eventually(self.is_answered)  # messages that come before it has begun are dropped
         self.cabinet.settimeout(20.0)
 
     def ask(self) -> FriCommand:
         self.sent += 1
         self.cabinet.sendto(write_monitoring(replace(MONITORING, counter=self.sent)), self.address)
         return read_command(self.cabinet.recv(2000))[1]
-
-    def is_answered(self) -> bool:
-        try:
-            return self.ask().reflected == self.sent
-        except TimeoutError:
-            return False
 
     def hear(self) -> bool:
         self.states += self.process.receive()[0]
@@ -85,6 +85,15 @@ def between_of(session: ArmSession) -> Iterator[Between]:
 def between() -> Iterator[Between]:
     with between_of(ArmSession("left", "cabinet")) as made:
         yield made
+
+
+def test_it_has_begun_as_soon_as_the_loop_has_it(between: Between) -> None:
+    assert between.ask().reflected == 1, "messages that came before it had begun would be dropped"
+
+
+def test_a_process_that_cannot_begin_says_why() -> None:
+    with open_socket("127.0.0.1", 0) as ours, pytest.raises(PlantError, match="answered no more: it came broken"):
+        AnsweringProcess([Line(BrokenOnTheWay("left", "cabinet"), "127.0.0.1", ours.fileno())])
 
 
 def test_the_loop_gets_the_state_after_each_message_and_an_answer_goes_by_what_was_sent_before_it(

@@ -8,10 +8,12 @@ from dataclasses import replace
 
 import pytest
 
+from q2r2_control.errors import ConfigError
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm, Trip
 from q2r2_control.plants.fri.wire import (
     CommandKind,
     FriCommand,
+    IoValue,
     Joints,
     Monitoring,
     Operation,
@@ -186,6 +188,57 @@ def test_answers_that_did_not_come_count_as_missed_where_the_client_goes_on_and_
     assert cabinet.missed == 6  # with the last message of commanding()
     run(cabinet, 20, lambda message: None)
     assert (cabinet.missed, cabinet.trips) == (6, [Trip.LATE])
+
+
+def test_the_cabinets_own_position_is_the_posture_that_it_holds_wherever_a_client_has_led_the_arm() -> None:
+    cabinet, client = commanding(replace(SETTINGS, acceleration=(1e3,) * 7))
+    ways = iter(range(1, 101))
+    message = run(cabinet, 100, lambda message: client.answer(message, moved(1e-3 * next(ways))))
+    assert (message.ipo_q, message.q) == (HOME, moved(0.1))
+    cabinet.stop()
+    cabinet.start_overlay()
+    message = run(cabinet, 2, client.answer)
+    assert (message.session, message.ipo_q) == (Session.COMMANDING_ACTIVE, moved(0.1)), "the next session begins there"
+
+
+@pytest.mark.parametrize(
+    ("io", "trips", "outputs"),
+    [
+        ({"opening": 0.5}, [], {"opening": 0.5}),
+        ({"elsewhere": 0.5}, [Trip.OUTPUT], {"opening": 1.0}),
+        ({"measured": 0.5}, [Trip.OUTPUT], {"opening": 1.0}),
+        ({"opening": True}, [Trip.OUTPUT], {"opening": 1.0}),
+    ],
+    ids=["listed", "not listed", "an input", "another kind"],
+)
+def test_an_answer_may_write_only_outputs_that_the_cabinet_lists(
+    io: dict[str, IoValue], trips: list[Trip], outputs: dict[str, IoValue]
+) -> None:
+    cabinet, client = Cabinet(SETTINGS, StillArm(HOME), {"opening": 1.0}), Client()
+    cabinet.inputs["measured"] = 1.0
+    cabinet.start_overlay()
+    run(cabinet, 60, client.answer)
+    message = run(cabinet, 1, lambda message: replace(client.answer(message), io=io))
+    assert (cabinet.trips, cabinet.outputs) == (trips, outputs)
+    assert (message.io, message.outputs) == ({"measured": 1.0, **outputs}, {"opening"})
+
+
+def test_torques_have_to_come_as_often_as_sunrise_asks_for() -> None:
+    with pytest.raises(ConfigError, match="answered every 6 ms: allowed with torques: 5 ms or less"):
+        replace(TORQUE, period=0.003, multiplier=2)
+
+
+def test_torques_are_not_overlaid_before_the_load_data_explain_what_the_arm_bears() -> None:
+    arm, client = StillArm(HOME), Client()
+    arm.external_tau = (0.0, 2.1, *(0.0,) * 5)
+    cabinet = Cabinet(TORQUE, arm)
+    cabinet.start_overlay()
+    tau = (1.0,) * 7
+    assert run(cabinet, 300, lambda message: client.answer(message, tau=tau)).session is Session.COMMANDING_WAIT
+    arm.external_tau = (0.0, -1.9, *(0.0,) * 5)
+    assert run(cabinet, 10, client.answer).session is Session.COMMANDING_WAIT, "nor before torques come"
+    message = run(cabinet, 2, lambda message: client.answer(message, tau=tau))
+    assert (message.session, message.commanded_tau) == (Session.COMMANDING_ACTIVE, tau)
 
 
 def test_after_a_stop_the_overlay_has_to_be_started_again_and_the_safety_stop_be_over() -> None:

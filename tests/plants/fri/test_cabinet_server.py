@@ -82,7 +82,8 @@ class Answered:
         self._client.bind(("127.0.0.1", 0))
         self._client.setblocking(False)
         address = self._client.getsockname()
-        self.server = CabinetServer(SimulatedArms(robot, config), settings, {"left": address}, {}, network)
+        origin = {"left": ("127.0.0.1", 0)}
+        self.server = CabinetServer(SimulatedArms(robot, config), settings, origin, {"left": address}, {}, network)
         (self.cabinet,) = self.server.cabinets.values()
         self.cabinet.start_overlay()
 

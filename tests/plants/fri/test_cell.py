@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import ReasonKind
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.answers import ReferencePath
-from q2r2_control.plants.fri.cabinet import Trip
+from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import SimulatedArm, SimulatedArms
 from q2r2_control.plants.fri.wire import Joints, Session, joints_of
 from q2r2_control.plants.mujoco import MujocoPlant
@@ -84,6 +85,22 @@ def test_missing_messages_are_said_once_a_run_for_each_cabinet(
         pipeline.run(1.0, realtime=False)
         lines = [entry.getMessage() for entry in caplog.records]
         assert sorted(line.partition(":")[0] for line in lines if "10 messages lost and 0 unreadable" in line) == said
+
+
+def test_a_cabinet_without_the_grippers_output_is_named_once_and_gets_no_write(
+    config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
+    pipeline = make_loop(config, grippers=dict.fromkeys(SIDES, GripperIoConfig(output="Gripper.Opening")))
+    assert isinstance(pipeline.plant, VirtualCabinets)
+    whole = pipeline.plant.cabinets["left"]
+    pipeline.plant.cabinets["left"] = Cabinet(whole.settings, whole.arm)
+    plant = started(pipeline)
+    pipeline.run(1.0, realtime=False)
+    told = [entry.getMessage() for entry in caplog.records if "Gripper.Opening" in entry.getMessage()]
+    lacks = "has no analog output Gripper.Opening, so that the gripper is not commanded"
+    assert told == [f"left: cabinet {lacks}; outputs that its application registers: none"]
+    assert trips(plant) == []
+    assert all(cabinet.session is Session.COMMANDING_ACTIVE for cabinet in plant.cabinets.values())
 
 
 @pytest.mark.parametrize(
@@ -183,6 +200,41 @@ def test_arms_go_on_although_each_tick_takes_longer_than_the_loop_allows_for(con
     assert ReasonKind.FRI_OVERTAKEN not in {event.reason.root.kind for event in summary.events}
     for arm in SIDES:
         assert summary.arms[arm].engaged_s > 1.5
+
+
+def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_afterwards(config: Config) -> None:
+    blocks, begins_within, period = 0.2, 0.015, 0.005
+    pipeline = make_loop(config, (period, period))
+    plant = started(pipeline)
+    sent: dict[str, list[tuple[float, Joints]]] = {arm: [] for arm in SIDES}
+    plant.on_message = lambda arm, t: sent[arm].append((t, plant.cabinets[arm].commanded))
+    newest: list[Tick] = []  # before the tick that blocks
+    decelerations: list[np.ndarray] = []
+
+    def block(tick: Tick) -> None:
+        if plant.thinking > 0.0:
+            plant.thinking = 0.0
+            pipeline.freeze(blocks)
+        elif not newest and np.abs(tick.reference.v).max() > 0.4:
+            newest.append(tick)
+            decelerations.append(np.array(tick.command.deceleration))
+            plant.thinking = blocks
+
+    pipeline.listeners.append(block)
+    summary = pipeline.run(3.0, realtime=False)
+    assert trips(plant) == []
+    begin, rest = newest[0].now, float((np.abs(newest[0].reference.v) / decelerations[0]).max())
+    assert begins_within + rest < 0.8 * blocks
+    for arm in SIDES:
+        speeds = {t: np.subtract(now, before) / period for (_, before), (t, now) in pairwise(sent[arm])}
+        fastest = [float(np.abs(v).max()) for t, v in speeds.items() if begin + begins_within < t < begin + blocks]
+        assert (np.diff(fastest) < 1e-6).all(), "it gets slower from then on"
+        late = [
+            np.abs(v).max() for t, v in speeds.items() if begin + begins_within + period + rest < t < begin + blocks
+        ]
+        assert len(late) > 10
+        assert max(late) < 1e-6, "and stands still for the rest of the time"
+        assert summary.arms[arm].engaged_s > 2.0
 
 
 def test_a_loop_that_is_always_too_late_says_so(config: Config) -> None:

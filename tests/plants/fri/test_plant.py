@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import threading
 
@@ -14,6 +15,7 @@ from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.plants.fri.wire import Session
 from q2r2_control.robot.robot import Robot
+from q2r2_control.types import CommandMode
 from tests.plants.conftest import hold
 from tests.plants.fri.conftest import PATIENCE
 from tests.plants.fri.waiting_cabinets import waiting_cabinets
@@ -60,12 +62,22 @@ def test_a_gripper_by_modbus_gets_its_openings_and_is_measured(robot: Robot, fri
         assert simulated.activations == 1
 
 
-def test_without_a_cabinet_the_run_says_which_one_and_where(robot: Robot, fri_config: Config, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr("q2r2_control.plants.fri.plant._WAIT", 0.1)
+def test_without_a_cabinet_the_run_says_which_one_and_where(robot: Robot, fri_config: Config) -> None:
     plant = FriPlant.from_config(robot, fri_config)
+    plant.longest_wait = 0.1
     port = fri_config.fri["left"].port
-    with pytest.raises(PlantError, match=f"left: no FRI message from cabinet 127.0.0.1 on port {port}"):
+    with pytest.raises(PlantError, match=f"left: no FRI message from cabinet 127.0.0.1 on port {port}; waited"):
         plant.reset()
+    assert plant.is_released()
+
+
+def test_a_wait_for_a_cabinet_that_is_stopped_says_so_and_releases_the_ports(robot: Robot, fri_config: Config) -> None:
+    plant = FriPlant.from_config(robot, fri_config)
+    plant.longest_wait, stopped = math.inf, iter((False, False, True))
+    plant.begin(CommandMode.POSITION, lambda: next(stopped, True))
+    with pytest.raises(PlantError, match=r"left: no FRI message .*; the wait was stopped after"):
+        plant.reset()
+    assert plant.is_released()
 
 
 def test_a_port_that_is_taken_is_named(robot: Robot, fri_config: Config) -> None:

@@ -12,9 +12,11 @@ from q2r2_control.events import ReasonKind
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
 from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand
-from q2r2_control.plants.fri.wire import CommandKind, FriCommand, Monitoring, Safety, Session, write_monitoring
+from q2r2_control.plants.fri.wire import CommandKind, FriCommand, Joints, Monitoring, Safety, Session, write_monitoring
 from q2r2_control.wording import sentence
 from tests.plants.fri.asking_cabinet import ACTIVE, IPO, MONITORING, WAITING, Cabinet, Q
+
+FAR = (0.3, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)  # where a client has led the arm
 
 
 def test_an_idle_cabinet_gets_no_answer_and_one_that_monitors_gets_no_position() -> None:
@@ -30,13 +32,35 @@ def test_fri_1_gets_the_commanded_position_mirrored() -> None:
     assert answer.q == IPO
 
 
-@pytest.mark.parametrize("message", [WAITING, ACTIVE])
-def test_the_first_command_is_the_cabinets_own_position(message: Monitoring) -> None:
+@pytest.mark.parametrize(
+    ("message", "q"),
+    [
+        pytest.param(WAITING, IPO, id="waiting"),
+        pytest.param(ACTIVE, Q, id="already active"),
+        pytest.param(replace(ACTIVE, version=1, commanded_q=FAR), FAR, id="already active, FRI 1"),
+    ],
+)
+def test_the_first_command_is_where_the_cabinet_holds_the_arm_or_where_another_client_has_left_it(
+    message: Monitoring, q: Joints
+) -> None:
     cabinet = Cabinet()
-    cabinet.ask(MONITORING)
+    cabinet.ask(replace(MONITORING, version=message.version))
     answer = cabinet.ask(message)
     assert answer is not None
-    assert answer.q == pytest.approx(IPO, abs=1e-15)
+    assert answer.q == pytest.approx(q, abs=1e-15)
+
+
+@pytest.mark.parametrize("message", [MONITORING, ACTIVE], ids=["monitoring", "active"])
+def test_only_outputs_that_the_cabinet_has_are_written_as_it_takes_them(message: Monitoring) -> None:
+    cabinet, ones = Cabinet(), (1.0,) * 7
+    wanted = {"opening": 0.25, "open": True, "light": False, "elsewhere": 0.5, "measured": 0.5, "digital": 0.5}
+    cabinet.ask(WAITING)
+    cabinet.session.follow(ArmCommand(cabinet.now, cabinet.now, cabinet.now + 0.002, IPO, (0.0,) * 7, ones, wanted))
+    io = {"opening": 1.0, "open": False, "light": 7, "measured": 1.0, "digital": False}
+    answer = cabinet.ask(replace(message, io=io, outputs=frozenset(io) - {"measured"}))
+    assert answer is not None
+    assert answer.io == {"opening": 0.25, "open": True, "light": 0}
+    assert isinstance(answer.io["open"], bool)
 
 
 def test_every_multiplier_th_message_is_answered() -> None:

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.errors import ProtocolError
+from q2r2_control.plants.fri.schema import MonitoringMessage
 from q2r2_control.plants.fri.wire import (
     CommandKind,
     Drives,
@@ -46,6 +47,8 @@ MONITORING = Monitoring(
     operation=Operation.T1,
     drives=Drives.TRANSITIONING,
     io={"gripper_open": True, "width": 0.25, "status": 3},
+    outputs=frozenset({"gripper_open"}),
+    commanded_tau=tuple(11.0 * value for value in Q),
 )
 
 
@@ -85,9 +88,22 @@ def test_what_is_written_is_read_again(version: int) -> None:
     sent = dataclasses.replace(MONITORING, version=version)
     datagram = write_monitoring(sent)
     assert version_of(datagram) == version
-    assert read_monitoring(datagram) == sent
+    assert read_monitoring(datagram) == dataclasses.replace(sent, commanded_tau=None), "which no client needs"
     command = FriCommand(4, 7, q=Q, tau=(1.0,) * 7, io={"gripper_close": False, "force": 0.5})
     assert read_command(write_command(command, version)) == (version, command)
+
+
+@pytest.mark.parametrize(
+    ("command", "control", "overlay"),
+    [(CommandKind.NONE, 0, 0), (CommandKind.POSITION, 0, 1), (CommandKind.WRENCH, 1, 1), (CommandKind.TORQUE, 2, 1)],
+)
+def test_a_cabinet_says_in_which_control_mode_it_lets_a_client_overlay(
+    command: CommandKind, control: int, overlay: int
+) -> None:
+    message = MonitoringMessage.FromString(
+        write_monitoring(dataclasses.replace(MONITORING, version=1, command=command))
+    )
+    assert (message.robot.control, message.ipo.overlay, message.ipo.tracking) == (control, overlay, 1.0)
 
 
 def test_the_frame_of_fri_2_is_a_length_and_the_crc_of_zlib() -> None:

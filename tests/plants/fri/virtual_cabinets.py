@@ -12,7 +12,7 @@ from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.events import Reason
 from q2r2_control.plants.base import check_command
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
-from q2r2_control.plants.fri.cabinet_server import SimulatedArms
+from q2r2_control.plants.fri.cabinet_server import SimulatedArms, outputs_of
 from q2r2_control.plants.fri.cell import FriCell
 from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
@@ -52,7 +52,11 @@ class VirtualCabinets:
         self._jitter, self._loss = jitter, loss
         self._simulation, self._grippers = arms, grippers or {}
         self.cabinets = {
-            arm: Cabinet(its, arms.arms[arm] if arms else StillArm(tuple(start[robot.arms[arm].joints])))
+            arm: Cabinet(
+                its,
+                arms.arms[arm] if arms else StillArm(tuple(start[robot.arms[arm].joints])),
+                outputs_of(self._grippers.get(arm)),
+            )
             for arm, its in settings.items()
         }
         rates = np.linspace(1.0 - 0.5 * drift, 1.0 + 0.5 * drift, len(settings))
@@ -63,7 +67,7 @@ class VirtualCabinets:
         self.thinking = 0.0  # time that passes between the beginning of a tick and its command [s]
         self._mode = CommandMode.POSITION
 
-    def begin(self, mode: CommandMode) -> None:
+    def begin(self, mode: CommandMode, stopped: Callable[[], bool]) -> None:
         self._mode = mode
 
     def reset(self, q: Array | None = None) -> None:
@@ -142,7 +146,7 @@ class VirtualCabinets:
         self.on_message(arm, self.now)
         message = cabinet.send(self.now)
         if cabinet.session is Session.COMMANDING_ACTIVE:
-            self.heard[arm].append(np.array(message.ipo_q if self._mode is CommandMode.POSITION else message.q))
+            self.heard[arm].append(np.array(cabinet.commanded if self._mode is CommandMode.POSITION else message.q))
         elif self.heard[arm] and self.heard[arm][-1] is not None:
             self.heard[arm].append(np.full(7, np.nan))
         self._at(self.now + cabinet.settings.period * self._rates[arm], self._send, arm)

@@ -40,9 +40,10 @@ def waiting_cabinets(robot: Robot, config: Config, version: int = 2) -> Iterator
                 break
         return None
 
-    def serve(cabinet: Cabinet, port: int) -> None:
+    def serve(cabinet: Cabinet, address: str, port: int) -> None:
         due = time.monotonic()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+            opened.bind((address, 0))
             opened.connect(("127.0.0.1", port))
             opened.settimeout(_LOOKS)
             while not done.wait(max(due - time.monotonic(), 0.0)):
@@ -55,7 +56,8 @@ def waiting_cabinets(robot: Robot, config: Config, version: int = 2) -> Iterator
                 else:
                     due = time.monotonic()
 
-    threads = [threading.Thread(target=serve, args=(made[arm], its.port)) for arm, its in config.fri.items()]
+    served = [(made[arm], its.address, its.port) for arm, its in config.fri.items()]
+    threads = [threading.Thread(target=serve, args=its) for its in served]
     for thread in threads:
         thread.start()
     try:

@@ -1,0 +1,78 @@
+"""A wait for cabinets, by a clock of the test's own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from q2r2_control.plants.fri.session_state import SessionState
+from q2r2_control.plants.fri.waiting import CabinetWait, what_is_missing
+from q2r2_control.plants.fri.wire import Session
+from tests.plants.fri.asking_cabinet import ACTIVE, MONITORING
+
+SILENT = SessionState("left", "cabinet 192.0.2.1 on port 30200")
+
+
+class Clock:
+    """Every look at it takes a second."""
+
+    now = -1.0
+
+    def __call__(self) -> float:
+        self.now += 1.0
+        return self.now
+
+
+@pytest.fixture(autouse=True)
+def _no_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("q2r2_control.plants.fri.waiting.time.sleep", lambda seconds: None)
+
+
+def waited(longest: float, ready_after: float = math.inf, stopped_after: float = math.inf) -> tuple[bool, float]:
+    clock = Clock()
+    waiting = CabinetWait(lambda: clock.now >= stopped_after, clock)
+    return waiting.until(lambda: clock.now >= ready_after, lambda: [SILENT], longest), clock.now
+
+
+def test_a_wait_lasts_until_cabinets_are_ready_or_time_is_over_or_somebody_stops_it() -> None:
+    assert waited(math.inf, ready_after=70.0) == (True, 70.0)
+    assert waited(60.0) == (False, 60.0)
+    assert waited(math.inf, stopped_after=5.0) == (False, 5.0)
+
+
+def test_a_wait_says_for_what_and_every_ten_seconds_for_how_long(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    waited(34.0)
+    lines = [entry.getMessage() for entry in caplog.records]
+    assert [line.partition(":")[0] for line in lines] == ["waits", *(f"waits still, for {t} s" for t in (13, 23, 33))]
+    assert "left: no FRI message from cabinet 192.0.2.1 on port 30200 of this computer; start its FRI" in lines[0]
+
+
+def test_cabinets_that_are_there_soon_need_no_line(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    waited(math.inf, ready_after=2.0)
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize(
+    ("session", "told"),
+    [
+        (
+            Session.MONITORING_WAIT,
+            "in monitoring wait, connection excellent, drives active; the connection is not good",
+        ),
+        (Session.MONITORING_READY, "let its application start the overlay"),
+        (Session.COMMANDING_WAIT, "whether the load data are those of the tool"),
+    ],
+)
+def test_what_a_person_has_to_do_goes_by_the_session(session: Session, told: str) -> None:
+    state = replace(SILENT, newest=replace(MONITORING, session=session), arrival=10.0)
+    assert told in what_is_missing(state, 10.0)
+    assert "no FRI message" in what_is_missing(state, 11.0)
+
+
+def test_a_message_that_cannot_be_read_is_told_as_it_is() -> None:
+    state = replace(SILENT, newest=ACTIVE, arrival=10.0, problem="FRI 2 datagram whose checksum is wrong")
+    assert what_is_missing(state, 11.0).endswith("30200: FRI 2 datagram whose checksum is wrong")
