@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.config.control import ControllerSettings, check_priority
-from q2r2_control.control.geometry.collision import CollisionModel, collision_model_of, turning_bodies
+from q2r2_control.control.geometry.collision import CollisionModel, Pairs, collision_model_of, turning_bodies
+from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import with_rounded_boxes
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_data import Approach, SafetyData, SafetyModel
@@ -70,8 +71,15 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
         ),
         min_distance=min_distance,
         arm=arm,
+        of_two_arms=_of_two_arms(collision.pairs),
     )
     return KernelModel(safety, task_model_of(robot, settings, collision.chain))
+
+
+def _of_two_arms(pairs: Pairs) -> IntArray:
+    """Which pairs (p,) have two bodies that move each by joints of its own."""
+    own = (pairs.carried == 0) & (pairs.sign > 0).any(axis=1) & (pairs.sign < 0).any(axis=1)
+    return own.astype(np.int64)
 
 
 def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) -> None:

@@ -13,8 +13,9 @@ from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.safety.joint_limits import ACCELERATION, NO_LIMIT
+from q2r2_control.control.safety.reference_history import remember
 from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
-from q2r2_control.control.safety.speed_bound import fastest_approach, fastest_body
+from q2r2_control.control.safety.speed_bound import fastest_approach, fastest_body, speed_of
 from q2r2_control.control.safety.stop_certificate import certify, is_too_close
 from q2r2_control.control.safety.stop_rollout import SHAPES, TOGETHER, brake, stay_with_stop, write_stop
 from q2r2_control.types import Array
@@ -47,6 +48,7 @@ def apply_safety_filter(
             outcome = _largest_certified(model, data, h)
     if outcome == STOPPED:
         brake(q, v, data.certified, h, candidate.q, candidate.v)
+    remember(data.history, q, v, candidate.v, h)
     for j in range(q.shape[0]):
         # Rounding of a difference over a tiny h may exceed the limit that the velocities keep.
         limit = model.limits.acceleration[j]
@@ -222,7 +224,12 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
         far = distance[p] >= least
         if far and distance[p] > always + horizon * fastest:
             continue  # whichever its bodies are, without a look at them
-        relevant = always + horizon * fastest_approach(data.velocities, pairs.first[p], pairs.second[p])
+        first, second = pairs.first[p], pairs.second[p]
+        if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:  # either may stop alone
+            approach_speed = speed_of(data.velocities, first) + speed_of(data.velocities, second)
+        else:
+            approach_speed = fastest_approach(data.velocities, first, second)
+        relevant = always + horizon * approach_speed
         if far and distance[p] > relevant:
             continue
         distance[p] = measure(collision, data.collision, p)

@@ -60,6 +60,7 @@ class VirtualCabinets:
         self.on_message: Callable[[str, float], None] = lambda arm, t: None
         self.asleep_until = -1.0  # nothing of this computer's is done before [s]
         self.stands_until = dict.fromkeys(self.cabinets, -1.0)  # a cabinet does nothing before [s]
+        self.unplugged: set[str] = set()  # cabinets whose cable is pulled: nothing goes either way
         self.thinking = 0.0  # time that passes between the beginning of a tick and its command [s]
         self._mode = CommandMode.POSITION
 
@@ -146,12 +147,12 @@ class VirtualCabinets:
         elif self.heard[arm] and self.heard[arm][-1] is not None:
             self.heard[arm].append(np.full(7, np.nan))
         self._at(self.now + cabinet.settings.period * self._rates[arm], self._send, arm)
-        if self._random.random() >= self._loss:
+        if self._random.random() >= self._loss and arm not in self.unplugged:
             self._at(max(self.now + self._late(), self.asleep_until), self._receive, arm, write_monitoring(message))
 
     def _receive(self, arm: str, datagram: bytes) -> None:
         answer = self.answer(arm, datagram)
-        if answer is not None and self._random.random() >= self._loss:
+        if answer is not None and self._random.random() >= self._loss and arm not in self.unplugged:
             self._at(self.now + self._late(), self.cabinets[arm].receive, answer)
 
     def answer(self, arm: str, datagram: bytes) -> bytes | None:
