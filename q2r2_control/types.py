@@ -294,3 +294,18 @@ class ArmTarget:
     def command_for(self, tool: pin.SE3) -> pin.SE3:
         """The controller's target that brings the tool to ``tool``, world frame."""
         return tool if self.offset is None else moved_by(tool, -self.offset)
+
+
+@dataclass(frozen=True, slots=True)
+class ArmTiming:
+    """What is known of when an arm does what the reference says, all in [s]."""
+
+    behind: float  # the reference, by the newest message of the arm
+    silent: float  # time since that message
+    period: float  # between its messages, as a rule
+    noise: float = 0.0  # of ``behind``
+
+    @property
+    def lag(self) -> float:
+        """How far behind the arm may be by now: a message that is missing may say that the arm stands still."""
+        return self.behind + max(self.silent - self.period, 0.0)

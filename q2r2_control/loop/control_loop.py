@@ -12,15 +12,17 @@ import pinocchio as pin
 from q2r2_control.compliance.admittance import estimate_wrench
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.safety.reference_history import LONGEST_WINDOW
 from q2r2_control.drives.base import Drive, DriveReport
 from q2r2_control.events import Reason
+from q2r2_control.supervision.arm_skew import skew_window
 from q2r2_control.supervision.gripper_limiter import REMEMBERED, STALL, GraspWatch, GripperLimiter
 from q2r2_control.supervision.joint_watch import ExternalArms, WatchSettings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.haptics import ArmCondition
-from q2r2_control.types import Array, Command, LimitKind, Reference, RobotState, StepReport
+from q2r2_control.types import ArmTiming, Array, Command, LimitKind, Reference, RobotState, StepReport
 
 _PROVEN = Phase.ACTIVE, Phase.BRAKING  # in other phases no opening of a gripper is proven
 
@@ -97,6 +99,15 @@ class ControlLoop:
         until they rest.
         """
         self.supervisor.update_state(state, now, passed, lost)
+
+    def watch_skew(self, timings: Mapping[str, ArmTiming], lead: float, now: float) -> None:
+        """Let supervision compare arms that follow the reference each on its own, before a step and an activation.
+
+        ``lead``: from where they are led to the end of the newest step [s]. They are kept apart for all that they may
+        be apart in time.
+        """
+        self.controller.allow_skew(min(skew_window(timings, lead), LONGEST_WINDOW))
+        self.supervisor.skew.observe(timings, now)
 
     def activate(self, state: RobotState, now: float) -> None:
         """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`Q2R2Error`."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -60,14 +60,12 @@ class Case:
     def __init__(
         self,
         case: str,
-        arm: str,
         speed: float,
-        direction: float,
         config: Config | None = None,
         period: float = 0.005,
         apart: float = 0.2,
     ) -> None:
-        """``direction``: 1.0 to the left. The ``speed`` [m/s] of the tools is asked for in mid-swing."""
+        """The ``speed`` [m/s] of the tools is asked for in mid-swing; to the left, where the left arm goes in front."""
         config = config or load_config("config/dual_iiwa7_fri.yaml")
         robot = Robot.from_config(config)
         start = side_by_side(config, robot, apart)
@@ -75,12 +73,12 @@ class Case:
         rate, longest = config.nominal_rate_hz, config.control.max_substep
         self.plant = VirtualCabinets(robot, settings, start, 1.0 / rate, longest)
         frequency = speed / (2.0 * math.pi * _AMPLITUDE)
-        path = HandTrajectory(lambda t, f: _swing(t, f, direction), lambda t, f: _swing(t, f, direction))
+        path = HandTrajectory(_swing, _swing)
         hands = ScriptedInput(path, frequency_hz=frequency)
         self.loop = FreezingLoop(config, robot, hands, self.plant)
         self.loop.listeners.append(self._look)
         self.plant.on_message = lambda arm, t: self._measure(t)
-        self.robot, self._case, self._arm = robot, case, arm
+        self.robot, self._case, self._arm = robot, case, "left"
         self._happens = START + math.ceil(frequency) / frequency
         self._kept = np.array(self.loop.controller.kept_distances)
         self._between = np.array([i for i in range(len(self._kept)) if _moves_both(robot, i)])
@@ -93,9 +91,7 @@ class Case:
         for cabinet in self.plant.cabinets.values():
             cabinet.start_overlay()
         summary = self.loop.run(self._happens + duration, realtime=False)
-        self.outcome.events = [
-            f"{event.t - self._happens:.3f} s: {sentence(event.reason)}" for event in summary.events
-        ]
+        self.outcome.events = [f"{event.t - self._happens:.3f} s: {sentence(event.reason)}" for event in summary.events]
         self.outcome.error = math.sqrt(np.mean(np.square(self._errors)))
         return self.outcome
 
@@ -109,8 +105,16 @@ class Case:
             if tick.t > self._happens - 0.4:
                 for arm, target in tick.targets.items():
                     if target.command is not None:
-                        self._errors.append(float(np.linalg.norm(target.command.translation - tick.tools[arm].translation)))
-            J = pin.computeFrameJacobian(self.robot.model, self.robot.model.createData(), tick.state.q, self.robot.arms["left"].frame_id, pin.LOCAL_WORLD_ALIGNED)
+                        self._errors.append(
+                            float(np.linalg.norm(target.command.translation - tick.tools[arm].translation))
+                        )
+            J = pin.computeFrameJacobian(
+                self.robot.model,
+                self.robot.model.createData(),
+                tick.state.q,
+                self.robot.arms["left"].frame_id,
+                pin.LOCAL_WORLD_ALIGNED,
+            )
             found.speed = max(found.speed, float(np.linalg.norm(J[:3] @ tick.state.v)))
         if self._case == "answers 0.25 s apart":
             for pause in (0.36, 0.24, 0.12):
@@ -145,38 +149,36 @@ class Case:
 def _moves_both(robot: Robot, pair: int) -> bool:
     """Whether the bodies of a pair are parts of different arms."""
     geometry, model = robot.collision_model, robot.model
-    joints = robot.arms["left"].joints, robot.arms["right"].joints
-    pair = geometry.collisionPairs[pair]
+    bodies = geometry.collisionPairs[pair].first, geometry.collisionPairs[pair].second
     owners = []
-    for body in (pair.first, pair.second):
-        chain = model.supports[geometry.geometryObjects[body].parentJoint]
-        owners.append({side for side, its in enumerate(joints) for joint in chain if joint and model.idx_vs[joint] in its})
+    for body in bodies:
+        moving = {model.idx_vs[joint] for joint in model.supports[geometry.geometryObjects[body].parentJoint] if joint}
+        owners.append({arm for arm, its in robot.arms.items() if moving.intersection(its.joints)})
     return bool(owners[0] and owners[1] and not owners[0] & owners[1])
 
 
-def _swing(t: float, frequency: float, direction: float) -> tuple[Array, Array]:
+def _swing(t: float, frequency: float) -> tuple[Array, Array]:
     """Sidewards, to and fro; it gathers speed in its first second."""
     phase = 2.0 * math.pi * frequency * max(t - START, 0.0)
     share = min(max(t - START, 0.0), 1.0)
-    return np.array([0.0, direction * share * _AMPLITUDE * math.sin(phase), 0.0]), np.zeros(3)
+    return np.array([0.0, share * _AMPLITUDE * math.sin(phase), 0.0]), np.zeros(3)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--apart", type=float, default=0.2)
-    parser.add_argument("--period", type=float, default=5.0)
-    parser.add_argument("--speeds", type=float, nargs="*", default=[0.25, 0.5, 0.8])
+    parser.add_argument("--apart", type=float, default=0.15, help="the tools at the start [m]")
+    parser.add_argument("--period", type=float, default=5.0, help="of the cabinets' messages [ms]")
+    parser.add_argument("--speeds", type=float, nargs="*", default=[0.25, 0.5, 0.8], help="of the tools [m/s]")
     given = parser.parse_args()
-    print(f"{'case':22}{'asked':>7}{'speed':>7}{'error':>8}{'reference':>11}{'measured':>10}{'margin':>9}{'rest':>7}")
+    names = ("speed", "error", "reference", "measured", "margin")
+    print(f"{'case':22}{'asked':>7}" + "".join(f"{name:>10}" for name in names) + f"{'rest':>8}")
     for speed in given.speeds:
         for case in CASES:
-            for arm, direction in (("left", 1.0),):
-                found = Case(case, arm, speed, direction, period=1e-3 * given.period, apart=given.apart).run()
-                print(
-                    f"{case:22}{arm:6}{speed:5.2f} {found.speed:6.2f}{1e3 * found.error:8.2f}{1e3 * found.reference:10.1f}"
-                    f"{1e3 * found.measured:10.1f}{1e3 * found.margin:9.1f}{found.rest:7.3f}", [event for event in found.events if not event.startswith("-")][:2],
-                    flush=True,
-                )
+            found = Case(case, speed, period=1e-3 * given.period, apart=given.apart).run()
+            lengths = (found.error, found.reference, found.measured, found.margin)
+            figures = "".join(f"{1e3 * value:10.1f}" for value in lengths)
+            after = [event for event in found.events if not event.startswith("-")]
+            print(f"{case:22}{speed:7.2f}{found.speed:10.2f}{figures}{found.rest:8.3f}  {after[:1]}", flush=True)
 
 
 if __name__ == "__main__":

@@ -14,10 +14,10 @@ from q2r2_control.plants.base import check_command
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
 from q2r2_control.plants.fri.cabinet_server import SimulatedArms
 from q2r2_control.plants.fri.cell import FriCell
-from q2r2_control.plants.fri.session import ArmSession, follow
+from q2r2_control.plants.fri.session import ArmSession, answer, follow
 from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Command, CommandMode, RobotState
+from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 
 _BEGIN = -0.1  # of the cabinets [s]
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
@@ -88,6 +88,12 @@ class VirtualCabinets:
         self._pass(now)
         return self.cell.due(now)
 
+    def timings(self) -> dict[str, ArmTiming]:
+        return self.cell.timings()
+
+    def lead(self) -> float:
+        return self.cell.lead()
+
     def fault(self) -> Reason | None:
         return self.cell.fault()
 
@@ -157,6 +163,6 @@ class VirtualCabinets:
 
     def answer(self, arm: str, datagram: bytes) -> bytes | None:
         """A datagram as the process that answers takes it."""
-        answer = self.lines[arm].answer(datagram, self.now)
+        reply = answer(self.lines, arm, datagram, self.now)
         self.cell.update(copy(self.lines[arm].state))
-        return answer
+        return reply
