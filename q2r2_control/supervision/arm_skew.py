@@ -47,7 +47,7 @@ class SkewWatch:
         self._last = max(lags, key=lambda arm: lags[arm], default="")
         self._skew = lags[self._last] - min(lags.values()) if lags else 0.0
         self.holds = self._skew > self._allowed or self._one_is_silent(timings)
-        if not self.holds:
+        if not self.holds or self._together == math.inf:
             self._together = now
 
     def _one_is_silent(self, timings: Mapping[str, ArmTiming]) -> bool:
