@@ -300,7 +300,7 @@ class ArmTarget:
 class ArmTiming:
     """What is known of when an arm does what the reference says, all in [s]."""
 
-    behind: float  # the reference, by the newest message of the arm
+    behind: float | None  # the reference, by the newest message of the arm; None: nobody tells, so that it is measured
     silent: float  # time since that message
     period: float  # between its messages, as a rule
     noise: float = 0.0  # of ``behind``
@@ -308,4 +308,4 @@ class ArmTiming:
     @property
     def lag(self) -> float:
         """How far behind the arm may be by now: a message that is missing may say that the arm stands still."""
-        return self.behind + max(self.silent - self.period, 0.0)
+        return (self.behind or 0.0) + max(self.silent - self.period, 0.0)

@@ -18,6 +18,7 @@ from q2r2_control.events import Reason
 from q2r2_control.supervision.arm_skew import skew_window
 from q2r2_control.supervision.gripper_limiter import REMEMBERED, STALL, GraspWatch, GripperLimiter
 from q2r2_control.supervision.joint_watch import ExternalArms, WatchSettings
+from q2r2_control.supervision.measured_lags import MeasuredLags
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
@@ -79,6 +80,8 @@ class ControlLoop:
         self._still: Mapping[str, MovingObstacle] = {}  # obstacles that the drive was told of
         self.holding: dict[str, bool] = {}  # of each arm that has an object, whether its gripper holds it
         self.granted_openings: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and granted
+        self._lags = MeasuredLags(robot)
+        self._untold: dict[str, float] = {}  # when arms were measured whose drivers do not tell how far they are [s]
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
         self._first: float | None = None  # time of the first tick [s]
         self._aged = 0.0  # by how much reports of moving obstacles became older since then [s]
@@ -107,6 +110,10 @@ class ControlLoop:
         be apart in time.
         """
         self.controller.allow_skew(min(skew_window(timings, lead), LONGEST_WINDOW))
+        self._untold = untold = {arm: now - its.silent for arm, its in timings.items() if its.behind is None}
+        if untold and (state := self.supervisor.state) is not None:
+            behind = self._lags.behind(state.q, untold)
+            timings = {arm: replace(its, behind=behind.get(arm, its.behind)) for arm, its in timings.items()}
         self.supervisor.skew.observe(timings, now)
 
     def activate(self, state: RobotState, now: float) -> None:
@@ -162,6 +169,10 @@ class ControlLoop:
         if reference is None and self._owns_plant:
             reference = self.controller.brake(dt)  # the rest of the arms' motion
         self._aged += braked if reference is None else braked + dt
+        if reference is None:
+            self._lags.restart()
+        elif self._untold:
+            self._lags.note(reference.q, now)
         if self.controller.kept_distances is not self._kept:  # the step may have taken up others
             self._kept = self.controller.kept_distances
             self.drive.set_kept_distances(self._kept)

@@ -85,6 +85,11 @@ class Supervisor:
         return self._watch.fault
 
     @property
+    def state(self) -> RobotState | None:
+        """The newest measured state that was good."""
+        return self._watch.state
+
+    @property
     def trusted(self) -> bool:
         """Whether the arms move, or hold, by joint states that are good."""
         return self.phase in (Phase.ACTIVE, Phase.BRAKING) and self._watch.fault is None
