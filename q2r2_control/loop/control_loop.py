@@ -40,6 +40,7 @@ class LoopStep:
     refusals: dict[str, Reason] = field(default_factory=dict)  # arm -> why its target is not followed
 
 
+_REMEMBERED_LAG = 0.999  # share of the longest lag lately that a tick leaves
 _SAME_TIME = 1e-6  # [s]; less is rounding
 
 
@@ -81,6 +82,7 @@ class ControlLoop:
         self.holding: dict[str, bool] = {}  # of each arm that has an object, whether its gripper holds it
         self.granted_openings: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and granted
         self._lags = MeasuredLags(robot)
+        self._usual_lag = 0.0  # the longest one that was found lately [s]
         self._untold: dict[str, float] = {}  # when arms were measured whose drivers do not tell how far they are [s]
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
         self._first: float | None = None  # time of the first tick [s]
@@ -109,11 +111,13 @@ class ControlLoop:
         ``lead``: from where they are led to the end of the newest step [s]. They are kept apart for all that they may
         be apart in time.
         """
-        self.controller.allow_skew(min(skew_window(timings, lead), LONGEST_WINDOW))
         self._untold = untold = {arm: now - its.silent for arm, its in timings.items() if its.behind is None}
         if untold and (state := self.supervisor.state) is not None:
             behind = self._lags.behind(state.q, untold)
             timings = {arm: replace(its, behind=behind.get(arm, its.behind)) for arm, its in timings.items()}
+            self._usual_lag = max(_REMEMBERED_LAG * self._usual_lag, *behind.values())
+            lead += self._usual_lag  # such arms are led from where they are
+        self.controller.allow_skew(min(skew_window(timings, lead), LONGEST_WINDOW))
         self.supervisor.skew.observe(timings, now)
 
     def activate(self, state: RobotState, now: float) -> None:
