@@ -223,6 +223,7 @@ class LimitKind(StrEnum):
     VELOCITY = "velocity"
     ACCELERATION = "acceleration"
     SEPARATION = "separation"
+    TOOL_SPEED = "tool_speed"
     CONSTRAINT = "constraint"  # of a program's own
 
 
@@ -230,7 +231,7 @@ class ActiveLimit(NamedTuple):
     """A limit that was active at a step's solution."""
 
     kind: LimitKind
-    names: tuple[str, ...]  # of the joint, of both geometries of a pair, or of a constraint's class
+    names: tuple[str, ...]  # of the joint, both geometries of a pair, the tool's arm, or a constraint's class
 
 
 @dataclass(slots=True)
