@@ -110,7 +110,7 @@ def test_a_tool_that_starts_too_fast_is_braked_until_it_is_not_and_its_report_sa
     controller, v = limited(robot, solver=Pushing()), fast_start(robot)
     controller.reset(robot.home, v)
     tools, before, certified = MeasuredToolSpeeds(robot), 3.0 * LIMIT, []
-    for _ in range(100):
+    for _ in range(220):
         reference = controller.step({}, DT)
         speed = tools.fastest(reference.q, reference.v)
         assert speed <= max(LIMIT, before)
