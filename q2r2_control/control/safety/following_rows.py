@@ -2,7 +2,7 @@
 
 The arm in front may be where it was a window D ago. Along the pair's normal n the arm behind it has free
 
-    B = d - min_distance - part of the buffer - n'(the front's way in the window) - n'(the way of the stop behind).
+    B = d - min_distance - buffer - n'(the front's way in the window) - n'(the way of the stop behind).
 
 As in separation_rows.py a step uses up no more than a share of it, B+ >= (1 - gain h) B. What the one in front does now
 counts after D only. In a step B therefore changes by its way of D ago, and by what the one behind decides now.
@@ -14,9 +14,6 @@ from q2r2_control.control.geometry.closest_points import size_of
 from q2r2_control.control.geometry.pair_distance import distance_row, measure
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
-
-# Of a pair's buffer: arms that work beside each other are within all of it.
-_SHARE = 0.25
 
 
 @kernel
@@ -46,8 +43,7 @@ def append_following_row(
         return count
     behind = -1.0 if first < 0.0 else 1.0
     oldest = history.counted[0] - 1
-    buffer = _SHARE * (model.approach.stop_distance[p] - model.min_distance[p])
-    free, rate, before, change = distance - model.min_distance[p] - buffer, min(first, second), 0.0, 0.0
+    free, rate, before, change = distance - model.approach.stop_distance[p], min(first, second), 0.0, 0.0
     for k in range(pairs.joint.shape[1]):
         joint = pairs.joint[p, k]
         if joint == 0:
