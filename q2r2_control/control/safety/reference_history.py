@@ -107,6 +107,8 @@ def remember(history: ReferenceHistory, q: Array, v: Array, v_next: Array, h: fl
 @kernel
 def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Array) -> None:
     """Find out where the joints were in the window, seen from the reference ``q``, ``v`` (nv,)."""
+    if history.window[0] == 0.0 and history.counted[0] == 0:
+        return  # all arms are one body, and all that is found here is 0 already
     history.counted[0], history.time[0] = 0, 0.0
     history.travel[:], history.off[:], history.speed[:], history.bend[0, :] = 0.0, 0.0, 0.0, 0.0
     longest, newer, window = 0.0, 0.0, history.window[0]

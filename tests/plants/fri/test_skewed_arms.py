@@ -1,4 +1,4 @@
-"""Two arms that swing alike near each other, each behind its cabinet: one lags, its cable is pulled, or it is stopped."""
+"""Two arms that swing alike near each other, each behind its cabinet: one lags, or it stops alone."""
 
 from __future__ import annotations
 
