@@ -19,7 +19,12 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 SAFETY = "q2r2_control/control/safety/"
-TESTS = ("tests/control/safety", "tests/control/test_contract.py", "tests/control/test_moving_obstacles.py")
+TESTS = (
+    "tests/control/safety",
+    "tests/control/test_contract.py",
+    "tests/control/test_moving_obstacles.py",
+    "tests/control/test_arm_skew.py",
+)
 _LONGEST = 1800.0  # of a soak or the tests [s]
 
 
@@ -77,7 +82,7 @@ MUTATIONS = (
     Mutation(
         "obstacles are part of the proof",
         "stop_certificate.py",
-        "if _has_room(model, data, p, time):",
+        "if is_far(model, data, p, time) if alone else _has_room(model, data, p, time):",
         "if _has_room(model, data, p, time) or model.collision.bodies.box[model.collision.pairs.second[p]] == 1:",
     ),
     Mutation(
@@ -97,6 +102,18 @@ MUTATIONS = (
         "stop_certificate.py",
         "if distance - rest >= threshold:",
         "if distance >= threshold:",
+    ),
+    Mutation(
+        "arms are proven apart also at different times",
+        "stop_certificate.py",
+        "return keeps_apart_at_any_time(model, data, p, duration, threshold)",
+        "return _stop_keeps_apart(model, data, p, duration, threshold)",
+    ),
+    Mutation(
+        "an arm may be where it was a window ago",
+        "arm_skew.py",
+        "for i in range(history.counted[0]):",
+        "for i in range(0):",
     ),
     Mutation(
         "a pair that is too close must not come closer",

@@ -208,6 +208,7 @@ class ReasonKind(StrEnum):
     FRI_DROPPED = "fri_dropped", "{arm}: the cabinet ended the session"
     FRI_BEHIND = "fri_behind", "{arm}: the cabinet asks less often than every {period:g} ms, and is {lag:.2f} s behind"
     FRI_OVERTAKEN = "fri_overtaken", "the control loop was too late for the cabinets"
+    ARMS_APART = "arms_apart", "{arm}: {skew:.0f} ms behind the other arm; allowed: {allowed:.0f} ms"
     RUN_ENDED = "run_ended", "the run has ended"
     STOP_SERVICE = "stop_service", "the stop service was called"
     ACTIVATED = "activated", "active: the reference starts at the measured posture"

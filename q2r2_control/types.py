@@ -223,6 +223,7 @@ class LimitKind(StrEnum):
     VELOCITY = "velocity"
     ACCELERATION = "acceleration"
     SEPARATION = "separation"
+    TOOL_SPEED = "tool_speed"
     CONSTRAINT = "constraint"  # of a program's own
 
 
@@ -230,7 +231,7 @@ class ActiveLimit(NamedTuple):
     """A limit that was active at a step's solution."""
 
     kind: LimitKind
-    names: tuple[str, ...]  # of the joint, of both geometries of a pair, or of a constraint's class
+    names: tuple[str, ...]  # of the joint, both geometries of a pair, the tool's arm, or a constraint's class
 
 
 @dataclass(slots=True)
@@ -294,3 +295,18 @@ class ArmTarget:
     def command_for(self, tool: pin.SE3) -> pin.SE3:
         """The controller's target that brings the tool to ``tool``, world frame."""
         return tool if self.offset is None else moved_by(tool, -self.offset)
+
+
+@dataclass(frozen=True, slots=True)
+class ArmTiming:
+    """What is known of when an arm does what the reference says, all in [s]."""
+
+    behind: float | None  # the reference, by the newest message of the arm; None: nobody tells, so that it is measured
+    silent: float  # time since that message
+    period: float  # between its messages, as a rule
+    noise: float = 0.0  # of ``behind``
+
+    @property
+    def lag(self) -> float:
+        """How far behind the arm may be by now: a message that is missing may say that the arm stands still."""
+        return (self.behind or 0.0) + max(self.silent - self.period, 0.0)

@@ -14,6 +14,7 @@ _LIMITS = {
     LimitKind.VELOCITY: "velocity",
     LimitKind.ACCELERATION: "acceleration",
     LimitKind.CONSTRAINT: "constraint",
+    LimitKind.TOOL_SPEED: "tool speed",
 }
 
 

@@ -94,6 +94,12 @@ class ControllerSettings(StrictModel):
         description="driver: with plant fri or a preset lbr_*, position_margin is 0.105 rad at least, and "
         "velocity_scale 0.95 at most, with a preset lbr_* 0.85",
     )
+    tool_speed_limit: float | None = Field(
+        None,
+        ge=0.02,
+        le=3,
+        description="no tool of the reference is ever faster, whatever a solver answers [m/s]; null: no such promise",
+    )
     recovery_velocity: float = Field(0.2, gt=0, le=1, description="inward speed when outside a limit [rad/s]")
 
     min_distance: Annotated[Distance, _LIVE] = Field(

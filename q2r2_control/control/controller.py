@@ -90,7 +90,9 @@ class CartesianController(WatchedPairs):
             self._solver = solver if isinstance(solver, Guard) else Guard(solver, self._nv)
         self._qp = StepProblem(robot, settings, tasks, constraints)
         self._tools: TaskData = self._data_pointer.value.tasks
-        self._before = tuple(array.copy() for array in (self._state.q, self._state.v, self._stop))  # the last step
+        history = self._data_pointer.value.safety.history
+        self._restored = self._state.q, self._state.v, self._stop, *history.kept  # by :meth:`withdraw`
+        self._before = tuple(array.copy() for array in self._restored)  # the last step
         self._kept_before = self._live.kept, self._objects.kept
         self._solution = np.zeros(self._nv)  # of the QP, whatever array has it
         self._targets = TargetTracker(self._model_pointer.value.tasks, self._arms, settings)
@@ -288,7 +290,7 @@ class CartesianController(WatchedPairs):
     def _remember(self) -> None:
         """The state to which :meth:`withdraw` returns, and what pairs keep there."""
         self._kept_before = self._live.kept, self._objects.kept
-        for kept, array in zip(self._before, (self._state.q, self._state.v, self._stop), strict=True):
+        for kept, array in zip(self._before, self._restored, strict=True):
             kept[:] = array
 
     def withdraw(self, reference: Reference) -> None:
@@ -298,7 +300,7 @@ class CartesianController(WatchedPairs):
         :class:`RobotError` for what is no reference.
         """
         check_kind("reference", reference, Reference, "the Reference that the last step returned", RobotError)
-        for array, kept in zip((self._state.q, self._state.v, self._stop), self._before, strict=True):
+        for array, kept in zip(self._restored, self._before, strict=True):
             array[:] = kept
         reference.q[:], reference.v[:] = self._state.q, self._state.v
         # Later parts of the step may have proven more for pairs than holds where the arms are now.
@@ -369,7 +371,7 @@ class CartesianController(WatchedPairs):
         """
         own, problem, state = self._qp.constraints, self._qp.problem, self._state
         usable = solved and own.permit(np.clip(self._solution, problem.lower, problem.upper))
-        arrays = state.q, state.v, state.a, self._stop
+        arrays = *self._restored, state.a
         before = [array.copy() for array in arrays]
         pointers = self._model_pointer, self._data_pointer
         self._observed, outcome, slack = self._move(*pointers, self._solution, usable, h, share)

@@ -7,10 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.config.control import ControllerSettings, check_priority
-from q2r2_control.control.geometry.collision import CollisionModel, collision_model_of, turning_bodies
+from q2r2_control.control.geometry.collision import CollisionModel, Pairs, collision_model_of, turning_bodies
+from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import with_rounded_boxes
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_data import Approach, SafetyData, SafetyModel
+from q2r2_control.control.safety.tool_speed import tool_limits_of
 from q2r2_control.control.tasks.built_in import TaskData, TaskModel, task_model_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import KeptDistances, kept_distances
@@ -70,8 +72,16 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
         ),
         min_distance=min_distance,
         arm=arm,
+        of_two_arms=_of_two_arms(collision.pairs),
+        tools=tool_limits_of(robot, collision.chain, settings.tool_speed_limit),
     )
     return KernelModel(safety, task_model_of(robot, settings, collision.chain))
+
+
+def _of_two_arms(pairs: Pairs) -> IntArray:
+    """Which pairs (p,) have two bodies that move each by joints of its own."""
+    own = (pairs.carried == 0) & (pairs.sign > 0).any(axis=1) & (pairs.sign < 0).any(axis=1)
+    return own.astype(np.int64)
 
 
 def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) -> None:

@@ -10,6 +10,7 @@ from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.kernel_model import KernelData, KernelModel
 from q2r2_control.control.kernel_pointers import KernelPointer, pointee
+from q2r2_control.control.safety.reference_history import look_back, rest_always
 from q2r2_control.control.safety.safety_filter import apply_safety_filter, certify_bodies, certify_start, measure_pairs
 from q2r2_control.control.safety.speed_bound import update_body_velocities
 from q2r2_control.control.tasks.frame import tool_pose
@@ -24,6 +25,7 @@ Observed = tuple[int, float, int, float]
 def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -> bool:
     """Observe after a reset; whether a stop is known to keep all apart."""
     model, data = pointee(model_pointer), pointee(data_pointer)
+    rest_always(data.safety.history, data.safety.state.q)
     _observe(model, data)
     return certify_start(model.safety, data.safety)
 
@@ -65,6 +67,7 @@ def _observe(model: KernelModel, data: KernelData) -> Observed:
     collision, safety = model.safety.collision, data.safety
     update_placements(collision, safety.collision, safety.state.q)
     update_body_velocities(collision, safety.collision, safety.state.v, safety.velocities)
+    look_back(collision, safety.history, safety.state.q, safety.state.v)
     for i in range(model.tasks.tools.joint.shape[0]):
         tool_pose(data.tasks.placements, model.tasks.tools, i, data.tasks.rotation[i], data.tasks.translation[i])
     if safety.distance.shape[0] == 0:

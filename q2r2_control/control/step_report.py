@@ -9,7 +9,7 @@ import pinocchio as pin
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
 from q2r2_control.control.safety.safety_data import ActiveBounds
-from q2r2_control.control.safety.safety_filter import SEPARATION
+from q2r2_control.control.safety.safety_filter import SEPARATION, TOOL_SPEED
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ActiveLimit, LimitKind, StepStatus
 
@@ -34,6 +34,7 @@ class LimitNames:
             kind: [ActiveLimit(limit, (joint,)) for joint in robot.joint_names] for kind, limit in _KINDS.items()
         }
         self._by_kind[SEPARATION] = [ActiveLimit(LimitKind.SEPARATION, pair) for pair in self.pairs]
+        self._by_kind[TOOL_SPEED] = [ActiveLimit(LimitKind.TOOL_SPEED, (arm,)) for arm in robot.arms]
 
     def pair(self, number: int) -> tuple[str, str]:
         """Both bodies of a pair; empty names in a cell without pairs."""

@@ -17,6 +17,7 @@ from q2r2_control.control.live_settings import LiveSettings, ObjectPairs
 from q2r2_control.control.moving_obstacles import MovingObstacles
 from q2r2_control.control.reference import observe_bodies, spare_distance
 from q2r2_control.control.safety.protective_distance import ObstacleData
+from q2r2_control.control.safety.reference_history import LONGEST_WINDOW
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.control.step_report import LimitNames
 from q2r2_control.errors import RobotError, shown
@@ -137,6 +138,22 @@ class WatchedPairs:
         if not (isinstance(time, float | int) and 0.0 <= time < np.inf):
             raise RobotError(f"time = {shown(time)}: allowed: seconds, 0 or more")
         self._obstacles.pass_time(time)
+
+    @property
+    def skew(self) -> float:
+        """By how much time one arm may be behind where another one is on the reference [s]; 0: they move as one."""
+        return float(self._data_pointer.value.safety.history.window[0])
+
+    def allow_skew(self, time: float) -> None:
+        """Let arms be apart in time by up to ``time`` [s], at most 0.1, and stop one by one, from the next step on.
+
+        Bodies of two arms then keep their distance wherever on its own way each arm is: from where the reference had
+        it ``time`` ago to the end of the certified stop. More counts as fast as time passes, less counts at once. After
+        a :meth:`reset`, all of it does. Raises :class:`RobotError` for what is no such time.
+        """
+        if not (isinstance(time, float | int) and 0.0 <= time <= LONGEST_WINDOW):
+            raise RobotError(f"skew = {shown(time)}: allowed: seconds, 0 to {LONGEST_WINDOW:g}")
+        self._data_pointer.value.safety.history.window[1] = time
 
     def pairs_ahead(self, stop: float) -> PairsAhead:
         """All pairs, for a look at a way before it is gone by arms that stop in ``stop`` [s].

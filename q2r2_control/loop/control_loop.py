@@ -12,15 +12,18 @@ import pinocchio as pin
 from q2r2_control.compliance.admittance import estimate_wrench
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.safety.reference_history import LONGEST_WINDOW
 from q2r2_control.drives.base import Drive, DriveReport
 from q2r2_control.events import Reason
+from q2r2_control.supervision.arm_skew import skew_window
 from q2r2_control.supervision.gripper_limiter import REMEMBERED, STALL, GraspWatch, GripperLimiter
 from q2r2_control.supervision.joint_watch import ExternalArms, WatchSettings
+from q2r2_control.supervision.measured_lags import MeasuredLags
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.haptics import ArmCondition
-from q2r2_control.types import Array, Command, LimitKind, Reference, RobotState, StepReport
+from q2r2_control.types import ArmTiming, Array, Command, LimitKind, Reference, RobotState, StepReport
 
 _PROVEN = Phase.ACTIVE, Phase.BRAKING  # in other phases no opening of a gripper is proven
 
@@ -37,6 +40,7 @@ class LoopStep:
     refusals: dict[str, Reason] = field(default_factory=dict)  # arm -> why its target is not followed
 
 
+_REMEMBERED_LAG = 0.999  # share of the longest lag lately that a tick leaves
 _SAME_TIME = 1e-6  # [s]; less is rounding
 
 
@@ -77,6 +81,9 @@ class ControlLoop:
         self._still: Mapping[str, MovingObstacle] = {}  # obstacles that the drive was told of
         self.holding: dict[str, bool] = {}  # of each arm that has an object, whether its gripper holds it
         self.granted_openings: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and granted
+        self._lags = MeasuredLags(robot)
+        self._usual_lag = 0.0  # the longest one that was found lately [s]
+        self._untold: dict[str, float] = {}  # when arms were measured whose drivers do not tell how far they are [s]
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
         self._first: float | None = None  # time of the first tick [s]
         self._aged = 0.0  # by how much reports of moving obstacles became older since then [s]
@@ -97,6 +104,21 @@ class ControlLoop:
         until they rest.
         """
         self.supervisor.update_state(state, now, passed, lost)
+
+    def watch_skew(self, timings: Mapping[str, ArmTiming], lead: float, now: float) -> None:
+        """Let supervision compare arms that follow the reference each on its own, before a step and an activation.
+
+        ``lead``: from where they are led to the end of the newest step [s]. They are kept apart for all that they may
+        be apart in time.
+        """
+        self._untold = untold = {arm: now - its.silent for arm, its in timings.items() if its.behind is None}
+        if untold and (state := self.supervisor.state) is not None:
+            behind = self._lags.behind(state.q, untold)
+            timings = {arm: replace(its, behind=behind.get(arm, its.behind)) for arm, its in timings.items()}
+            self._usual_lag = max(_REMEMBERED_LAG * self._usual_lag, *behind.values())
+            lead += self._usual_lag  # such arms are led from where they are
+        self.controller.allow_skew(min(skew_window(timings, lead), LONGEST_WINDOW))
+        self.supervisor.skew.observe(timings, now)
 
     def activate(self, state: RobotState, now: float) -> None:
         """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`Q2R2Error`."""
@@ -151,6 +173,10 @@ class ControlLoop:
         if reference is None and self._owns_plant:
             reference = self.controller.brake(dt)  # the rest of the arms' motion
         self._aged += braked if reference is None else braked + dt
+        if reference is None:
+            self._lags.restart()
+        elif self._untold:
+            self._lags.note(reference.q, now)
         if self.controller.kept_distances is not self._kept:  # the step may have taken up others
             self._kept = self.controller.kept_distances
             self.drive.set_kept_distances(self._kept)

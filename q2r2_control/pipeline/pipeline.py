@@ -284,6 +284,7 @@ class Pipeline(RequestedRun):
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)
         self._lead = TargetLead()
+        self._watch_skew(self._clock.now)
         if sessions is None or sessions.fault() is None:
             self.loop.activate(self._state, self._clock.now)
             self.supervisor.events.clear()
@@ -344,6 +345,7 @@ class Pipeline(RequestedRun):
         seen, passed = self._plant_clock.stamped(state, now)
         lost = None if self._sessions is None else self._sessions.fault()
         self.loop.observe(seen, now, passed, lost)
+        self._watch_skew(now)
         openings, tools = self.plant.gripper_openings(), self._measured_tools(state)
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
@@ -394,6 +396,10 @@ class Pipeline(RequestedRun):
             self._operator.feed_back(tick)
         self._recorder.add(tick)
         return tick
+
+    def _watch_skew(self, now: float) -> None:
+        if self._sessions is not None:
+            self.loop.watch_skew(self._sessions.timings(), self._sessions.lead(), now)
 
     def _measured_tools(self, state: RobotState) -> dict[str, pin.SE3]:
         model, data, arms = self.robot.model, self._data, self.robot.arms

@@ -14,7 +14,7 @@ from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Command, CommandMode, RobotState
+from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 
 # Longest time of one call [s]: a loop that fell further behind must not catch up in one leap.
 MAX_ADVANCE = 1.0
@@ -94,6 +94,12 @@ class SessionPlant(Protocol):
 
     def delay(self) -> float:
         """From the time that a command is for until the arms are measured there [s]."""
+
+    def timings(self) -> dict[str, ArmTiming]:
+        """Of each arm that follows the reference on its own, when it does so at the newest tick; empty: all as one."""
+
+    def lead(self) -> float:
+        """From where the arms are led at a tick to the end of the command that the tick is for, at most [s]."""
 
     def fault(self) -> Reason | None:
         """Why the arms cannot be commanded now, or ceased to be since the last call; None: they can."""

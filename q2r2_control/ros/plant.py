@@ -26,12 +26,12 @@ from q2r2_control.plants.base import check_command
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.gripper_client import GripperClient
-from q2r2_control.ros.bridge.intakes import Fingers, JointIntake
+from q2r2_control.ros.bridge.intakes import COMMAND_TIME, Fingers, JointIntake
 from q2r2_control.ros.bridge.joint_outputs import TrajectoryOutput
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.monitoring import CommandWatch, WatchedPublisher
-from q2r2_control.types import Array, Command, CommandMode, RobotState
+from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
 _WAIT = 5.0  # for joint states and for whatever takes the commands [s]
@@ -129,6 +129,13 @@ class RosPlant:
 
     def withdraws(self) -> bool:
         return False
+
+    def timings(self) -> dict[str, ArmTiming]:
+        return self._joints.timings(self._last)
+
+    def lead(self) -> float:
+        """See :meth:`SessionPlant.lead`."""
+        return self._period + COMMAND_TIME
 
     def delay(self) -> float:
         """Drivers do not tell it."""

@@ -21,6 +21,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import joints_that_cannot_hold
+from q2r2_control.supervision.arm_skew import SkewWatch
 from q2r2_control.supervision.homing import Homing
 from q2r2_control.supervision.joint_watch import ExternalArms, JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
@@ -62,6 +63,7 @@ class Supervisor:
         self._origins = origins or Origins()
         self.targets = TargetStreams(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
+        self.skew = SkewWatch()
         self.homing = Homing(robot, controller, tools_only=external is not None)
         self._stopped: Reason | None = None  # why it takes a reset
         self._last: Reference | None = None
@@ -81,6 +83,11 @@ class Supervisor:
     def state_fault(self) -> Reason | None:
         """Why the newest measured state cannot be believed, or None."""
         return self._watch.fault
+
+    @property
+    def state(self) -> RobotState | None:
+        """The newest measured state that was good."""
+        return self._watch.state
 
     @property
     def trusted(self) -> bool:
@@ -157,6 +164,8 @@ class Supervisor:
             return None
         if self.phase is Phase.ACTIVE and fault is not None:
             self._brake(Reason(ReasonKind.JOINT_STATES, cause=fault))
+        elif apart := self.skew.fault(now):
+            self.start_over(apart, now)
         self.events += self.targets.expire(now)
         targets = self.homing.targets(self._last, dt) if self.homing.active else self.targets.at(now)
         self._last = reference = self._step(targets, dt, posture)
@@ -170,7 +179,7 @@ class Supervisor:
 
     def _step(self, targets: dict[str, pin.SE3 | None], dt: float, posture: Array | None) -> Reference:
         state = self._watch.state
-        if self.phase is not Phase.ACTIVE:
+        if self.phase is not Phase.ACTIVE or self.skew.holds:
             return self._controller.brake(dt)
         if state is None:
             return self._controller.step(targets, dt)

@@ -20,7 +20,8 @@ class PolicySide:
     """The policy of all arms.
 
     An operator who has a device is asked first: after a fault, arms wait for a press. Without one, they go on with the
-    next chunk that begins at the tool.
+    next chunk that begins at the tool. Linked arms begin together or not at all: both those that a chunk has actions
+    for and those that a fault has stopped together. Two hands may hold one object.
     """
 
     def __init__(self, arms: Mapping[str, ArmTeleop], settings: TeleopSettings) -> None:
@@ -28,6 +29,8 @@ class PolicySide:
         self._motions = {name: PolicyMotion(name, settings) for name in arms}
         self._told: dict[str, ReasonKind] = {}  # arm -> what its last refused actions were refused for
         self._linked = settings.linked
+        self._asked: set[str] = set()  # arms that the newest chunk has actions for
+        self._stopped: set[str] = set()  # linked arms that a fault stopped, and nothing else has moved on since
         self.seen = False  # whether a policy has sent anything in this run
 
     def configure(self, settings: TeleopSettings) -> None:
@@ -48,6 +51,7 @@ class PolicySide:
             if motion.following and self._arms[name].state is not ArmState.POLICY:
                 motion.forget()  # stopped or taken over: the next chunk says where to go on
         for chunk in chunks:
+            self._asked = {*chunk.tools, *chunk.motions} or self._asked
             for name, motion in self._motions.items():
                 if fault := chunk.fault or motion.receive(chunk, now):
                     faults[name] = fault
@@ -57,9 +61,8 @@ class PolicySide:
                 faults[name] = fault
         if faults:
             self._refuse(faults, now)
-        for name in () if faults else self._arms:
-            if self._may_begin(name, around) and self._motions[name].counts(now):
-                self._begin(name, around, now)
+        else:
+            self._begin(around, now)
 
     def _in(self, *states: ArmState) -> list[str]:
         return [name for name, arm in self._arms.items() if arm.state in states]
@@ -76,6 +79,7 @@ class PolicySide:
                 self._arms[name].record_event(now, Reason(ReasonKind.POLICY_REFUSED, cause=fault))
         first, fault = next(iter(faults.items()))
         if self._linked and not faults.keys().isdisjoint(following):
+            self._stopped.update(following)
             for name in following:
                 if name not in faults:
                     self._motions[name].forget()
@@ -88,14 +92,29 @@ class PolicySide:
         lost = self._in(ArmState.LOST) if self._linked else [name] if arm.state is ArmState.LOST else []
         return not any(self._arms[other].heard_of for other in lost)
 
-    def _begin(self, name: str, around: ArmMeasurements, now: float) -> None:
-        tool = around.expected(name, None) or floats_of(around.tools[name])
-        if fault := self._motions[name].begin(tool, now):
-            self._refuse({name: fault}, now)
+    def _begin(self, around: ArmMeasurements, now: float) -> None:
+        """Let arms follow that may, and for which an action counts: linked ones all at once."""
+        ready = [name for name in self._arms if self._may_begin(name, around) and self._motions[name].counts(now)]
+        if not ready or (self._linked and not self._wanted().issubset(ready)):
             return
-        self._told.pop(name, None)
-        self._arms[name].offset = None  # actions are what the controller is asked for
-        self._arms[name].go(Cause.POLICY_ACTS, now, Reason(ReasonKind.POLICY_ACTS))
+        tools = {name: around.expected(name, None) or floats_of(around.tools[name]) for name in ready}
+        begun = {name: self._motions[name].begin(tools[name], now) for name in ready}
+        faults = {name: fault for name, fault in begun.items() if fault is not None}
+        if faults:
+            self._refuse(faults, now)
+        for name in ready:
+            if faults and self._linked:
+                self._motions[name].forget()
+            elif name not in faults:
+                self._told.pop(name, None)
+                self._arms[name].offset = None  # actions are what the controller is asked for
+                self._arms[name].go(Cause.POLICY_ACTS, now, Reason(ReasonKind.POLICY_ACTS))
+
+    def _wanted(self) -> set[str]:
+        """Linked arms that have to begin together: those that nobody moves now."""
+        self._stopped = {name for name in self._stopped if self._arms[name].state is ArmState.LOST}
+        moved = self._in(ArmState.POLICY, ArmState.ENGAGED, ArmState.CARRIED)
+        return (self._stopped | (self._asked & self._arms.keys())).difference(moved)
 
     def target(self, name: str, around: ArmMeasurements, now: float) -> pin.SE3:
         """The target of an arm that follows the policy, which also says how far its gripper is open."""

@@ -19,6 +19,7 @@ from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport
 from q2r2_control.verification.promises import PROMISES, RELATIVE, Margin, MeasuredDistances
+from q2r2_control.verification.tool_speeds import MeasuredToolSpeeds
 
 _NEWEST = 5000  # ticks whose accelerations are kept
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the numbers
@@ -65,6 +66,7 @@ class Contract:
         self._upper = robot.position_upper - settings.position_margin
         self._ask(settings)
         self._measured = MeasuredDistances(robot, controller.kept_distances)
+        self._tool_limit, self._tools = settings.tool_speed_limit, MeasuredToolSpeeds(robot)
         self._substep = settings.max_substep
         self.start(robot.home if q is None else q, v)
 
@@ -150,6 +152,7 @@ class Contract:
                     self._note("unsaid", float(not report.fallback))
             self._check_limits(q, v)
             self._check_distance(self._measured.reported_margin(report), report.certified)
+            self._check_tools(q, v)
             stop = self._controller.stop_deceleration
             self._note("deceleration", float((stop / self._a).max()))
             self._note_objects()
@@ -245,6 +248,11 @@ class Contract:
         self._certain |= certified
         self._least = least
 
+    def _check_tools(self, q: Array, v: Array) -> None:
+        """At ``q`` [rad] and ``v`` [rad/s], (nv,) each or one row an instant, no tool is too fast."""
+        if self._tool_limit is not None and self._certain:
+            self._note("tool_speed", self._tools.fastest(q, v) / self._tool_limit)
+
     def _sample(self, q: Array, v: Array, stop: Array, h: float, report: StepReport) -> None:
         """Measure distances that the controller did not measure itself."""
         draw = 0.0 if self._sample_all else self._random.random()
@@ -258,14 +266,18 @@ class Contract:
                 self._note("bystanders", float(margins[self._apart].min()))
             if self._certain and 0.0 < h <= self._substep:
                 times = h * self._random.random((_BETWEEN_SAMPLES, 1))
-                between = self._braked(self._q, self._v, self._stop, times)[0]
+                between, speeds = self._braked(self._q, self._v, self._stop, times)
                 if self._parabola:
                     between = self._q + times * self._v + 0.5 * times**2 / h * (v - self._v)
+                    speeds = self._v + times / h * (v - self._v)
                 self._note("between", self._measured.least_of(between))
+                self._check_tools(between, speeds)
         if draw < _STOP_SHARE and self._certain:
             duration = float(np.max(np.abs(v) / stop))
             times = duration * (np.arange(_STOP_SAMPLES) + self._random.random()) / _STOP_SAMPLES
-            self._note("stop", self._measured.least_of(self._braked(q, v, stop, times[:, None])[0]))
+            braked, speeds = self._braked(q, v, stop, times[:, None])
+            self._note("stop", self._measured.least_of(braked))
+            self._check_tools(braked, speeds)
         if draw < _STOP_SHARE and self._can_stop.all():
             end = q + v * np.abs(v) / (2.0 * stop)
             self._note("stop_position", float(np.minimum(end - self._lower, self._upper - end).min()))

@@ -38,6 +38,7 @@ PROMISES = {  # key: name, unit, and what its value has to be
     "between": ("distance - kept distance, between ticks", "m", ">=", -COAL),
     "stop": ("distance - kept distance, full stops", "m", ">=", -COAL),
     "stop_position": ("room to position limits, full stops", "rad", ">=", -RELATIVE),
+    "tool_speed": ("tool speed / limit, at ticks, between and in stops", "", "<=", 1.0 + RELATIVE),
     "coal": ("reported distance off Coal's", "m", "<=", COAL),
     "bystanders": ("pairs apart while others recover", "m", ">=", -COAL),
     "uncertified": ("certificates lost", "", "<=", 0.0),

@@ -82,6 +82,8 @@ def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[
         return f"held by {' | '.join(report.tightest_pair)}, {1e3 * report.margin:.0f} mm to spare"
     if pairs:
         return f"held by {' | '.join(pairs[0])}"
+    if any(limit.kind is LimitKind.TOOL_SPEED and limit.names == (arm,) for limit in binding):
+        return "its tool is as fast as it may be"
     for kind, words in _HELD_BY.items():
         if mine := [limit.names[0] for limit in binding if limit.kind is kind and limit.names[0] in joints]:
             return f"{mine[0]} {words}"

@@ -101,6 +101,27 @@ def test_a_recording_says_at_every_frame_who_acted_and_is_replayed_to_the_bit(tm
     assert (again.difference, again.ended_by) == (None, None)
 
 
+class Jumping(Circle):
+    """After 0.3 s the left tool jumps 1 m in each chunk."""
+
+    def __call__(self, observation: Observation) -> Array:
+        actions = super().__call__(observation)
+        assert self.start is not None
+        if observation.time - self.start.time > 0.3:
+            actions[:, 0] += 1.0
+        return actions
+
+
+def test_no_arm_moves_on_alone_after_a_fault_of_the_policy() -> None:
+    loop = pipeline(source=PolicyInput(Jumping()))
+    watch = Watch(loop)
+    loop.run(1.2, realtime=False)
+    states = [tuple(tick.states.values()) for tick in watch.ticks]
+    assert ("policy", "policy") in states
+    first = states.index(("lost", "lost"))
+    assert set(states[first:]) <= {("lost", "lost"), ("stopping", "stopping")}
+
+
 class Leaving(HandsInput):
     """Hands that nobody hears any more after a while."""
 

@@ -142,6 +142,45 @@ def test_an_action_that_jumps_stops_both_arms_and_is_not_followed(way: Array, re
     assert run.reasons("right") == []
 
 
+STAYS, JUMPS, JUMPS_LATER = np.zeros(4), np.full(4, 1.0), np.array([0.0, 0.0, 1.0, 1.0])  # of the left tool [m]
+
+
+def for_both(run: Run, left: Array) -> ActionChunk:
+    """One chunk for both arms, of which the right one stays."""
+    times = np.array(run.now + PERIOD * np.arange(4), dtype=np.float64)
+    ways = zip(SIDES, (left, STAYS), strict=True)
+    tools = {arm: chunk(times, its, (arm,)).tools[arm] for arm, its in ways}
+    return ActionChunk(times, PERIOD, tools=tools)
+
+
+@pytest.mark.parametrize("left", [JUMPS, JUMPS_LATER], ids=["from the tool", "between two actions"])
+@pytest.mark.parametrize("before", [0.1, 0.0], ids=["after both followed", "from the first chunk on"])
+def test_linked_arms_begin_together_or_not_at_all(before: float, left: Array) -> None:
+    run = Run()
+    run.ways(before, *[for_both(run, STAYS)] * (before > 0.0))
+    for _ in range(5):
+        run.ways(0.1, for_both(run, left))
+        assert run.states() <= {"lost", "idle"}
+    run.ways(2.0 * TICK, for_both(run, STAYS))
+    assert run.states() == {"policy"}
+
+
+def test_arms_that_a_fault_stopped_together_do_not_go_on_with_actions_for_one_of_them() -> None:
+    run = Run()
+    run.ways(0.1, for_both(run, STAYS))
+    run.ways(0.1, for_both(run, JUMPS))
+    run.ways(0.1, chunk(run.now + PERIOD * np.arange(4), np.zeros(4), ("right",)))
+    assert run.states() == {"lost"}
+
+
+def test_an_arm_that_is_not_linked_goes_on_alone() -> None:
+    run = Run(TeleopSettings(linked=False))
+    run.ways(0.1, for_both(run, STAYS))
+    run.ways(0.1, for_both(run, JUMPS))
+    run.ways(0.1, for_both(run, JUMPS))
+    assert {arm: str(state) for arm, state in run.teleop.states.items()} == {"left": "lost", "right": "policy"}
+
+
 def test_what_cannot_be_used_is_told_once_while_nothing_moves() -> None:
     run = Run()
     fault = ActionChunk(np.zeros(0), PERIOD, fault=Reason.of(ReasonKind.POLICY_UNUSABLE, text="no numbers"))

@@ -10,7 +10,9 @@ from q2r2_control.control.geometry.collision import CollisionData, CollisionMode
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.kernel_pointers import KernelPointers, pointers_to
 from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox
+from q2r2_control.control.safety.reference_history import ReferenceHistory
 from q2r2_control.control.safety.speed_bound import BodyVelocities
+from q2r2_control.control.safety.tool_speed import ToolLimits, ToolSpeeds
 from q2r2_control.types import Array
 
 # A pair that is closer than its distance by less than this is not too close, see stop_certificate.py.
@@ -35,11 +37,14 @@ class SafetyModel(NamedTuple):
     approach: Approach
     min_distance: Array  # (p,) of every pair [m]; minus infinity: it does not count now
     arm: IntArray  # (nv,) number of the arm that a joint belongs to; joints of none share the last number
+    of_two_arms: IntArray  # (p,) 1: both bodies move, and no joint moves both
+    tools: ToolLimits
 
 
 _SAMPLES = 65  # of a stop, both ends among them
 INSTANTS = (0, 20, 64)  # of 64, where a row looks at the stop: the start, half of the way, and the end
-_ROWS_PER_PAIR = 5 * len(INSTANTS)  # the closest points and four segment ends, at each
+# The closest points and four segment ends at each, and one of an arm that follows another.
+_ROWS_PER_PAIR = 5 * len(INSTANTS) + 1
 
 
 class ReferenceState(NamedTuple):
@@ -113,8 +118,8 @@ class Rollout(NamedTuple):
 class ActiveBounds(NamedTuple):
     """The limits that held the last step back; the first ``used[0]`` are valid."""
 
-    kind: IntArray  # (k,) POSITION, VELOCITY or ACCELERATION of a joint, or SEPARATION of a pair
-    subject: IntArray  # (k,) index of the joint or the pair
+    kind: IntArray  # (k,) POSITION, VELOCITY or ACCELERATION of a joint, SEPARATION of a pair, TOOL_SPEED of a tool
+    subject: IntArray  # (k,) index of the joint, the pair or the tool
     used: IntArray  # (1,)
 
 
@@ -135,11 +140,13 @@ class SafetyData(NamedTuple):
     rollout: Rollout
     active: ActiveBounds
     unproven: IntArray  # (1,) pair that the last certificate failed for
+    history: ReferenceHistory
+    tools: ToolSpeeds
 
     @classmethod
     def empty(cls, model: SafetyModel) -> SafetyData:
         pairs, nv = len(model.collision.pairs.first), len(model.limits.lower)
-        rows = _ROWS_PER_PAIR * pairs
+        rows, tools = _ROWS_PER_PAIR * pairs, len(model.tools.joint)
         return cls(
             state=ReferenceState(*np.zeros((3, nv))),
             collision=CollisionData.empty(model.collision),
@@ -159,17 +166,21 @@ class SafetyData(NamedTuple):
             certified=np.ones(nv),
             candidate=Candidate(*np.zeros((2, nv)), *np.ones((1, nv))),
             rollout=Rollout.empty(model.collision),
-            active=ActiveBounds(*np.zeros((2, nv + rows), dtype=np.int64), *np.zeros((1, 1), dtype=np.int64)),
+            active=ActiveBounds(*np.zeros((2, nv + rows + tools), dtype=np.int64), *np.zeros((1, 1), dtype=np.int64)),
             unproven=np.zeros(1, dtype=np.int64),
+            history=ReferenceHistory.empty(model.collision, CollisionData.empty(model.collision)),
+            tools=ToolSpeeds.empty(model.tools),
         )
 
 
 def provable_distances(model: SafetyModel, data: SafetyData) -> Array:
     """d - S of every pair (p,) [m]: the stop that is at hand brings it no closer than that (stop_certificate.py).
 
+    Nor does what the arms may still be at, see arm_skew.py.
+
     Needs the distances at the reference as it is. A pair may be asked to keep as much from now on. Then the stop at
     hand is proven with that, as if it had always been so.
     """
-    pairs, travel = model.collision.pairs, 0.5 * data.state.v**2 / data.certified
+    pairs, travel = model.collision.pairs, np.maximum(0.5 * data.state.v**2 / data.certified, data.history.travel)
     way = (pairs.reach * travel[pairs.joint - 1]).sum(axis=1)  # reach is 0 where there is no joint
     return np.asarray(data.distance - way)

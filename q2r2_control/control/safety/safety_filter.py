@@ -13,14 +13,17 @@ from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.safety.joint_limits import ACCELERATION, NO_LIMIT
+from q2r2_control.control.safety.reference_history import remember
 from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
-from q2r2_control.control.safety.speed_bound import fastest_approach, fastest_body
+from q2r2_control.control.safety.speed_bound import fastest_approach, fastest_body, speed_of
 from q2r2_control.control.safety.stop_certificate import certify, is_too_close
 from q2r2_control.control.safety.stop_rollout import SHAPES, TOGETHER, brake, stay_with_stop, write_stop
+from q2r2_control.control.safety.tool_speed import keeps_tool_speed
 from q2r2_control.types import Array
 
 FOLLOWED, REDUCED, STOPPED = 0, 1, 2
 SEPARATION = ACCELERATION + 1  # what may hold a pair of bodies back, next to the limits of joints
+TOOL_SPEED = SEPARATION + 1  # what may hold a tool back
 _BISECTIONS = 4
 _ACTIVE = 1e-7  # [rad/s] from a bound
 
@@ -36,6 +39,7 @@ def apply_safety_filter(
     """
     q, v, candidate = data.state.q, data.state.v, data.candidate
     outcome = STOPPED
+    data.tools.held[:] = 0
     if usable:
         total = 0.0
         for j in range(q.shape[0]):
@@ -47,6 +51,7 @@ def apply_safety_filter(
             outcome = _largest_certified(model, data, h)
     if outcome == STOPPED:
         brake(q, v, data.certified, h, candidate.q, candidate.v)
+    remember(data.history, q, v, candidate.v, h)
     for j in range(q.shape[0]):
         # Rounding of a difference over a tiny h may exceed the limit that the velocities keep.
         limit = model.limits.acceleration[j]
@@ -113,7 +118,8 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
     if _certify_mixture(model, data, 1.0, h, too_close):
         _keep_stop(data)
         return FOLLOWED
-    if is_too_close(model, data, data.unproven[0]) and not data.state.v.any():
+    unproven = data.unproven[0]
+    if unproven >= 0 and is_too_close(model, data, unproven) and not data.state.v.any():
         return STOPPED  # less of a motion from rest would come closer too, and trying takes long beside many pairs
     low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):
@@ -143,9 +149,10 @@ def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: floa
 @kernel
 def _some_stop_certified(model: SafetyModel, data: SafetyData, h: float, shapes: int) -> bool:
     """Whether one of the first ``shapes`` of stops proves the candidate; it is the candidate's then."""
+    data.unproven[0] = -1
     for shape in range(shapes):
         write_stop(model, data.candidate.q, data.candidate.v, shape, data.candidate.deceleration)
-        if certify(model, data, h):
+        if keeps_tool_speed(model, data, h) and certify(model, data, h):
             return True
     return False
 
@@ -180,6 +187,10 @@ def _note_active(data: SafetyData) -> float:
         slack = max(slack, rows.lower[i] - rate)
         if rate <= rows.lower[i] + _ACTIVE:
             active.kind[count], active.subject[count] = SEPARATION, rows.pair[i]
+            count += 1
+    for i in range(data.tools.held.shape[0]):
+        if data.tools.held[i] == 1:
+            active.kind[count], active.subject[count] = TOOL_SPEED, i
             count += 1
     active.used[0] = count
     return slack
@@ -222,7 +233,12 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
         far = distance[p] >= least
         if far and distance[p] > always + horizon * fastest:
             continue  # whichever its bodies are, without a look at them
-        relevant = always + horizon * fastest_approach(data.velocities, pairs.first[p], pairs.second[p])
+        first, second = pairs.first[p], pairs.second[p]
+        if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:  # either may stop alone
+            approach_speed = speed_of(data.velocities, first) + speed_of(data.velocities, second)
+        else:
+            approach_speed = fastest_approach(data.velocities, first, second)
+        relevant = always + horizon * approach_speed
         if far and distance[p] > relevant:
             continue
         distance[p] = measure(collision, data.collision, p)

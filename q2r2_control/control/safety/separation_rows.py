@@ -35,6 +35,7 @@ from q2r2_control.control.geometry.closest_points import dot, segment_segment, s
 from q2r2_control.control.geometry.collision import CollisionData
 from q2r2_control.control.geometry.pair_distance import distance_row, measure, measure_part
 from q2r2_control.control.jit import inlined_kernel, kernel
+from q2r2_control.control.safety.following_rows import append_following_row
 from q2r2_control.control.safety.safety_data import INSTANTS, SafetyData, SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, stay_with_stop
@@ -93,6 +94,8 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
             count = _append_row(model, data, at, p, distance, moment, count)
             if count > before:
                 count = _append_end_rows(model, data, at, p, distance, moment, count)
+        if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:
+            count = append_following_row(model, data, p, h, duration, model.approach.gain[0], count)
     data.rows.used[0] = count
 
 

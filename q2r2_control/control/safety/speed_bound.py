@@ -100,8 +100,14 @@ def fastest_body(velocities: BodyVelocities) -> float:
     """Bound on the speed of any point of any geometry [m/s]."""
     fastest = 0.0
     for g in range(velocities.swing.shape[0]):
-        fastest = max(fastest, size_of(velocities.middle[g]) + velocities.swing[g])
+        fastest = max(fastest, speed_of(velocities, g))
     return fastest
+
+
+@inlined_kernel
+def speed_of(velocities: BodyVelocities, g: int) -> float:
+    """Bound on the speed of any point of a geometry [m/s]."""
+    return size_of(velocities.middle[g]) + velocities.swing[g]
 
 
 @kernel

@@ -22,6 +22,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.pair_distance import distance_row, measure
 from q2r2_control.control.jit import inlined_kernel, kernel
+from q2r2_control.control.safety.arm_skew import is_far, keeps_apart_at_any_time, write_way
 from q2r2_control.control.safety.safety_data import ROUNDING, SafetyData, SafetyModel
 from q2r2_control.control.safety.separating_plane import stays_beyond
 from q2r2_control.control.safety.speed_bound import least_distance, way, write_deviations
@@ -55,19 +56,24 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     duration = begin_rollout(data)
     write_step(data, h)
     time = write_deviations(model, data, h, duration)
-    farthest = 0.0  # that any joint travels in the step and the stop [rad or m]
+    history = data.history
+    apart = history.window[0] > 0.0
+    if apart:
+        write_way(model, data, h, duration)
+    farthest = 0.0  # that any joint travels in the step and the stop, or did in the window [rad or m]
     for j in range(data.rollout.step.travel.shape[0]):
-        farthest = max(farthest, data.rollout.step.travel[j] + data.rollout.stop.travel[j])
+        farthest = max(farthest, data.rollout.step.travel[j] + data.rollout.stop.travel[j], history.travel[j])
     for p in range(data.distance.shape[0]):
         if data.distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
             continue  # no joint travels farther, so the way is no longer
-        if _has_room(model, data, p, time):
+        alone = apart and model.of_two_arms[p] == 1  # each of the two may be anywhere on its way
+        if is_far(model, data, p, time) if alone else _has_room(model, data, p, time):
             continue
         data.unproven[0] = p
         if is_too_close(model, data, p):
             if not _comes_no_closer(model, data, p, duration, _CLOSER):
                 return False
-        elif not _keeps_apart(model, data, p, h, duration):
+        elif not _keeps_apart(model, data, p, h, duration, alone):
             return False
     return True
 
@@ -79,14 +85,19 @@ def is_too_close(model: SafetyModel, data: SafetyData, p: int) -> bool:
 
 
 @kernel
-def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float) -> bool:
-    """Prove pair ``p`` apart in the step and in the stop: with one plane, or else piece by piece."""
+def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, alone: bool) -> bool:
+    """Prove pair ``p`` apart in the step and in the stop: with one plane, or else piece by piece.
+
+    ``alone``: also where its arms go and stop at different times.
+    """
     data.distance[p] = measure(model.collision, data.collision, p)
     if data.distance[p] < model.min_distance[p] - 0.5 * ROUNDING and not _comes_no_closer(
         model, data, p, duration, _NOISE
     ):
         return False  # or the digits below would add up, tick by tick, to more than rounding
     threshold = min(model.min_distance[p], data.distance[p] - _LAST_DIGITS)
+    if alone:  # which at the same time is a part of
+        return keeps_apart_at_any_time(model, data, p, duration, threshold)
     if stays_beyond(model.collision, data.collision, p, data.rollout.step, h, data.rollout.stop, duration, threshold):
         return True
     if not _step_keeps_apart(model, data, p, h, duration, threshold):

@@ -54,6 +54,7 @@ def tools_of(robot: Robot) -> Tools:
 
 
 ROTATION_LENGTH = 0.3  # [m/rad]
+_SHARE_OF_LIMIT = 0.9  # of a tool's speed limit that its task asks for: the certificate needs some of it
 
 
 class Motion(NamedTuple):
@@ -68,10 +69,11 @@ class Motion(NamedTuple):
 
 def motion_of(settings: ControllerSettings) -> Motion:
     """Gains and speeds as the kernels read them."""
+    limit = np.inf if settings.tool_speed_limit is None else settings.tool_speed_limit
     return Motion(
         gain=np.array([settings.position_gain, settings.rotation_gain]),
         deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
-        full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
+        full_speed=np.array([min(settings.max_linear_speed, _SHARE_OF_LIMIT * limit), settings.max_angular_speed]),
         stretch_gain=np.array([settings.stretch_gain]),
         weight=np.array([*settings.position_weights, *settings.rotation_weights], dtype=np.float64),
     )

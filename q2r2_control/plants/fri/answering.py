@@ -19,7 +19,7 @@ from ipaddress import ip_address
 from subprocess import TimeoutExpired
 
 from q2r2_control.errors import PlantError
-from q2r2_control.plants.fri.session import ArmSession, follow
+from q2r2_control.plants.fri.session import ArmSession, answer, follow
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import LONGEST, read_monitoring
 from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of, start_python
@@ -177,18 +177,18 @@ class _Answering:
         return False
 
     def _answer(self, line: Line, opened: socket.socket) -> None:
-        session, state = line.session, line.session.state
+        state = line.session.state
         try:
             datagram, extra, _, source = opened.recvmsg(LONGEST + 1, _EXTRA)
             if source[0] != line.address:
                 return
             came = time.monotonic() - _waited(extra)
             before, state.took = state.newest, None
-            answer = session.answer(datagram, came)
+            reply = answer(self._sessions, state.arm, datagram, came)
             if state.newest is not before:
                 line.newest = datagram
-            if answer is not None:
-                opened.sendto(answer, source)
+            if reply is not None:
+                opened.sendto(reply, source)
                 state.took = time.monotonic() - came
         except OSError:  # a cabinet that is gone refuses; its silence is noticed
             return

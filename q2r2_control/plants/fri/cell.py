@@ -22,7 +22,7 @@ from q2r2_control.plants.fri.session import DELAY
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import JOINTS, CommandKind, Monitoring, joints_of
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Command, CommandMode, RobotState
+from q2r2_control.types import ArmTiming, Command, CommandMode, RobotState
 
 # From the decision how far the reference goes until the sessions have it, and after commands that came too late [s].
 # The reference then goes farther ahead by the difference.
@@ -168,6 +168,14 @@ class FriCell:
         is_torque = any(state.wanted is CommandKind.TORQUE for state in states)
         farther = self._ahead - self._period
         return 0.0 if is_torque else farther + DELAY + _PASSING + 2.5 * max(state.period for state in states)
+
+    def timings(self) -> dict[str, ArmTiming]:
+        """Of all arms that were heard, at the newest tick. Torques are for no time: there only silence tells."""
+        return {arm: state.timing(self._now) for arm, state in self.states.items() if state.newest is not None}
+
+    def lead(self) -> float:
+        """See :meth:`SessionPlant.lead`."""
+        return DELAY + self._ahead + self._period
 
     def openings(self) -> dict[str, float]:
         """Measured opening of each gripper that has an input, 0 closed .. 1 open."""

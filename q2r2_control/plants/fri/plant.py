@@ -20,7 +20,7 @@ from q2r2_control.plants.fri.waiting import CabinetWait
 from q2r2_control.plants.fri.wire import JOINTS, CommandKind
 from q2r2_control.plants.modbus_gripper import ModbusGripper
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Command, CommandMode, RobotState
+from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
 _KEPT = 100_000  # answers; the garbage collector goes through all of them in mid-run
@@ -155,6 +155,14 @@ class FriPlant:
     def delay(self) -> float:
         """See :meth:`FriCell.delay`."""
         return self.cell.delay()
+
+    def timings(self) -> dict[str, ArmTiming]:
+        """See :meth:`FriCell.timings`."""
+        return self.cell.timings()
+
+    def lead(self) -> float:
+        """See :meth:`FriCell.lead`."""
+        return self.cell.lead()
 
     def fault(self) -> Reason | None:
         """See :meth:`FriCell.fault`."""

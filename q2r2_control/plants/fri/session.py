@@ -72,6 +72,7 @@ class ArmSession:
         self._answers = 0
         self._times: AnswerTimes | None = None
         self._clock = MessageClock(-math.inf)
+        self.waits = 0.0  # how far its answers wait for the other arms [s]
         self._begun = False  # the cabinet's own position is known, where the path begins
 
     def is_still(self, now: float) -> bool:
@@ -228,14 +229,14 @@ class ArmSession:
             self._times.restart()
         if self.state.wanted is CommandKind.TORQUE:
             return self._torque(message, now)
-        question = message.counter, self._clock.expected, counter, message.reflected
+        question = message.counter, self._clock.expected - self.waits, counter, message.reflected
         time, state = self._times.at(*question), self.state
-        wanted = self._clock.expected - DELAY
+        wanted = self._clock.expected - self.waits - DELAY
         if abs(wanted - time) > message.period and self._rests(min(time, wanted)):
             self._times.restart()  # where nothing moves, and nothing is known that will, an answer may be for any time
             time = self._times.at(*question)
         state.answered, state.lag = max(state.answered, time), now - DELAY - time
-        state.expected = self._clock.expected
+        state.expected, state.behind = self._clock.expected, self._clock.expected - DELAY - time
         return FriCommand(counter, reflected, joints_of(self.path.at(time)), io=self._io(message))
 
     def _io(self, message: Monitoring) -> dict[str, IoValue]:
@@ -265,6 +266,16 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
     for arm, command in commands.items():
         sessions[arm].follow(command)
     return True
+
+
+def answer(sessions: Mapping[str, ArmSession], arm: str, datagram: bytes, now: float) -> bytes | None:
+    """As :meth:`ArmSession.answer` of one ``arm``, which waits for those that are behind.
+
+    It waits by half of what they are behind. They catch up meanwhile, and so all arrive where none is behind.
+    """
+    lags = [other.state.timing(now).lag for name, other in sessions.items() if name != arm and other.state.following]
+    sessions[arm].waits = 0.5 * max(0.0, *lags, 0.0)
+    return sessions[arm].answer(datagram, now)
 
 
 def _ahead(message: Monitoring, before: Monitoring) -> int:

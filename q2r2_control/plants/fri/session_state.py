@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.plants.fri.answers import CATCH_UP
 from q2r2_control.plants.fri.wire import JOINTS, CommandKind, IoValue, Joints, Monitoring, Safety, Session, in_words
+from q2r2_control.types import ArmTiming
 
 TORQUE_PERIOD = 0.005  # between two answers at most: with 0.01 the arm swings up at the default stiffness [s]
 _SILENT = 0.1  # a cabinet without a message for longer is gone [s]
@@ -34,6 +35,7 @@ class SessionState:
     answered: float = -math.inf  # the latest time that an answer was for
     expected: float = -math.inf  # when the message of that answer would have come, had nothing made it late
     lag: float = 0.0  # of the answers behind where they are to be
+    behind: float = 0.0  # the same by the cabinet's clock, whenever its messages arrive
     took: float | None = None  # from the newest message's arrival until its answer was sent; None: it got none
     lost: int = 0  # messages of the cabinet
     unreadable: int = 0
@@ -59,6 +61,10 @@ class SessionState:
 
     def is_silent(self, now: float) -> bool:
         return now - self.arrival > _SILENT
+
+    def timing(self, now: float) -> ArmTiming:
+        """When the arm does what its reference says, at ``now`` [s]."""
+        return ArmTiming(self.behind, now - self.arrival, self.period)
 
     def latest(self, t: float) -> float:
         """The latest time that an answer until ``t`` may be for [s]."""

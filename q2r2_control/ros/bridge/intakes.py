@@ -34,12 +34,15 @@ from q2r2_control.ros.bridge.messages import (
 )
 from q2r2_control.ros.monitoring import Publishers
 from q2r2_control.supervision.targets import DelayWatch
-from q2r2_control.types import Array, RobotState
+from q2r2_control.types import ArmTiming, Array, RobotState
 from q2r2_control.wording import sentence
 
 _SHARED = "joint_states"  # where no other topic is asked for
 _LATEST = 0.02  # that a target is received, later than others after the time of its stamp, for that to say anything [s]
 _OLD = 0.5  # a target that is older than the one before it, by so much, was made before its sender stood still [s]
+_LONGEST_PERIOD, _PERIOD_SHARE = 0.02, 0.05  # of joint states that may tell arms apart in time [s], and of its mean
+COMMAND_TIME = 0.01  # that a command takes to its driver and arm, where drivers do not tell [s]
+_LAG_NOISE = 0.01  # of a lag that is found in joint states [s]
 _WARNING_TIME = 1.0  # refused targets are reported for this long [s]
 # Takes an arm's target in the world frame, or None if it is no pose, the time [s], the message's number, and when the
 # target is due [s], or None.
@@ -164,6 +167,7 @@ class JointIntake:
         self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
         self._others = {topic: tuple(set(robot.arms).difference(its)) for topic, its in self._topics.items()}
         self._stamps = dict.fromkeys(self._topics, -math.inf)
+        self._periods = dict.fromkeys(self._topics, _LONGEST_PERIOD)  # between messages, as a rule [s]
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
         what = 'external torques of all joints, for admittance and vibrations: effort of a JointState; "": none'
         self._external_topic = node.parameter("external_torque_topic", "", what)
@@ -195,6 +199,17 @@ class JointIntake:
         where = f" on {topic}" if len(self._topics) > 1 else ""
         return self._publishers.source(topic) + where
 
+    def timings(self, now: float) -> dict[str, ArmTiming]:
+        """When arms with topics of their own are measured, at ``now`` [s]; empty: one driver moves all, or none yet."""
+        if len(self._topics) < 2 or self.state is None:
+            return {}
+        silent = {topic: now - stamp for topic, stamp in self._stamps.items()}
+        return {
+            arm: ArmTiming(None, silent[topic], self._periods[topic], _LAG_NOISE)
+            for topic, arms in self._topics.items()
+            for arm in arms
+        }
+
     def _on_message(self, take: TakeState, look: Callable[[JointState], None], topic: str, message: JointState) -> None:
         look(message)
         names = self._names[topic]
@@ -211,6 +226,8 @@ class JointIntake:
             text = part if len(self._topics) == 1 else f"{topic}: {part}"
             take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=text), now)
             return
+        passed = min(now - self._stamps[topic], _LONGEST_PERIOD)
+        self._periods[topic] += _PERIOD_SHARE * (passed - self._periods[topic])
         self._stamps[topic] = now
         oldest = min(self._stamps.values())
         self._values[:, self._joints[topic]] = part.q, part.v, part.tau

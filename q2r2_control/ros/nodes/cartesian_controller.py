@@ -23,7 +23,7 @@ from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, OK, WARN, ManagedNode
 from q2r2_control.ros.bridge.controller_feedback import GRIPPER_DELAY, ControllerFeedback, GripperLimits
-from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
+from q2r2_control.ros.bridge.intakes import COMMAND_TIME, JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import KINDS, NONE, make_output
 from q2r2_control.ros.bridge.lbr_driver import LbrDrivers
 from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live, make_watching_live
@@ -58,7 +58,8 @@ class CartesianControllerNode(ManagedNode):
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
         rate = self.parameter("rate", 250.0, "of the control loop [Hz]", within=(20, 1000))
         output = self.parameter("output", "trajectory", "what the arms are commanded with", one_of=(*KINDS, NONE))
-        if output == NONE:
+        self._only_leads = output == NONE
+        if self._only_leads:
             config = settings_for_external_arms(config)
         robot = Robot.from_config(config)
         self._period = 1.0 / rate
@@ -93,19 +94,19 @@ class CartesianControllerNode(ManagedNode):
             streams,
             watch,
             origins=Origins(self._joints.source, self._targets.source),
-            external=ExternalArms(robot, self._controller, external, streams, watch) if output == NONE else None,
+            external=ExternalArms(robot, self._controller, external, streams, watch) if self._only_leads else None,
             gripper_delay=GRIPPER_DELAY,
             owns_plant=False,
         )
         self._supervisor = self._loop.supervisor
         # Another controller's arms are judged with fingers all of their way.
-        asking = self._targets.topics if output != NONE else {}
+        asking = {} if self._only_leads else self._targets.topics
         self._grippers = GripperLimits(self, config, self._loop, asking)
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
         self._commanding, self._advances = False, 0  # ticks that have gone by some time
         # Another controller follows every safe target; arms that listen tick a hundred times a second.
-        every = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
+        every = 1 if self._only_leads else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._last_tick = self.now
         self._deactivated = Reason.of(ReasonKind.CONTROLLER_DEACTIVATED, controller=self.get_fully_qualified_name())
@@ -141,6 +142,8 @@ class CartesianControllerNode(ManagedNode):
 
     def _advance(self, now: float, dt: float, decided: float) -> None:
         self._advances += 1
+        if not self._only_leads:  # another controller's arms are judged by where they are measured
+            self._loop.watch_skew(self._joints.timings(now), self._period + COMMAND_TIME, now)
         if self._supervisor.phase is Phase.INACTIVE and self._grippers.awaits(now):
             return
         # Commands that the arms do not follow are not for a receiver that has just come.

@@ -14,10 +14,10 @@ from q2r2_control.plants.base import check_command
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
 from q2r2_control.plants.fri.cabinet_server import SimulatedArms, outputs_of
 from q2r2_control.plants.fri.cell import FriCell
-from q2r2_control.plants.fri.session import ArmSession, follow
+from q2r2_control.plants.fri.session import ArmSession, answer, follow
 from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Command, CommandMode, RobotState
+from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 
 _BEGIN = -0.1  # of the cabinets [s]
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
@@ -64,6 +64,7 @@ class VirtualCabinets:
         self.on_message: Callable[[str, float], None] = lambda arm, t: None
         self.asleep_until = -1.0  # nothing of this computer's is done before [s]
         self.stands_until = dict.fromkeys(self.cabinets, -1.0)  # a cabinet does nothing before [s]
+        self.unplugged: set[str] = set()  # cabinets whose cable is pulled: nothing goes either way
         self.thinking = 0.0  # time that passes between the beginning of a tick and its command [s]
         self._mode = CommandMode.POSITION
 
@@ -90,6 +91,12 @@ class VirtualCabinets:
     def due(self, now: float) -> tuple[float, float]:
         self._pass(now)
         return self.cell.due(now)
+
+    def timings(self) -> dict[str, ArmTiming]:
+        return self.cell.timings()
+
+    def lead(self) -> float:
+        return self.cell.lead()
 
     def fault(self) -> Reason | None:
         return self.cell.fault()
@@ -150,16 +157,16 @@ class VirtualCabinets:
         elif self.heard[arm] and self.heard[arm][-1] is not None:
             self.heard[arm].append(np.full(7, np.nan))
         self._at(self.now + cabinet.settings.period * self._rates[arm], self._send, arm)
-        if self._random.random() >= self._loss:
+        if self._random.random() >= self._loss and arm not in self.unplugged:
             self._at(max(self.now + self._late(), self.asleep_until), self._receive, arm, write_monitoring(message))
 
     def _receive(self, arm: str, datagram: bytes) -> None:
         answer = self.answer(arm, datagram)
-        if answer is not None and self._random.random() >= self._loss:
+        if answer is not None and self._random.random() >= self._loss and arm not in self.unplugged:
             self._at(self.now + self._late(), self.cabinets[arm].receive, answer)
 
     def answer(self, arm: str, datagram: bytes) -> bytes | None:
         """A datagram as the process that answers takes it."""
-        answer = self.lines[arm].answer(datagram, self.now)
+        reply = answer(self.lines, arm, datagram, self.now)
         self.cell.update(copy(self.lines[arm].state))
-        return answer
+        return reply

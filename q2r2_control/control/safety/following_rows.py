@@ -1,0 +1,68 @@
+"""Rows of the QP for an arm that moves after another one, which may stop alone (arm_skew.py).
+
+The arm in front may be where it was a window D ago. Along the pair's normal n the arm behind it has free
+
+    B = d - min_distance - buffer - n'(the front's way in the window) - n'(the way of the stop behind).
+
+As in separation_rows.py a step uses up no more than a share of it, B+ >= (1 - gain h) B. What the one in front does now
+counts after D only. In a step B therefore changes by its way of D ago, and by what the one behind decides now.
+"""
+
+from __future__ import annotations
+
+from q2r2_control.control.geometry.closest_points import size_of
+from q2r2_control.control.geometry.pair_distance import distance_row, measure
+from q2r2_control.control.jit import kernel
+from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
+
+
+@kernel
+def append_following_row(
+    model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, gain: float, count: int
+) -> int:
+    """Add the row of pair ``p`` of two arms as number ``count`` where one follows the other, and the row may bind.
+
+    The step takes ``h``, the certified stop from here ``duration`` [s]. Returns the number of rows then.
+    """
+    pairs, history, v, row = model.collision.pairs, data.history, data.state.v, data.rows.matrix[count]
+    distance = measure(model.collision, data.collision, p)
+    if distance < model.min_distance[p] or history.counted[0] == 0:
+        return count  # one that is too close has to open, whoever is in front
+    distance_row(model.collision, data.collision, p, row)
+    first, second = 0.0, 0.0
+    for k in range(pairs.joint.shape[1]):
+        joint = pairs.joint[p, k]
+        if joint == 0:
+            break
+        rate = row[joint - 1] * v[joint - 1]
+        if pairs.sign[p, k] < 0.0:
+            first += rate
+        else:
+            second += rate
+    if min(first, second) >= 0.0 or max(first, second) <= 0.0:
+        return count
+    behind = -1.0 if first < 0.0 else 1.0
+    oldest = history.counted[0] - 1
+    free, rate, before, change = distance - model.approach.stop_distance[p], min(first, second), 0.0, 0.0
+    for k in range(pairs.joint.shape[1]):
+        joint = pairs.joint[p, k]
+        if joint == 0:
+            break
+        j = joint - 1
+        if pairs.sign[p, k] == behind:
+            free += row[j] * 0.5 * v[j] * abs(v[j]) / data.certified[j]
+            change += abs(row[j]) * model.limits.acceleration[j]
+        else:
+            free += row[j] * (history.q[oldest, j] - data.state.q[j])
+            before += row[j] * history.v[oldest, j]
+            row[j] = 0.0
+    lever = max(0.5 * duration, 0.5 * h) + 0.5 * h
+    change *= h * lever
+    allowed = -gain * h * free - h * before
+    if h * rate - change >= allowed or change <= 0.0:
+        return count
+    size = size_of(row)
+    row /= size
+    data.rows.lower[count] = (rate + (allowed - h * rate) / lever) / size
+    data.rows.pair[count] = p
+    return count + 1

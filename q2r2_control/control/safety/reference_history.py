@@ -1,0 +1,156 @@
+"""Where the reference was lately, for the proof that arms may be there still (arm_skew.py), compiled."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.control.geometry.collision import CollisionData, CollisionModel
+from q2r2_control.control.geometry.kinematics import IntArray
+from q2r2_control.control.jit import inlined_kernel, kernel
+from q2r2_control.control.kernel_pointers import KernelPointers, pointers_to
+from q2r2_control.types import Array
+
+LONGEST_WINDOW = 0.1  # that the postures of the past reach back [s]
+_POSTURES = 13
+_SPACING = LONGEST_WINDOW / (_POSTURES - 1)  # of these in time, or the length of a longer step [s]
+_LONG_AGO = 1e3  # since when arms at rest count as resting [s]
+
+
+class ReferenceHistory(NamedTuple):
+    """Where the reference was lately; postures of the past are sorted from the newest to the oldest."""
+
+    window: Array  # (2,) in force, and asked for; 0: all arms are one body [s]
+    q: Array  # (m, nv) [rad]
+    v: Array  # (m, nv) [rad/s]
+    a: Array  # (m, nv) greatest acceleration from each posture to the next newer one [rad/s^2]
+    age: Array  # (m,) of each posture [s]
+    known: Array  # (m,) 1 where the bodies of a posture are placed
+    samples: KernelPointers  # (m,) CollisionData at each
+    counted: IntArray  # (1,) number of postures that the window reaches back to
+    time: Array  # (1,) how far it reaches back [s]
+    travel: Array  # (nv,) the farthest that a joint was in the window from where it is now [rad or m]
+    off: Array  # (nv,) the most that it was off v t there, with what turning adds [rad or m]
+    speed: Array  # (nv,) its greatest speed there [rad/s]
+    bend: Array  # (2, nv) its share in how far corners are off straight lines: in the window, and on the whole way
+    deviation: Array  # (nv,) the most that it is off v t on the whole way, with what turning adds [rad or m]
+
+    @classmethod
+    def empty(cls, model: CollisionModel, shared: CollisionData) -> ReferenceHistory:
+        """At rest at zero; the samples have their scratch in common with ``shared``."""
+        nv = len(model.chain.parent) - 1
+        samples = []
+        for _ in range(_POSTURES):
+            sample = CollisionData.empty(model)
+            placements = sample.placements._replace(rotation=shared.placements.rotation)
+            samples.append(sample._replace(placements=placements, contact=shared.contact))
+        return cls(
+            window=np.zeros(2),
+            q=np.zeros((_POSTURES, nv)),
+            v=np.zeros((_POSTURES, nv)),
+            a=np.zeros((_POSTURES, nv)),
+            age=np.full(_POSTURES, _LONG_AGO),
+            known=np.zeros(_POSTURES),
+            samples=pointers_to(samples),
+            counted=np.zeros(1, dtype=np.int64),
+            time=np.zeros(1),
+            travel=np.zeros(nv),
+            off=np.zeros(nv),
+            speed=np.zeros(nv),
+            bend=np.zeros((2, nv)),
+            deviation=np.zeros(nv),
+        )
+
+    @property
+    def kept(self) -> tuple[Array, ...]:
+        """The arrays that say where the reference was; the others are made of them."""
+        return self.window, self.q, self.v, self.a, self.age
+
+
+@kernel
+def rest_always(history: ReferenceHistory, q: Array) -> None:
+    """Let the arms have rested at ``q`` (nv,)."""
+    history.window[0] = history.window[1]
+    for i in range(history.age.shape[0]):
+        history.age[i] = _LONG_AGO
+        for j in range(q.shape[0]):
+            history.q[i, j], history.v[i, j], history.a[i, j] = q[j], 0.0, 0.0
+
+
+@kernel
+def remember(history: ReferenceHistory, q: Array, v: Array, v_next: Array, h: float) -> None:
+    """Before the reference leaves ``q``, ``v`` (nv,) and has ``v_next`` after ``h`` [s]: keep it for the window."""
+    if history.window[1] == 0.0:
+        history.window[0] = 0.0
+        return
+    if history.age[0] + h > _SPACING:
+        for i in range(history.age.shape[0] - 1, 0, -1):
+            history.age[i] = history.age[i - 1]
+            for j in range(q.shape[0]):
+                history.q[i, j], history.v[i, j], history.a[i, j] = (
+                    history.q[i - 1, j],
+                    history.v[i - 1, j],
+                    history.a[i - 1, j],
+                )
+        history.age[0] = 0.0
+        for j in range(q.shape[0]):
+            history.q[0, j], history.v[0, j], history.a[0, j] = q[j], v[j], 0.0
+    for j in range(q.shape[0]):
+        if h > 0.0:
+            history.a[0, j] = max(history.a[0, j], abs(v_next[j] - v[j]) / h)
+    for i in range(history.age.shape[0]):
+        history.age[i] += h
+    history.window[0] = min(history.window[1], history.window[0] + h)
+
+
+@kernel
+def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Array) -> None:
+    """Find out where the joints were in the window, seen from the reference ``q``, ``v`` (nv,)."""
+    if history.window[0] == 0.0 and history.counted[0] == 0:
+        return  # all arms are one body, and all that is found here is 0 already
+    history.counted[0], history.time[0] = 0, 0.0
+    history.travel[:], history.off[:], history.speed[:], history.bend[0, :] = 0.0, 0.0, 0.0, 0.0
+    longest, newer, window = 0.0, 0.0, history.window[0]
+    for i in range(history.age.shape[0]):
+        if newer >= window:
+            break
+        history.known[i], history.counted[0] = 0.0, i + 1
+        moved = False
+        for j in range(q.shape[0]):
+            later = v[j] if i == 0 else history.v[i - 1, j]
+            moved |= history.v[i, j] != 0.0 or history.a[i, j] != 0.0 or later != 0.0
+        # Arms that rested did so for as long as they are asked about.
+        age = history.age[i] if moved else min(history.age[i], max(newer, window))
+        if moved:
+            longest = max(longest, age - newer)
+            for j in range(q.shape[0]):
+                later = v[j] if i == 0 else history.v[i - 1, j]
+                speed = max(abs(history.v[i, j]), abs(later)) + 0.5 * history.a[i, j] * (age - newer)
+                history.speed[j] = max(history.speed[j], speed)
+                history.bend[0, j] = max(history.bend[0, j], history.a[i, j])
+        for j in range(q.shape[0]):
+            way = history.q[i, j] - q[j]
+            history.travel[j] = max(history.travel[j], abs(way))
+            history.off[j] = max(history.off[j], abs(way + v[j] * age))
+        newer = age
+    history.time[0] = newer
+    share = 0.125 * longest * longest
+    for j in range(q.shape[0]):
+        bent = share * history.bend[0, j]
+        history.travel[j] += bent
+        history.off[j] += bent
+        history.bend[0, j] = bent + share * turning(model, history.speed, j)
+    for j in range(q.shape[0]):
+        history.off[j] += 0.5 * turning(model, history.travel, j)
+
+
+@inlined_kernel
+def turning(model: CollisionModel, way: Array, j: int) -> float:
+    """w_j (w_j + 2 sum_(i before j) w_i) of ``way`` (nv,): what a joint's motion and its turning of others add."""
+    before = 0.0
+    joint = model.chain.parent[j + 1]
+    while joint != 0:
+        before += way[joint - 1]
+        joint = model.chain.parent[joint]
+    return way[j] * (way[j] + 2.0 * before)

@@ -1,0 +1,123 @@
+"""No tool is faster than its limit: the bound along motions, and a controller whose solver works against it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, QpProblem, QpSolution, Robot, Solver
+from q2r2_control.config.cell import load_config
+from q2r2_control.control.safety.stop_rollout import SHAPES
+from q2r2_control.control.safety.tool_speed import fastest_tool
+from q2r2_control.types import Array, LimitKind
+from q2r2_control.verification.contract import Contract
+from q2r2_control.verification.tool_speeds import MeasuredToolSpeeds
+from tests.control.cells import NAMES, cell, kernel_data, kernel_model, random_posture
+from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
+
+LIMIT, DT = 0.25, 0.002
+
+
+def speeds_along(name: str, motion: Motion) -> tuple[float, float]:
+    """The fastest tool at the motion's begin, and in all of its step and its stop [m/s]."""
+    robot = cell(name).robot
+    tools, t = MeasuredToolSpeeds(robot), np.linspace(0.0, 1.0, 30)[:, None]
+    in_step = motion.v + t * (motion.v_next - motion.v)
+    q = motion.q + t * H * motion.v + 0.5 * t**2 * H * (motion.v_next - motion.v)
+    time = 1.0001 * t * np.max(np.abs(motion.v_next) / motion.deceleration)
+    moving = np.minimum(time, np.abs(motion.v_next) / motion.deceleration)
+    brake = np.sign(motion.v_next) * motion.deceleration
+    q_stop, v_stop = motion.q_next + motion.v_next * moving - 0.5 * brake * moving**2, motion.v_next - brake * moving
+    return tools.fastest(motion.q, motion.v), max(tools.fastest(q, in_step), tools.fastest(q_stop, v_stop))
+
+
+def bound_of(name: str, motion: Motion) -> float:
+    model, data = kernel_model(name).safety, kernel_data(name, motion.q, motion.v).safety
+    data.candidate.q[:], data.candidate.v[:] = motion.q_next, motion.v_next
+    data.candidate.deceleration[:] = motion.deceleration
+    return max(fastest_tool(model, data, i, H) for i in range(len(model.tools.joint)))
+
+
+@pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
+@pytest.mark.parametrize("name", NAMES)
+def test_no_tool_is_faster_than_the_bound_in_a_step_and_a_stop_of_any_shape(name: str, shape: int) -> None:
+    random, robot, shares = np.random.default_rng(71), cell(name).robot, []
+    for _ in range(40):
+        v = random.choice([0.02, 0.3, 1.0]) * random.uniform(-robot.velocity_limit, robot.velocity_limit)
+        v_next = v + random.uniform(-1, 1, robot.model.nv) * ACCELERATION * H
+        motion = motion_of(name, random_posture(robot, random), v, v_next, shape)
+        before, fastest = speeds_along(name, motion)
+        bound = bound_of(name, motion)
+        assert fastest <= max(before, bound) * (1.0 + 1e-12)
+        shares.append(fastest / bound)
+    assert max(shares) > 0.9, "a bound that nothing comes near would make arms slow"
+
+
+class Pushing:
+    """A solver that drives all joints as fast as the box allows, this way or that for a while."""
+
+    def __init__(self) -> None:
+        self._random, self._left, self._signs = np.random.default_rng(72), 0, np.ones(1)
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        if self._left == 0:
+            self._left, self._signs = 150, self._random.choice([-1.0, 1.0], len(problem.g))
+        self._left -= 1
+        return QpSolution(np.where(self._signs > 0.0, problem.upper, problem.lower), 0.0)
+
+
+def limited(robot: Robot, solver: Solver | None = None) -> CartesianController:
+    settings = load_config("config/dual_iiwa7.yaml").control
+    return CartesianController(robot, settings.model_copy(update={"tool_speed_limit": LIMIT}), solver=solver)
+
+
+def test_a_solver_that_pushes_moves_no_tool_faster_at_between_and_after_any_tick(robot: Robot) -> None:
+    controller = limited(robot, solver=Pushing())
+    contract, fastest = Contract(controller, sample_all=True), 0.0
+    for _ in range(450):
+        reference = controller.step({}, DT)
+        contract.check(reference, DT)
+        fastest = max(fastest, MeasuredToolSpeeds(robot).fastest(reference.q, reference.v))
+    assert 0.8 * LIMIT < fastest <= LIMIT
+    assert contract.margins["tool_speed"].checked > 400
+
+
+def test_a_tool_goes_near_its_limit_to_a_far_target_arrives_and_its_report_names_no_limit(robot: Robot) -> None:
+    controller = limited(robot)
+    contract, goal = Contract(controller), controller.tool_pose("left")
+    goal.translation += [0.1, 0.2, 0.1]
+    fastest, held = 0.0, 0
+    for _ in range(1500):
+        reference = controller.step({"left": goal}, DT)
+        contract.check(reference, DT)
+        fastest = max(fastest, MeasuredToolSpeeds(robot).fastest(reference.q, reference.v))
+        held += any(limit.kind is LimitKind.TOOL_SPEED for limit in reference.report.binding)
+    assert 0.85 * LIMIT < fastest <= LIMIT
+    assert held == 0
+    assert np.linalg.norm(controller.tool_pose("left").translation - goal.translation) < 1e-3
+
+
+def fast_start(robot: Robot) -> Array:
+    """Joint velocities (nv,) with which the left tool moves at three times its limit [rad/s]."""
+    data = robot.model.createData()
+    pin.computeJointJacobians(robot.model, data, robot.home)
+    J = pin.getFrameJacobian(robot.model, data, robot.arms["left"].frame_id, pin.LOCAL_WORLD_ALIGNED)[:3]
+    return np.asarray(np.linalg.pinv(J) @ [0.0, 0.0, 3.0 * LIMIT])
+
+
+def test_a_tool_that_starts_too_fast_is_braked_until_it_is_not_and_its_report_says_why(robot: Robot) -> None:
+    controller, v = limited(robot, solver=Pushing()), fast_start(robot)
+    controller.reset(robot.home, v)
+    tools, before, certified = MeasuredToolSpeeds(robot), 3.0 * LIMIT, []
+    for _ in range(220):
+        reference = controller.step({}, DT)
+        speed = tools.fastest(reference.q, reference.v)
+        assert speed <= max(LIMIT, before)
+        if speed > LIMIT:
+            assert any(one.kind is LimitKind.TOOL_SPEED and one.names == ("left",) for one in reference.report.binding)
+        before = speed
+        certified.append(reference.report.certified)
+    assert not certified[0]
+    assert all(certified[-50:])
+    assert before <= LIMIT

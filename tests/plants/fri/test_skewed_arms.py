@@ -1,0 +1,22 @@
+"""Two arms that swing alike near each other, each behind its cabinet: one lags, or it stops alone."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.plants.fri.skewed_arms import CASES, Case
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_measured_arms_keep_their_distance_whatever_happens_to_one_of_them(case: str) -> None:
+    found = Case(case, 0.5).run()
+    assert found.speed > 0.35
+    assert found.margin >= 0.0
+    assert found.error < 0.02 or case == "answers 0.25 s apart", "they are followed as long as they are together"
+
+
+@pytest.mark.parametrize("case", ["cable pulled", "pendant stopped"])
+def test_the_other_arm_rests_in_the_time_of_two_messages_and_its_stop(case: str) -> None:
+    assert Case(case, 0.5).run().rest < 0.2

@@ -1,0 +1,95 @@
+"""Arms that are not at the same place of the one reference brake together, whichever loop moves them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control import CartesianController, Robot
+from q2r2_control.events import ReasonKind
+from q2r2_control.supervision.arm_skew import SkewWatch, allowed_skew, skew_window
+from q2r2_control.types import ArmTiming
+from tests.supervision.test_supervisor import DT, World, raised
+
+PERIOD = 0.005  # of the arms' messages [s]
+
+
+def timings(left: float = 0.0, right: float = 0.0, silent: tuple[float, float] = (0.0, 0.0)) -> dict[str, ArmTiming]:
+    """Of two arms that are so far behind, and ``silent``, in periods."""
+    behind = {"left": left, "right": right}
+    return {
+        arm: ArmTiming(PERIOD * lag, PERIOD * quiet, PERIOD)
+        for (arm, lag), quiet in zip(behind.items(), silent, strict=True)
+    }
+
+
+@pytest.mark.parametrize(
+    ("found", "holds"),
+    [
+        pytest.param(timings(), False, id="both in time"),
+        pytest.param(timings(left=50.0, right=50.0), False, id="both late alike"),
+        pytest.param(timings(left=1.0, silent=(1.0, 0.0)), False, id="one message lost"),
+        pytest.param(timings(left=2.3), True, id="more than two periods apart"),
+        pytest.param(timings(right=2.3), True, id="the other one behind"),
+        pytest.param(timings(left=1.5, silent=(1.9, 0.0)), True, id="behind, and a message is missing"),
+        pytest.param(timings(silent=(2.5, 0.1)), True, id="one silent for two periods"),
+        pytest.param(timings(silent=(20.0, 20.0)), False, id="this loop stood still"),
+        pytest.param({"left": ArmTiming(1.0, 1.0, PERIOD)}, False, id="a single arm"),
+        pytest.param({}, False, id="arms that move as one"),
+    ],
+)
+def test_arms_are_held_up_while_they_are_apart_in_time(found: dict[str, ArmTiming], holds: bool) -> None:
+    watch = SkewWatch()
+    watch.observe(found, 0.0)
+    assert watch.holds == holds
+
+
+def test_the_window_holds_the_allowed_skew_and_two_messages_more() -> None:
+    found = timings()
+    assert skew_window(found, 0.004) == pytest.approx(allowed_skew(found) + 2.0 * PERIOD + 0.004)
+    assert skew_window({"left": found["left"]}, 0.004) == 0.0
+
+
+def test_arms_that_are_apart_for_long_name_the_one_that_is_behind() -> None:
+    watch = SkewWatch()
+    watch.observe(timings(), 0.0)
+    watch.observe(timings(right=4.0), 0.05)
+    assert watch.fault(0.05) is None
+    watch.observe(timings(right=4.0), 0.11)
+    fault = watch.fault(0.11)
+    assert fault is not None
+    assert (fault.kind, fault.detail["arm"]) == (ReasonKind.ARMS_APART, "right")
+
+
+def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_is_not(
+    robot: Robot, controller: CartesianController
+) -> None:
+    world = World(robot, controller)
+    left, right = world.engage_both()
+
+    def go(seconds: float, skew: float) -> float:
+        """Both up by 50 mm; returns how fast the fastest joint is in the end [rad/s]."""
+        for _ in range(round(seconds / DT)):
+            world.supervisor.skew.observe(timings(left=skew), world.now)
+            world.run(DT, raised(left, 0.05), right=raised(right, 0.05))
+        before, now = world.commanded[-2:]
+        assert before is not None
+        assert now is not None
+        return float(np.abs(now - before).max() / DT)
+
+    fastest = go(0.1, 0.0)
+    assert go(0.03, 3.0) < fastest - 0.2
+    assert world.states == ["following"] * 2
+    go(1.0, 0.0)
+    assert world.states == ["following"] * 2
+    assert controller.tool_pose("left").translation[2] == pytest.approx(left.translation[2] + 0.05, abs=1e-3)
+
+
+def test_arms_that_stay_apart_are_activated_anew_from_rest(robot: Robot, controller: CartesianController) -> None:
+    world = World(robot, controller)
+    left, right = world.engage_both()
+    for _ in range(60):
+        world.supervisor.skew.observe(timings(left=3.0), world.now)
+        world.run(DT, raised(left, 0.05), right=raised(right, 0.05))
+    assert ReasonKind.ARMS_APART in {event.root.kind for event in world.supervisor.events}
+    assert world.states != ["following"] * 2
