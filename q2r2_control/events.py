@@ -122,6 +122,11 @@ class ReasonKind(StrEnum):
         "controller_deactivated",
         "{controller} is deactivated: ros2 lifecycle set {controller} activate takes over where the arms are",
     )
+    CONTROLLER_ABSENT = (
+        "controller_absent",
+        "{controller} is not there: nobody publishes {topic} ({type}); another controller than the built-in one needs "
+        "its preset",
+    )
     CONTROLLER_RESTARTED = "controller_restarted", "{controller} was restarted"
     CONTROLLER_ENDED = "controller_ended", "{controller} has ended"
     NODE_BEGINS = "node_begins", "the node has not begun yet"

@@ -111,7 +111,8 @@ class ExternalConfig(StrictModel):
 
     preset: str = Field(description=f"its terms: {', '.join(_EXTERNAL)}")
     mode: Mode = Field(
-        Mode.RAW, description="raw: the hand's target; filtered: what the built-in controller makes of it"
+        Mode.FILTERED,
+        description="filtered: what the built-in controller makes of the hand's target; raw: that target itself",
     )
     rate: float | None = Field(None, ge=1, le=1000, description="of what it is sent; none: as the preset says [Hz]")
     world_frame: FrameName | None = Field(

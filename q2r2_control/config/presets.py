@@ -133,6 +133,10 @@ class Mode(StrEnum):
     FILTERED = "filtered"  # what the built-in controller makes of it: within limits and free of collisions
 
 
+# What whoever chooses mode raw has to know, at the start and in q2r2 check.
+RAW_WARNING = "raw: no limits, no distances, no self-collision"
+
+
 def preset_of(name: str, mode: str) -> tuple[Preset, Mode]:
     """Preset and mode by their names. Raises :class:`ConfigError` for names and pairs that are not allowed."""
     if name not in PRESETS:

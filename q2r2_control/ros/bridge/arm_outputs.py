@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from importlib import import_module
 from typing import Any
 
@@ -26,6 +27,8 @@ _POSE = 2  # of moveit_msgs/srv/ServoCommandType
 # Reports of the built-in controller on an arm that takes a stream of targets.
 _READY = ("holding", "following", "homing")
 _ANSWER = 0.2  # the controller has told of all earlier streams by then [s]
+_STATE_TYPE = "std_msgs/msg/String"
+_SILENT = 2.0  # a controller that has not reported for so long does not answer; it reports twice a second [s]
 _RETRY = 1.0  # the service is called again if it has not answered for this long [s]
 
 
@@ -162,8 +165,8 @@ class FollowWatch:
     """Whether the built-in controller follows the targets of an arm, as it publishes on ``~/following/<arm>``.
 
     It drops a stream for reasons of its own, such as missing joint states. It then accepts only a new one, for which
-    the arm has to be paused. A controller that publishes nothing here is taken to follow. One that reports on
-    ``~/state`` is not ready before it has: it may have no joint states.
+    the arm has to be paused. A controller is ready only while it reports on ``~/state``: it may have no joint states,
+    or be another one, whose terms the built-in controller's targets do not keep.
     """
 
     def __init__(self, node: BaseNode, controller: str, arm: str, timeout: float) -> None:
@@ -174,7 +177,7 @@ class FollowWatch:
         self._followed_since = math.inf  # targets have been sent and followed [s]
         self._node, self._state_topic = node, f"{controller}/state"
         self._unready: Reason | None = None  # by the newest report
-        self._starts, self._reported = 0, False
+        self._starts, self._reported_at = 0, -math.inf  # the newest report came then [s]
         self.homing = False  # whether it says that it goes home
         self.homing_outcome: Reason | None = None  # of the last way, where that ended by itself
         self.gripper_held = ""  # what keeps the gripper from going farther
@@ -184,14 +187,19 @@ class FollowWatch:
     @property
     def unready(self) -> Reason | None:
         """Why the controller would follow no stream of targets now."""
-        if self._reported or not self._node.count_publishers(self._state_topic):
+        if not self._node.count_publishers(self._state_topic):
+            absent = {"controller": self.controller, "topic": self._state_topic, "type": _STATE_TYPE}
+            return Reason.of(ReasonKind.CONTROLLER_ABSENT, **absent)
+        if (age := time.monotonic() - self._reported_at) <= _SILENT:
             return self._unready
-        return Reason.of(ReasonKind.TOPIC_EMPTY, topic=self._state_topic)
+        if age == math.inf:
+            return Reason.of(ReasonKind.TOPIC_EMPTY, topic=self._state_topic)
+        return Reason.of(ReasonKind.TOPIC_SILENT, topic=self._state_topic, source="", age=age)
 
     def notice(self, starts: int) -> None:
         """The reports of an earlier controller do not count; ``starts``: how often one has appeared."""
         if starts != self._starts:
-            self._starts, self._reported, self._unready = starts, False, None
+            self._starts, self._reported_at, self._unready = starts, -math.inf, None
 
     def refusal(self, sending: bool, now: float) -> Reason | None:
         """A reason if targets are ``sending`` and are followed no more, or not yet after the timeout."""
@@ -205,7 +213,7 @@ class FollowWatch:
         # The end of a stream before this one may be told late, when this one has not been answered yet.
         dropped = now - self._followed_since > _ANSWER
         self._since, self._followed_since = min(self._since, now), math.inf
-        if self._follows is None or not (dropped or now - self._since > self._timeout):
+        if not (dropped or now - self._since > self._timeout):
             return None
         return Reason.of(ReasonKind.FOLLOWED_NO_MORE if dropped else ReasonKind.NOT_FOLLOWED, topic=self._topic)
 
@@ -213,7 +221,7 @@ class FollowWatch:
         self._follows = bool(message.data)
 
     def _on_state(self, message: String) -> None:
-        self._reported = True
+        self._reported_at = time.monotonic()
         try:
             said = json.loads(message.data)
             state, fault, outcome = said[f"{self._arm}_state"], said["fault"], said["homing_outcome"]

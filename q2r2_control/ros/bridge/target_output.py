@@ -8,7 +8,7 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_msgs.msg import Empty
 
-from q2r2_control.config.presets import BUILTIN, Hold, Preset
+from q2r2_control.config.presets import BUILTIN, POSE, Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
@@ -83,7 +83,7 @@ class TargetOutput:
     def unready(self) -> Reason | None:
         """A reason if the topic has no subscriber, or one whose node is not known yet."""
         if self._publisher.listeners == 0:
-            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=self.topic)
+            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=f"{self.topic} ({POSE})")
         return self._unknown_node if self._unknown and not self.following else None
 
     def take_fault(self, now: float) -> Reason | None:

@@ -11,6 +11,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from q2r2_control.config.presets import BUILTIN, RAW_WARNING, Mode
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
@@ -157,6 +158,8 @@ class TeleopLoop:
         """After the node's publishers and subscriptions were made."""
         if node is not self.nodes[0]:
             return
+        if node.parameters.mode is Mode.RAW and node.parameters.preset is not BUILTIN:
+            node.get_logger().warning(RAW_WARNING)
         self._recorder = RecorderLink(node)
         self._home = HomeClient(node, node.outputs.home_controller)
         self._ticked = node.now
