@@ -75,7 +75,7 @@ class BaseNode(Node):
         super().__init__(name, **kwargs)
         what = "of SCHED_FIFO, where the system permits it; 0: as any other program; of nodes in a process the highest"
         self.priority = self.parameter("realtime_priority", self.priority, what, within=(0, 98))
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
         self._ros_time = 0.0, time.monotonic()  # the newest, and the steady time when it was first seen [s]
         self._dropped: set[str] = set()  # topics of which some messages could not be read
@@ -129,6 +129,17 @@ class BaseNode(Node):
         if one_of and value not in one_of:
             raise ConfigError(f"parameter {name}: {value!r}: allowed are {', '.join(one_of)}")
         return value
+
+    def full_name(self, name: str) -> str:
+        """A topic's, service's or node's name in this node's namespace; one that begins with / stays, if it was given.
+
+        It is not remapped: whoever subscribes, publishes or calls by it does that.
+        """
+        return str(self.resolve_topic_name(name, only_expand=True)) if name else name
+
+    def name_in_set(self, name: str) -> str:
+        """The full name of what is called ``name``, such as ``/recorder``, in a set without a namespace."""
+        return self.full_name(name.removeprefix("/"))
 
     @property
     def now(self) -> float:

@@ -181,16 +181,23 @@ class CommandWatch:
 
 
 class NodeStates:
-    """The newest state of every node in the domain that reports one, by its full name; the node has to be spun."""
+    """The newest state of every node that reports one, by its full name; the node has to be spun."""
 
-    def __init__(self, node: Node, on_state: Callable[[str, dict[str, Any]], None] = lambda name, state: None) -> None:
-        self._node, self._on_state = node, on_state
+    def __init__(
+        self,
+        node: Node,
+        on_state: Callable[[str, dict[str, Any]], None] = lambda name, state: None,
+        namespace: str = "/",
+    ) -> None:
+        """``namespace``: where nodes are that count."""
+        self._node, self._on_state, self._prefix = node, on_state, f"{namespace.rstrip('/')}/"
         self._heard: set[str] = set()  # topics
         self.newest: dict[str, tuple[dict[str, Any], float]] = {}  # and when it came [s]
 
     def look(self) -> None:
         for topic, types in self._node.get_topic_names_and_types():
-            if topic.endswith(_STATE) and types == ["std_msgs/msg/String"] and topic not in self._heard:
+            ours = topic.startswith(self._prefix) and topic.endswith(_STATE)
+            if ours and types == ["std_msgs/msg/String"] and topic not in self._heard:
                 self._heard.add(topic)
                 take = partial(self._take, topic.removesuffix(_STATE))
                 self._node.create_subscription(String, topic, take, STREAM_QOS)
@@ -209,7 +216,7 @@ class HandListeners:
     """The nodes that say on ``~/state`` that they follow one of some hands."""
 
     def __init__(self, node: Node, hands: Sequence[str]) -> None:
-        self._states, self._hands = NodeStates(node), hands
+        self._states, self._hands = NodeStates(node, namespace=node.get_namespace()), hands
         self._began = self._asked_at = 0.0  # [s]
 
     def look(self) -> None:

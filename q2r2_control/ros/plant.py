@@ -75,7 +75,7 @@ class RosPlant:
         self._executor.add_node(node)
         self._publisher = WatchedPublisher(node, JointTrajectory, TrajectoryOutput.topic, STREAM_TIMEOUT)
         self._grippers = {
-            arm: GripperClient(node, f"/q2r2/{arm}_gripper/gripper_cmd", GripperSettings())
+            arm: GripperClient(node, node.full_name(f"q2r2/{arm}_gripper/gripper_cmd"), GripperSettings())
             for arm in self._fingers.arms
         }
         self._openings = {}

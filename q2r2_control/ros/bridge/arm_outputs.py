@@ -188,8 +188,8 @@ class FollowWatch:
     def unready(self) -> Reason | None:
         """Why the controller would follow no stream of targets now."""
         if not self._node.count_publishers(self._state_topic):
-            absent = {"controller": self.controller, "topic": self._state_topic, "type": _STATE_TYPE}
-            return Reason.of(ReasonKind.CONTROLLER_ABSENT, **absent)
+            kind, topic = ReasonKind.CONTROLLER_ABSENT, self._state_topic
+            return Reason.of(kind, controller=self.controller, topic=topic, type=_STATE_TYPE)
         if (age := time.monotonic() - self._reported_at) <= _SILENT:
             return self._unready
         if age == math.inf:

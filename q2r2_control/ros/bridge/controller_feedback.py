@@ -59,8 +59,8 @@ class ControllerFeedback:
         self._following = {arm: node.create_publisher(Bool, f"~/following/{arm}", LATCHED_QOS) for arm in self._follows}
         self._conditions = ConditionPublishers(node, self._follows, ArmConditions(controller))
         self._distances = node.create_publisher(Marker, "~/distances", 10)
-        self._recorded_reference = node.create_publisher(JointTrajectory, REFERENCE, RECORDED_QOS)
-        self._recorded_tick = node.create_publisher(Float64MultiArray, CONTROLLER_TICK, RECORDED_QOS)
+        self._recorded_reference = node.create_publisher(JointTrajectory, node.name_in_set(REFERENCE), RECORDED_QOS)
+        self._recorded_tick = node.create_publisher(Float64MultiArray, node.name_in_set(CONTROLLER_TICK), RECORDED_QOS)
         self._last = 0.0  # tick [s]
         node.create_timer(_MARKER_PERIOD, self._show_distance)
 

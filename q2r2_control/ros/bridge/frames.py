@@ -24,6 +24,7 @@ from q2r2_control.ros.monitoring import Publishers
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.targets import SequenceWatch
 
+_TF, _TF_STATIC = "tf", "tf_static"
 # Two publishers whose poses of a frame differ by more do not tell of the same robot [m], [rad].
 _SAME = 0.05, 0.1
 _REMEMBERED = 2.0  # such a difference [s]
@@ -117,11 +118,11 @@ class FrameListener:
         self.tree = FrameTree()
         self._node = node
         self._numbers: defaultdict[str, SequenceWatch] = defaultdict(SequenceWatch)  # of messages with a frame
-        self._publishers = Publishers(node, ["/tf"])
+        self._publishers = Publishers(node, [_TF])
         self._disagree: dict[str, float] = {}  # frames of which two publishers say different things, and when [s]
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        node.create_subscription(TFMessage, "/tf", self._take, 100, raw=True)
-        node.create_subscription(TFMessage, "/tf_static", self._take_fixed, latched, raw=True)
+        node.create_subscription(TFMessage, _TF, self._take, 100, raw=True)
+        node.create_subscription(TFMessage, _TF_STATIC, self._take_fixed, latched, raw=True)
 
     def conflict(self, frame: str) -> Reason | None:
         """A reason while two publishers disagree about ``frame`` or what it hangs on."""
@@ -130,12 +131,12 @@ class FrameListener:
         now = time.monotonic()
         for name, _ in self.tree.upwards(frame):
             if now - self._disagree.get(name, -math.inf) <= _REMEMBERED:
-                return Reason.of(ReasonKind.FRAME_DISPUTED, frame=name, publishers=self._publishers.of("/tf"))
+                return Reason.of(ReasonKind.FRAME_DISPUTED, frame=name, publishers=self._publishers.of(_TF))
         return None
 
     def _take(self, message: bytes, info: Mapping[str, int | None]) -> None:
         received, now, number = self._node.now, time.monotonic(), info["publication_sequence_number"]
-        for transform in self._read("/tf", message):
+        for transform in self._read(_TF, message):
             frame = transform.child_frame_id
             if number is not None:
                 senders = self._numbers[frame].take(number, now, _PAUSE)
@@ -144,14 +145,14 @@ class FrameListener:
             self.tree.set(transform, received)
 
     def _take_fixed(self, message: bytes) -> None:
-        for transform in self._read("/tf_static", message):
+        for transform in self._read(_TF_STATIC, message):
             self.tree.set(transform, math.inf)
 
     def _read(self, topic: str, message: bytes) -> Sequence[ReadTransform]:
         try:
             return read_transforms(message)
         except SerdeError:  # which is some other node's fault
-            self._node.drop(topic, f"{len(message)} bytes")
+            self._node.drop(f"/{topic}", f"{len(message)} bytes")
             return ()
 
 
@@ -164,7 +165,7 @@ class ToolFrame:
 
     def __init__(self, node: BaseNode, frame: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
-        self._publishers = Publishers(node, ["/tf"])
+        self._publishers = Publishers(node, [_TF])
         self.problem: Reason | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
@@ -173,7 +174,7 @@ class ToolFrame:
         if placement is None:
             self.problem = Reason.of(ReasonKind.NO_TRANSFORM, frame=self._frame, world=self._world)
         elif (age := now - placement.received) > self._timeout:
-            source = self._publishers.source("/tf")
+            source = self._publishers.source(_TF)
             self.problem = Reason.of(ReasonKind.TRANSFORM_OLD, frame=self._frame, source=source, age=age)
         else:
             self.problem = None

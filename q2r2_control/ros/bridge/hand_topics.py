@@ -66,9 +66,10 @@ class HandPublishers:
     def subscribers(self, hand: str) -> int:
         """How many subscribers the topics of ``hand`` have, a recorder aside."""
         publishers = [publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand]
+        recorder = f"{self._node.get_namespace().rstrip('/')}{RECORDER}"
         matched = sum(publisher.get_subscription_count() for publisher in publishers)
         listed = (self._node.get_subscriptions_info_by_topic(publisher.topic_name) for publisher in publishers)
-        return min(matched, sum(node_of(info) not in (None, RECORDER) for infos in listed for info in infos))
+        return min(matched, sum(node_of(info) not in (None, recorder) for infos in listed for info in infos))
 
 
 def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None]) -> None:

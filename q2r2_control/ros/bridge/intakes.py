@@ -62,7 +62,8 @@ class TargetIntake:
         self.frames = {arm: _frame_of(node, robot, arm) for arm in robot.arms}
         self.topics: dict[str, str] = {}
         for arm in robot.arms:
-            topic = node.parameter(f"{arm}.target_topic", f"/q2r2/{arm}/target_frame", "targets of this arm")
+            name = node.parameter(f"{arm}.target_topic", f"q2r2/{arm}/target_frame", "targets of this arm")
+            topic = node.full_name(name)
             if topic in self.topics.values():
                 raise ConfigError(f"{arm}.target_topic = {topic!r:.80}: another arm has it; allowed: one of its own")
             self.topics[arm] = topic

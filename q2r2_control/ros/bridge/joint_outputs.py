@@ -92,7 +92,7 @@ class JointStates(Kind):
 class LbrPosition(Kind):
     """LBRJointPositionCommand of lbr_fri_idl, one topic an arm."""
 
-    topic, joints_each, older = "/{arm}/command/lbr_joint_position_command", 7, "joint_position"
+    topic, joints_each, older = "{arm}/command/lbr_joint_position_command", 7, "joint_position"
     type_name = "LBRJointPositionCommand"
 
     def __init__(self, period: float, robot: Robot) -> None:

@@ -105,7 +105,8 @@ class RecorderLink:
         self._heard = 0.0  # [s] of steady time
         self._served: int | None = None  # services that it has answered
         self._reasons: list[Reason] = []
-        node.create_subscription(String, f"{RECORDER}/state", self._on_state, 10)
+        self._topic = f"{node.name_in_set(RECORDER)}/state"
+        node.create_subscription(String, self._topic, self._on_state, 10)
 
     def update(self, marks: EpisodeMarks) -> list[Reason]:
         """Once a tick, before the teleoperation; returns the reasons of new events of its services."""
@@ -124,7 +125,7 @@ class RecorderLink:
                 self._reasons.append(Reason.from_json(state["served_last"]))
             self._served, self._heard = state["served"], time.monotonic()
         except (ValueError, TypeError, KeyError):
-            self._node.drop(f"{RECORDER}/state", f"{message.data!r:.60}")
+            self._node.drop(self._topic, f"{message.data!r:.60}")
 
 
 class TickInputs(NamedTuple):

@@ -73,10 +73,10 @@ class BaseArmController(BaseNode):
         self.arm_name, self.robot_name = arm_name, robot_name
         self.defaults = ArmDefaults(
             arm_name=arm_name,
-            ctrl_prefix=ctrl_prefix or f"/{robot_name}/{arm_name}",
+            ctrl_prefix=ctrl_prefix or f"{robot_name}/{arm_name}",
             base_frame_id=base_frame_id,
             end_effector_link_name=end_effector_link_name or f"{arm_name}_tool_frame",
-            gripper_action_topic=gripper_action_topic or f"/{robot_name}/{arm_name}_gripper/gripper_cmd",
+            gripper_action_topic=gripper_action_topic or f"{robot_name}/{arm_name}_gripper/gripper_cmd",
             teleop=teleop_defaults(mirror, filter_window_size),
             preset=preset,
         )

@@ -148,7 +148,7 @@ class MujocoRobot(BaseNode):
         self._grippers = {
             arm: GripperServer(
                 self,
-                f"/q2r2/{arm}_gripper/gripper_cmd",
+                f"q2r2/{arm}_gripper/gripper_cmd",
                 partial(self._cell.command_gripper, arm),
                 partial(self._note, f"{arm}_gripper"),
             )
@@ -164,8 +164,8 @@ class MujocoRobot(BaseNode):
         self._joint_states = self.create_publisher(JointState, "joint_states", 10)
         self._measured_names = (*self._robot.joint_names, *self._cell.fingers)
         self._external = self.create_publisher(JointState, "~/external_torque", 10)
-        self._tf = self.create_publisher(TFMessage, "/tf", 10)
-        self._tf_static = self.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
+        self._tf = self.create_publisher(TFMessage, "tf", 10)
+        self._tf_static = self.create_publisher(TFMessage, "tf_static", LATCHED_QOS)
         self._description = self.create_publisher(String, "robot_description", LATCHED_QOS)
         self._description.publish(String(data=self._robot.urdf))
         self._moving, fixed = link_transforms(self._cell.plant.model, self._cell.loose_objects)
