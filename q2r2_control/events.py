@@ -127,6 +127,11 @@ class ReasonKind(StrEnum):
         "{controller} is not there: nobody publishes {topic} ({type}); another controller than the built-in one needs "
         "its preset",
     )
+    CONTROLLER_STANDS = (
+        "controller_stands",
+        "the {arm} arm's controller{takers} stands still: the arm is measured, and does not go the {way:.3f} {unit} "
+        "that it was asked to in {time:g} s",
+    )
     CONTROLLER_RESTARTED = "controller_restarted", "{controller} was restarted"
     CONTROLLER_ENDED = "controller_ended", "{controller} has ended"
     NODE_BEGINS = "node_begins", "the node has not begun yet"

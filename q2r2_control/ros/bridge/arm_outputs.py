@@ -19,6 +19,8 @@ from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput
+from q2r2_control.ros.commanders import takers_of
+from q2r2_control.supervision.standstill import LAGGING_TOOL, StandstillWatch, standing
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.hand_motion import MAX_OFFSET
@@ -67,6 +69,10 @@ class ArmOutputs:
         self._command_type = None if service is None else CommandType(node, service.format(ctrl=values.prefix))
         self._safe_problem: Reason | None = self._safe_target.problem  # why the relay could not begin now
         self._relaying = False
+        raw = not self._filtered and preset is not BUILTIN
+        # Of the built-in controller the arm's node knows the reference, which may rightly stand still.
+        self._stands = StandstillWatch(LAGGING_TOOL) if raw else None
+        self._node, self._arm = node, arm
 
     def limit(self, guard: GuardSettings) -> None:
         """Other limits of the targets that go to the preset's controller, from the next one on."""
@@ -118,6 +124,17 @@ class ArmOutputs:
             self._follows.notice(self.first.starts)
             faults += [self._safe_target.take_silence(now), self._follows.refusal(self.first.following, now)]
         return _refused(next((fault for fault in faults if fault), None))
+
+    def standstill(self, tool: pin.SE3 | None, received: float, now: float) -> Reason | None:
+        """A reason where the controller takes targets and does not move the tool, measured then [s]."""
+        asked = self.first.last_sent
+        if self._stands is None or tool is None or asked is None or not self.first.following:
+            return None
+        if (way := self._stands.look(asked.translation, tool.translation, received, now)) is None:
+            return None
+        self.forget(now)  # nothing is repeated that it would go to in one leap
+        takers = f" {name}" if (name := takers_of(self._node, self.first.topic)) else ""
+        return _refused(standing(self._arm, takers, way, "m"))
 
     def step(
         self,

@@ -165,12 +165,15 @@ class ToolFrame:
 
     def __init__(self, node: BaseNode, frame: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
+        self.received = -math.inf  # the newest pose was [s]
         self._publishers = Publishers(node, [_TF])
         self.problem: Reason | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
         """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         placement = self._tree.find(self._frame, self._world)
+        if placement is not None:
+            self.received = placement.received
         if placement is None:
             self.problem = Reason.of(ReasonKind.NO_TRANSFORM, frame=self._frame, world=self._world)
         elif (age := now - placement.received) > self._timeout:
@@ -211,6 +214,11 @@ class PoseTopic:
             self.problem = None
             return placement.pose * self._pose
         return None
+
+    @property
+    def received(self) -> float:
+        """When the newest message came [s]; -inf: none has."""
+        return -math.inf if self._newest is None else self._newest[2]
 
     @property
     def stamp(self) -> int | None:

@@ -18,6 +18,7 @@ from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
 from q2r2_control.recording.messages import RECORDER
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge import messages as convert
+from q2r2_control.ros.commanders import several_publishers
 from q2r2_control.ros.monitoring import Publishers, node_of
 from q2r2_control.types import SIDES, HandInputs, HandSample, HapticFeedback
 
@@ -110,6 +111,7 @@ class HandIntake:
         self._callbacks = (PoseStamped, "pose", on_pose), (OVR2ROSInputs, "inputs", on_inputs)
         self._publishers: dict[str, Publishers] = {}  # of each hand
         self._haptics: dict[str, Any] = {}
+        self._topics: dict[str, list[str]] = {}  # of each hand, as the graph knows them
         self._samples = SampleQueue()
         self._received = -math.inf  # the message that is being taken was [s]
         self.follow(hand)
@@ -124,9 +126,11 @@ class HandIntake:
             return
         self._publishers[hand] = Publishers(self._node, (_topic(hand, "pose"), _topic(hand, "inputs")))
         self._haptics[hand] = self._node.create_publisher(OVR2ROSHapticFeedback, HAPTIC_TOPICS[hand], COMMAND_QOS)
+        self._topics[hand] = []
         for kind, what, callback in self._callbacks:
             take = partial(self._take, hand, callback)
-            self._node.create_subscription(kind, _topic(hand, what), take, STREAM_QOS)
+            made = self._node.create_subscription(kind, _topic(hand, what), take, STREAM_QOS)
+            self._topics[hand].append(made.topic_name)
 
     def put_pose(self, message: PoseStamped) -> None:
         self._pose = convert.hand_pose(message), self._received
@@ -156,6 +160,12 @@ class HandIntake:
         if (age := min(missing.values())) == math.inf:
             return Reason.of(ReasonKind.HAND_UNKNOWN, data=what, hand=self.hand, source=source)
         return Reason.of(ReasonKind.HAND_SILENT, data=what, hand=self.hand, source=source, age=age)
+
+    @property
+    def conflict(self) -> Reason | None:
+        """A reason if the hand has more than one publisher: the arm would follow both in turns."""
+        found = (several_publishers(self._node, topic) for topic in self._topics[self.hand])
+        return next(filter(None, found), None)
 
     def feel(self, pulse: HapticFeedback) -> None:
         feedback = OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude)

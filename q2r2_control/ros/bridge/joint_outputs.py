@@ -23,7 +23,8 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.messages import joint_state_message
-from q2r2_control.ros.monitoring import CommandWatch, WatchedPublisher
+from q2r2_control.ros.commanders import CommandWatch, takers_of
+from q2r2_control.ros.monitoring import WatchedPublisher
 from q2r2_control.types import Command, CommandMode, RobotState
 
 NONE = "none"
@@ -166,7 +167,13 @@ class JointOutput:
         self.withheld: Collection[str] = ()  # namespaces of drivers that get nothing
 
     def watch(self, node: BaseNode) -> CommandWatch:
-        return CommandWatch(node, self._kind.message, [channel.publisher.topic_name for channel in self._channels])
+        return CommandWatch(node, self._kind.message, [channel.publisher for channel in self._channels])
+
+    def takers(self, node: BaseNode, joints: np.ndarray) -> str:
+        """Who takes the commands of the joints with these velocity indices: " /node", or "" where that is not known."""
+        topics = [one.publisher.topic_name for one in self._channels if np.isin(joints, one.joints).all()]
+        names = (takers_of(node, topic) for topic in topics)
+        return next((f" {name}" for name in names if name), "")
 
     def send(self, command: Command, state: RobotState, t: float, decided: float) -> None:
         """Send a command of the tick at ``t`` [s] of the node's clock; ``decided``: see :func:`publish_in_time`."""

@@ -14,6 +14,7 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import ended_topic, stamped_pose, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
+from q2r2_control.ros.commanders import several_publishers
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.tick_pacer import PoseRateLimiter
@@ -75,9 +76,7 @@ class TargetOutput:
     @property
     def conflict(self) -> Reason | None:
         """A reason if there are other publishers of the same topic."""
-        if (count := self._node.handle.get_count_publishers(self.topic)) <= 1:
-            return None
-        return Reason.of(ReasonKind.SEVERAL_PUBLISHERS, count=count, topic=self.topic)
+        return several_publishers(self._node, self.topic)
 
     @property
     def unready(self) -> Reason | None:

@@ -159,6 +159,7 @@ class BaseArmController(BaseNode):
         self._base_pose = base
         self.inputs = TickInputs(tool, commanded, reference, None if obstacle is None else obstacle[1])
         fault = self.outputs.take_fault(now) or (None if self._refusal is None else self._refusal[1])
+        fault = fault or self.outputs.standstill(tool, self._tool.received, now)
         return None if self.state in HOLDING else fault
 
     def follow(self, target: ArmTarget, now: float, decided: float) -> Reason | None:
@@ -238,7 +239,7 @@ class BaseArmController(BaseNode):
     ) -> tuple[bytes, Reason] | None:
         """Why the arm may not be engaged now, its hand aside, with the level of the diagnostics."""
         values = self.parameters
-        if (conflict := self.outputs.conflict or self._frames.conflict(values.tool_frame)) is not None:
+        if (conflict := self._conflict()) is not None:
             return ERROR, conflict
         if tool is None:
             why = self._tool.problem or Reason(ReasonKind.NO_CURRENT_POSE)
@@ -252,6 +253,10 @@ class BaseArmController(BaseNode):
             if self.state is ArmState.IDLE:
                 self.get_logger().warning(sentence(away), once=True)
         return None if unready is None else (WARN, unready)
+
+    def _conflict(self) -> Reason | None:
+        """Two nodes that say different things where the arm follows one."""
+        return self.outputs.conflict or self.intake.conflict or self._frames.conflict(self.parameters.tool_frame)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
         """For the leash and for anchors. Another controller's is not known: then the tool's, or the last target's."""
