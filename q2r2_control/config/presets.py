@@ -60,7 +60,7 @@ class Preset:
 
 
 _LATCHES = "active; keeps the last target for ever"
-BUILTIN = Preset("builtin", "always on", rate=200.0, lowest_rate=20.0, hold=Hold.SILENCE, guard=_WIDE)
+BUILTIN = Preset("builtin", "always on", rate=100.0, lowest_rate=20.0, hold=Hold.SILENCE, guard=_WIDE)
 _ALL = (
     BUILTIN,
     # Its velocity clamp counts the time since the target last changed: a long pause would let the next one through.

@@ -51,7 +51,6 @@ class BaseArmController(BaseNode):
     """
 
     ticks = True
-    priority = 38
 
     def __init__(
         self,

@@ -124,7 +124,6 @@ class MujocoRobot(BaseNode):
     """Runs a :class:`SimulatedCell` in real time between its topics, services and actions."""
 
     ticks = True
-    priority = 39
 
     def __init__(self) -> None:
         super().__init__("mujoco_robot")

@@ -40,7 +40,6 @@ class SimulationInput(BaseNode):
     """
 
     ticks = True
-    priority = 37
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("simulation_input", **kwargs)
@@ -142,7 +141,6 @@ class HandInput(BaseNode):
     """
 
     ticks = True
-    priority = 37
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("hand_input", **kwargs)
