@@ -2,8 +2,8 @@
 
 Messages and ticks go past rclpy's wait set; all else, such as services, is rclpy's to run. Measured on two busy cores
 with both arms moving: 1.1 cores and 167 joint commands a second. With ``SingleThreadedExecutor`` it was 1.7 cores and
-53. The ``EventsExecutor`` of rclpy 7.1 fails with a ``SystemError`` where a callback gets a message's times. rclpy makes
-a wait set each time that it looks, which takes a millisecond where other programs have the caches. A wait set that stays
+53. The ``EventsExecutor`` of rclpy 7.1 fails with a ``SystemError`` where a callback gets a message's times. rclpy
+makes a wait set each time that it looks, which takes a millisecond where other programs have the caches. One that stays
 says in 0.05 ms whether there is anything to run.
 """
 

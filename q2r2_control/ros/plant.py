@@ -27,6 +27,7 @@ from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.gripper_client import GripperClient
 from q2r2_control.ros.bridge.intakes import Fingers, JointIntake
 from q2r2_control.ros.bridge.joint_outputs import TrajectoryOutput
+from q2r2_control.ros.bridge.wire import JointNumbers
 from q2r2_control.ros.commanders import CommandWatch
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.launch.middleware import set_up_middleware
@@ -112,7 +113,7 @@ class RosPlant:
     def _take_state(self, state: RobotState | Reason, now: float) -> None:
         self._bad = state if isinstance(state, Reason) else None
 
-    def _take_fingers(self, message: JointState) -> None:
+    def _take_fingers(self, message: JointState | JointNumbers) -> None:
         self._openings |= self._fingers.openings(message)
 
     def due(self, now: float) -> tuple[float, float]:

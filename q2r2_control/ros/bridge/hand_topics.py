@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, Twist
@@ -41,6 +41,7 @@ class HandPublishers:
         self._publishers = {
             name: node.create_publisher(_KINDS[topic.kind][0], name, _DEPTH) for name, topic in topics.items()
         }
+        self._template = lru_cache(maxsize=8)(convert.pose_template)  # of each frame
         self.sent: dict[str, int] = {publisher.topic_name: 0 for publisher in self._publishers.values()}
 
     def publish(self, topic: str, message: HandMessage, frame: str, t: float) -> None:
@@ -48,7 +49,7 @@ class HandPublishers:
         publisher = self._publishers[topic]
         self.sent[publisher.topic_name] += 1
         if isinstance(message, HandPose):
-            publisher.publish(convert.hand_pose_message(message, frame, t))
+            publisher.publish(self._template(frame).fill([*message.position.tolist(), *message.quaternion.tolist()], t))
         elif isinstance(message, HandTwist):
             publisher.publish(convert.hand_twist_message(message))
         else:
@@ -61,7 +62,7 @@ class HandPublishers:
             messages[MessageType.POSE] = HandPose(sample.position, sample.quaternion, sample.pose_stamp, frame)
         for kind, message in messages.items():
             topic = self._topics.get((sample.hand, kind))
-            if topic is not None and message is not None:
+            if topic is not None and message is not None and self._publishers[topic].get_subscription_count():
                 self.publish(topic, message, frame, sample.pose_stamp)
 
     def subscribers(self, hand: str) -> int:

@@ -12,7 +12,7 @@ from q2r2_control.config.presets import BUILTIN, POSE, Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import ended_topic, stamped_pose, time_message
+from q2r2_control.ros.bridge.messages import ended_topic, fill_pose, pose_template, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.commanders import several_publishers
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
@@ -51,6 +51,7 @@ class TargetOutput:
         self.preset = preset
         self.guard = PoseRateLimiter(guard, 1.0 / values.rate)
         self._node, self._controller, self._frame = node, controller, frame
+        self._template = pose_template(frame)
         self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
         self.topic = self._publisher.topic_name  # as the graph knows it
         self._unknown_node = Reason.of(ReasonKind.SUBSCRIBER_UNKNOWN, topic=self.topic)
@@ -139,7 +140,7 @@ class TargetOutput:
             return None
         if self.following and self._publisher.waits():
             return pose
-        if self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now), decided):
+        if self._publisher.publish(fill_pose(self._template, base.actInv(pose), now), decided):
             self.last_sent, self._sent_at = pose, now
         return pose
 
