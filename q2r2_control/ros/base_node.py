@@ -292,7 +292,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         gc.collect()
         gc.freeze()
         _take_priority(nodes)
-        while rclpy.ok() and not stop.asked and all(node.exit_code is None for node in nodes):
+        while not stop.asked and all(node.exit_code is None for node in nodes):
             executor.spin_once(timeout_sec=0.1)
     except (Q2R2Error, ParameterException) as error:
         print(f"{name}: {error}", file=sys.stderr)

@@ -1,7 +1,7 @@
 """Who else publishes where one node may: hands, targets and commands have one publisher each, for every loop.
 
-A publisher that appears is found in the graph, at the tick after the middleware has discovered it. One that was there
-before and said nothing is listened to, and found by its first message.
+A publisher that appears is found in the graph, 0.04 s after the middleware has discovered it. One that was there before
+and said nothing is listened to, and found by its first message.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 
 _DISCOVERY = 1.0  # what a new node discovers by then was there before it [s]
+_GRAPH_PERIOD = 0.04  # of asking the graph [s]
 HEARD = 0.3  # a commander that was heard within this time commands [s]
 
 
@@ -33,12 +34,25 @@ def takers_of(node: BaseNode, topic: str) -> str:
     return " and ".join(sorted(found - {node.get_fully_qualified_name()}))
 
 
-def several_publishers(node: BaseNode, topic: str) -> Reason | None:
-    """A reason where more than one publisher of ``topic``, a full name, is known; asked at every tick."""
-    if (count := node.handle.get_count_publishers(topic)) <= 1:
-        return None
-    named = f"{topic} ({publishers_of(node, topic)})"
-    return Reason.of(ReasonKind.SEVERAL_PUBLISHERS, count=count, topic=named)
+class OnePublisher:
+    """Whether topics, by their full names, have more than one publisher; may be asked at every tick."""
+
+    def __init__(self, node: BaseNode, topics: Iterable[str]) -> None:
+        self._node, self._topics = node, tuple(topics)
+        self._asked_at = -math.inf  # [s]
+        self._found: Reason | None = None
+
+    def conflict(self) -> Reason | None:
+        """A reason for the first topic that has several."""
+        if (now := time.monotonic()) - self._asked_at >= _GRAPH_PERIOD:
+            self._asked_at, self._found = now, next(filter(None, map(self._look, self._topics)), None)
+        return self._found
+
+    def _look(self, topic: str) -> Reason | None:
+        if (count := self._node.handle.get_count_publishers(topic)) <= 1:
+            return None
+        named = f"{topic} ({publishers_of(self._node, topic)})"
+        return Reason.of(ReasonKind.SEVERAL_PUBLISHERS, count=count, topic=named)
 
 
 class CommandWatch:
@@ -55,6 +69,7 @@ class CommandWatch:
         self._heard = dict.fromkeys(self._publishers, -math.inf)  # the last command of another node [s]
         self._subscriptions: list[Any] = []
         self._born = time.monotonic()
+        self._asked_at = -math.inf  # the graph [s]
         self._known: int | None = None  # other publishers since the node commands; None: it does not
         self._found: Reason | None = None  # of this time of commanding
 
@@ -84,6 +99,10 @@ class CommandWatch:
 
     def intruder(self) -> Reason | None:
         """Why this node may not go on commanding, or None; to be asked before each command."""
+        if self._known is not None and time.monotonic() - self._asked_at < _GRAPH_PERIOD:
+            self._found = self._found or self.commander()
+            return self._found
+        self._asked_at = time.monotonic()
         counts = {topic: self._node.handle.get_count_publishers(topic) - 1 for topic in self._publishers}
         others = sum(counts.values())
         if self._known is None:

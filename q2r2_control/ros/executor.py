@@ -47,6 +47,7 @@ class TickExecutor(SingleThreadedExecutor):
         self._streams: list[Any] = []  # those with a publisher; to look for a message takes long where none can come
         self._ticks: list[Any] = []  # timers
         self._served_at = -math.inf  # [s]
+        self._simulated = False  # see _is_simulated
         self._rest = _RestOfNodes([])
 
     def add_node(self, node: Any) -> bool:
@@ -64,8 +65,6 @@ class TickExecutor(SingleThreadedExecutor):
         longest = _SERVED if timeout_sec is None or timeout_sec < 0.0 else min(timeout_sec, _SERVED)
         if (sleep := self._time_left(longest)) > 0.0:
             time.sleep(sleep)
-        if not self.context.ok():
-            raise ExternalShutdownException
         self.take_messages()
         for timer in self._ticks:
             if self._changed:
@@ -74,7 +73,9 @@ class TickExecutor(SingleThreadedExecutor):
                 timer.handle.call_timer()
                 timer.callback()
         if (now := time.monotonic()) - self._served_at >= _SERVED:
-            self._served_at, self._streams = now, self._subscriptions
+            if not self.context.ok():
+                raise ExternalShutdownException
+            self._served_at, self._streams, self._simulated = now, self._subscriptions, self._is_simulated()
             self.take_messages()  # a publisher may have come, and even gone
             if not self._changed:
                 self._streams = [one for one in self._streams if one[0].handle.get_publisher_count()]
@@ -94,10 +95,14 @@ class TickExecutor(SingleThreadedExecutor):
                 one.callback(*taken[:arguments])
 
     def _time_left(self, longest: float) -> float:
-        if any(isinstance(timer.clock, ROSClock) and timer.clock.ros_time_is_active for timer in self._ticks):
+        if self._simulated:
             return min(longest, _SIMULATED)
         left = [timer.time_until_next_call() for timer in self._ticks]  # [ns]; None: cancelled
         return min([longest, *(1e-9 * one for one in left if one is not None)])
+
+    def _is_simulated(self) -> bool:
+        """Whether some tick goes by a clock that others set; it may become so while a node runs."""
+        return any(isinstance(timer.clock, ROSClock) and timer.clock.ros_time_is_active for timer in self._ticks)
 
     def _serve(self) -> None:
         with suppress(TimeoutException):
@@ -114,7 +119,7 @@ class TickExecutor(SingleThreadedExecutor):
         self._ticks = [one for node, group in groups for one in node.timers if one.callback_group is group]
         streams = [one for node, group in groups for one in node.subscriptions if one.callback_group is group]
         self._streams = self._subscriptions = [(one, _arguments(one.callback)) for one in streams]
-        self._rest = _RestOfNodes(nodes)
+        self._rest, self._simulated = _RestOfNodes(nodes), self._is_simulated()
 
 
 class _RestOfNodes:

@@ -64,7 +64,7 @@ class ControllerFeedback:
         self._recorded_reference = node.create_publisher(JointTrajectory, node.name_in_set(REFERENCE), RECORDED_QOS)
         self._recorded_tick = node.create_publisher(Float64MultiArray, node.name_in_set(CONTROLLER_TICK), RECORDED_QOS)
         self._last = 0.0  # tick [s]
-        node.create_timer(_MARKER_PERIOD, self._show_distance)
+        self._shown = 0.0  # [s]
 
     def publish(self, reference: Reference, state: RobotState, now: float, dt: float, decided: float) -> None:
         """Of one tick of ``dt`` at ``now`` [s]; see :func:`publish_in_time`."""
@@ -74,6 +74,9 @@ class ControllerFeedback:
         if self._recorded_tick.get_subscription_count():
             self._record(reference, now, dt, decided)
         self._last = now
+        if not 0.0 <= now - self._shown < _MARKER_PERIOD:
+            self._shown = now
+            self._show_distance()
         if self._ticks % self._every:
             return
         for arm, publisher in self._safe_targets.items():

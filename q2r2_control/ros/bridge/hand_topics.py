@@ -10,6 +10,8 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped, Twist
 from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from rosbags.serde import SerdeError
 
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
@@ -18,7 +20,7 @@ from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
 from q2r2_control.recording.messages import RECORDER
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge import messages as convert
-from q2r2_control.ros.commanders import several_publishers
+from q2r2_control.ros.commanders import OnePublisher
 from q2r2_control.ros.monitoring import Publishers, node_of
 from q2r2_control.types import SIDES, HandInputs, HandSample, HapticFeedback
 
@@ -28,6 +30,12 @@ _KINDS: dict[MessageType, tuple[type, Callable[[Any], HandMessage]]] = {
     MessageType.TWIST: (Twist, convert.hand_twist),
     MessageType.INPUTS: (OVR2ROSInputs, convert.hand_inputs),
 }
+
+
+@lru_cache(maxsize=32)
+def _serialized(inputs: HandInputs) -> bytes:
+    """The message of a hand's controls, which rest for most of the time."""
+    return bytes(serialize_message(convert.inputs_message(inputs)))
 
 
 class HandPublishers:
@@ -53,16 +61,26 @@ class HandPublishers:
         elif isinstance(message, HandTwist):
             publisher.publish(convert.hand_twist_message(message))
         else:
-            publisher.publish(convert.inputs_message(message))
+            publisher.publish(_serialized(message))
 
-    def publish_sample(self, sample: HandSample, frame: str = "", twist: HandTwist | None = None) -> None:
-        """Publish a sample's messages on those topics that there are; a pose with a fault is left out."""
-        messages: dict[MessageType, HandMessage | None] = {MessageType.INPUTS: sample.inputs, MessageType.TWIST: twist}
-        if sample.fault is None:
-            messages[MessageType.POSE] = HandPose(sample.position, sample.quaternion, sample.pose_stamp, frame)
-        for kind, message in messages.items():
+    def publish_sample(
+        self, sample: HandSample, frame: str = "", twist: Callable[[], HandTwist | None] = lambda: None
+    ) -> None:
+        """Publish a sample's messages on those topics that somebody takes; a pose with a fault is left out.
+
+        ``twist`` makes the hand's, where somebody takes it.
+        """
+        for kind in (MessageType.INPUTS, MessageType.TWIST, MessageType.POSE):
             topic = self._topics.get((sample.hand, kind))
-            if topic is not None and message is not None and self._publishers[topic].get_subscription_count():
+            if topic is None or not self._publishers[topic].get_subscription_count():
+                continue
+            message: HandMessage | None = sample.inputs
+            if kind is MessageType.TWIST:
+                message = twist()
+            elif kind is MessageType.POSE:
+                pose = HandPose(sample.position, sample.quaternion, sample.pose_stamp, frame)
+                message = pose if sample.fault is None else None
+            if message is not None:
                 self.publish(topic, message, frame, sample.pose_stamp)
 
     def subscribers(self, hand: str) -> int:
@@ -105,14 +123,19 @@ class HandIntake:
         node: BaseNode,
         hand: str,
         timeout: float,
-        on_pose: Callable[[PoseStamped], None],
+        on_pose: Callable[[PoseStamped], None] | None,
         on_inputs: Callable[[OVR2ROSInputs], None],
     ) -> None:
         self._node, self._timeout = node, timeout
-        self._callbacks = (PoseStamped, "pose", on_pose), (OVR2ROSInputs, "inputs", on_inputs)
+        # Without a callback that wants to see it, a pose need not become a message first.
+        take_pose = self.put_pose if on_pose is None else on_pose
+        self._callbacks = (
+            (PoseStamped, "pose", take_pose, on_pose is None),
+            (OVR2ROSInputs, "inputs", on_inputs, False),
+        )
         self._publishers: dict[str, Publishers] = {}  # of each hand
         self._haptics: dict[str, Any] = {}
-        self._topics: dict[str, list[str]] = {}  # of each hand, as the graph knows them
+        self._one: dict[str, OnePublisher] = {}  # of each hand
         self._samples = SampleQueue()
         self._received = -math.inf  # the message that is being taken was [s]
         self.follow(hand)
@@ -127,14 +150,20 @@ class HandIntake:
             return
         self._publishers[hand] = Publishers(self._node, (_topic(hand, "pose"), _topic(hand, "inputs")))
         self._haptics[hand] = self._node.create_publisher(OVR2ROSHapticFeedback, HAPTIC_TOPICS[hand], COMMAND_QOS)
-        self._topics[hand] = []
-        for kind, what, callback in self._callbacks:
+        topics = []
+        for kind, what, callback, raw in self._callbacks:
             take = partial(self._take, hand, callback)
-            made = self._node.create_subscription(kind, _topic(hand, what), take, STREAM_QOS)
-            self._topics[hand].append(made.topic_name)
+            made = self._node.create_subscription(kind, _topic(hand, what), take, STREAM_QOS, raw=raw)
+            topics.append(made.topic_name)
+        self._one[hand] = OnePublisher(self._node, topics)
 
-    def put_pose(self, message: PoseStamped) -> None:
-        self._pose = convert.hand_pose(message), self._received
+    def put_pose(self, message: PoseStamped | bytes) -> None:
+        """A pose, serialized or not."""
+        try:
+            self._pose = convert.hand_pose(message), self._received
+        except SerdeError as error:  # which is its sender's fault
+            self._node.drop(_topic(self.hand, "pose"), str(error))
+            return
         self._put()
 
     def put_inputs(self, message: OVR2ROSInputs) -> None:
@@ -165,8 +194,7 @@ class HandIntake:
     @property
     def conflict(self) -> Reason | None:
         """A reason if the hand has more than one publisher: the arm would follow both in turns."""
-        found = (several_publishers(self._node, topic) for topic in self._topics[self.hand])
-        return next(filter(None, found), None)
+        return self._one[self.hand].conflict()
 
     def feel(self, pulse: HapticFeedback) -> None:
         feedback = OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude)

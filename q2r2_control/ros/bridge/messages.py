@@ -17,7 +17,7 @@ from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
 from q2r2_control.inputs.messages import HandPose, HandTwist
-from q2r2_control.ros.bridge.wire import JointNumbers, Template
+from q2r2_control.ros.bridge.wire import JointNumbers, Template, read_pose
 from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, RobotState
 
 _UNIT = 1e-3  # a quaternion's norm may be off by this
@@ -90,14 +90,11 @@ def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
     return pin.XYZQUATToSE3(pose)
 
 
-def hand_pose(message: PoseStamped) -> HandPose:
-    p, o = message.pose.position, message.pose.orientation
-    return HandPose(
-        position=np.array([p.x, p.y, p.z]),
-        quaternion=np.array([o.x, o.y, o.z, o.w]),
-        stamp=seconds(message.header.stamp),
-        frame_id=message.header.frame_id,
-    )
+def hand_pose(message: PoseStamped | bytes) -> HandPose:
+    """A hand's pose, unchecked. Raises SerdeError for bytes that are no PoseStamped."""
+    stamp, frame, numbers = read_pose(message)
+    values = np.array(numbers)
+    return HandPose(values[:3], values[3:], stamp * 1e-9, frame)
 
 
 def pose_template(frame: str) -> Template:

@@ -14,7 +14,7 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import ended_topic, fill_pose, pose_template, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
-from q2r2_control.ros.commanders import several_publishers
+from q2r2_control.ros.commanders import OnePublisher
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.tick_pacer import PoseRateLimiter
@@ -54,6 +54,7 @@ class TargetOutput:
         self._template = pose_template(frame)
         self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
         self.topic = self._publisher.topic_name  # as the graph knows it
+        self._one = OnePublisher(node, [self.topic])
         self._unknown_node = Reason.of(ReasonKind.SUBSCRIBER_UNKNOWN, topic=self.topic)
         self._wrench = None
         if preset.zero_wrench is not None:
@@ -77,7 +78,7 @@ class TargetOutput:
     @property
     def conflict(self) -> Reason | None:
         """A reason if there are other publishers of the same topic."""
-        return several_publishers(self._node, self.topic)
+        return self._one.conflict()
 
     @property
     def unready(self) -> Reason | None:

@@ -167,7 +167,7 @@ class TeleopLoop:
         self._without_time: Reason | None = None
         node.create_tick(1.0 / node.parameters.rate, self.tick)
         # Without time there are no ticks, and so nothing else that would pause the arms.
-        node.create_timer(_TIME_PERIOD, self._watch_time, clock=STEADY)
+        node.create_tick(_TIME_PERIOD, self._watch_time, clock=STEADY)
 
     def tick(self) -> None:
         """Process what arrived, and publish where the tools should go."""

@@ -116,7 +116,9 @@ class BaseArmController(BaseNode):
         )
         self._safe_target = PoseTopic(self, f"{values.builtin_node}/safe_target/{self.arm_name}", *within)
         timeout = values.teleop.gate.timeout
-        self.intake = HandIntake(self, self.hand, timeout, self.pose_callback, self.inputs_callback)
+        own = type(self).pose_callback is BaseArmController.pose_callback
+        on_pose = None if own else self.pose_callback
+        self.intake = HandIntake(self, self.hand, timeout, on_pose, self.inputs_callback)
         self.outputs = ArmOutputs(self, self.arm_name, values, self._safe_target)
         self.feedback = ArmFeedback(self, self.arm_name, values, self.intake)
         grants = None
