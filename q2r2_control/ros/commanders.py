@@ -18,19 +18,20 @@ from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 
 _DISCOVERY = 1.0  # what a new node discovers by then was there before it [s]
 _GRAPH_PERIOD = 0.04  # of asking the graph [s]
+_UNKNOWN = "a node not known yet"  # the graph knows an endpoint before it knows its node
 HEARD = 0.3  # a commander that was heard within this time commands [s]
 
 
 def publishers_of(node: BaseNode, topic: str, *, own: bool = True) -> str:
     """Names of the nodes that publish on ``topic``, for a sentence; ``own``: this node's too."""
     leave_out = None if own else node.get_fully_qualified_name()
-    names = {node_of(info) or "a node not known yet" for info in node.get_publishers_info_by_topic(topic)}
+    names = {node_of(info) or _UNKNOWN for info in node.get_publishers_info_by_topic(topic)}
     return " and ".join(sorted(names - {leave_out})) or "another node"
 
 
 def takers_of(node: BaseNode, topic: str) -> str:
     """Names of the nodes that take what this one sends on ``topic``, for a sentence."""
-    found = {node_of(info) or "a node not known yet" for info in node.get_subscriptions_info_by_topic(topic)}
+    found = {node_of(info) or _UNKNOWN for info in node.get_subscriptions_info_by_topic(topic)}
     return " and ".join(sorted(found - {node.get_fully_qualified_name()}))
 
 
@@ -116,6 +117,12 @@ class CommandWatch:
             self.end()
         self._found = self._found or self.commander()
         return self._found
+
+    def named(self, reason: Reason) -> Reason:
+        """The same reason with the names of nodes that are known by now."""
+        if reason.kind is not ReasonKind.OTHER_COMMANDER or _UNKNOWN not in reason.detail["nodes"]:
+            return reason
+        return self._reason(reason.detail["topic"])
 
     def rest(self) -> None:
         """This node commands no more: when it does again, whoever is there then was there before."""

@@ -28,6 +28,7 @@ from q2r2_control.types import Array, RobotState
 WINDOW = 0.05  # W [s]
 _SHARE = 0.1  # of the way that was asked for, below which an arm stands
 _FOLLOWS = 0.5  # of that way, above which it follows
+_LOOK_PERIOD = 0.0075  # a loop may tick a thousand times a second [s]
 _TICK_GAP, _STATE_GAP = 0.03, 0.045  # between two ticks, and between two states; with more the window begins anew [s]
 
 
@@ -103,10 +104,13 @@ class StandingArms:
     def __init__(self, robot: Robot, limits: StandstillLimits, takers: Callable[[str], str]) -> None:
         self._joints = {arm: its.joints for arm, its in robot.arms.items()}
         self._watches = {arm: StandstillWatch(limits) for arm in robot.arms}
-        self._takers = takers
+        self._takers, self._looked = takers, -math.inf
 
     def look(self, asked: Array, state: RobotState, now: float) -> Reason | None:
         """A reason where an arm does not go where it was ``asked`` to be (nv,) [rad], else None."""
+        if 0.0 <= now - self._looked < _LOOK_PERIOD:
+            return None
+        self._looked = now
         for arm, joints in self._joints.items():
             way = self._watches[arm].look(asked[joints], state.q[joints], state.stamp, now)
             if way is not None:

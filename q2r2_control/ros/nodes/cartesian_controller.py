@@ -45,7 +45,7 @@ from q2r2_control.wording import sentence
 _LONGEST_STOP = 3.0  # [s]
 _QUIET = 0.3  # nobody else commands the arms for so long before this node does [s]
 _LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
-_SAFE_TARGET_PERIOD = 0.012  # [s]
+_SAFE_TARGET_PERIOD = 0.02  # of arms that only listen [s]
 
 
 class CartesianControllerNode(ManagedNode):
@@ -106,7 +106,7 @@ class CartesianControllerNode(ManagedNode):
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
         self._commanding, self._advances = False, 0  # ticks that have gone by some time
-        # Another controller follows every safe target; arms that listen tick a hundred times a second.
+        # Another controller follows every safe target; arms that listen need the newest to know where the arm is.
         every = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._last_tick = self.now
@@ -208,6 +208,7 @@ class CartesianControllerNode(ManagedNode):
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         supervisor, now = self._supervisor, self.now
         fault = supervisor.fault or self._other if self.is_active else self._deactivated
+        fault = None if fault is None else self._others.named(fault)
         refused, ended, homed = self._targets.faults(), supervisor.targets.ended, supervisor.homing.outcome
         values: dict[str, Any] = {
             "phase": supervisor.phase,
