@@ -60,6 +60,8 @@ class TickExecutor(SingleThreadedExecutor):
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Sleep until a tick is due, for 50 ms or ``timeout_sec`` at most; run what is due then."""
+        if not self.context.ok():
+            raise ExternalShutdownException
         if self._changed:
             self._collect()
         longest = _SERVED if timeout_sec is None or timeout_sec < 0.0 else min(timeout_sec, _SERVED)
@@ -73,8 +75,6 @@ class TickExecutor(SingleThreadedExecutor):
                 timer.handle.call_timer()
                 timer.callback()
         if (now := time.monotonic()) - self._served_at >= _SERVED:
-            if not self.context.ok():
-                raise ExternalShutdownException
             self._served_at, self._streams, self._simulated = now, self._subscriptions, self._is_simulated()
             self.take_messages()  # a publisher may have come, and even gone
             if not self._changed:

@@ -19,7 +19,7 @@ from q2r2_control.events import HOLD_REQUESTS, Reason, ReasonKind
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
-_PERIOD = 1.0  # of asking the graph where no other code asks [s]
+_PERIOD = 2.0  # of asking the graph where no other code asks [s]
 _NO_WAIT = Duration(nanoseconds=0)
 # A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. Messages are therefore left out
 # every _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.

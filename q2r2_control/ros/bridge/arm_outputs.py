@@ -29,6 +29,7 @@ _POSE = 2  # of moveit_msgs/srv/ServoCommandType
 # Reports of the built-in controller on an arm that takes a stream of targets.
 _READY = ("holding", "following", "homing")
 _ANSWER = 0.2  # the controller has told of all earlier streams by then [s]
+_LOOK_PERIOD = 0.04  # of asking the graph for it [s]
 _STATE_TYPE = "std_msgs/msg/String"
 _SILENT = 2.0  # a controller that has not reported for so long does not answer; it reports twice a second [s]
 _RETRY = 1.0  # the service is called again if it has not answered for this long [s]
@@ -195,6 +196,7 @@ class FollowWatch:
         self._node, self._state_topic = node, f"{controller}/state"
         self._unready: Reason | None = None  # by the newest report
         self._starts, self._reported_at = 0, -math.inf  # the newest report came then [s]
+        self._is_there, self._looked = False, -math.inf  # whether somebody reports, and when the graph was asked [s]
         self.homing = False  # whether it says that it goes home
         self.homing_outcome: Reason | None = None  # of the last way, where that ended by itself
         self.gripper_held = ""  # what keeps the gripper from going farther
@@ -204,10 +206,12 @@ class FollowWatch:
     @property
     def unready(self) -> Reason | None:
         """Why the controller would follow no stream of targets now."""
-        if not self._node.count_publishers(self._state_topic):
+        if (now := time.monotonic()) - self._looked > _LOOK_PERIOD:
+            self._looked, self._is_there = now, bool(self._node.count_publishers(self._state_topic))
+        if not self._is_there:
             kind, topic = ReasonKind.CONTROLLER_ABSENT, self._state_topic
             return Reason.of(kind, controller=self.controller, topic=topic, type=_STATE_TYPE)
-        if (age := time.monotonic() - self._reported_at) <= _SILENT:
+        if (age := now - self._reported_at) <= _SILENT:
             return self._unready
         if age == math.inf:
             return Reason.of(ReasonKind.TOPIC_EMPTY, topic=self._state_topic)

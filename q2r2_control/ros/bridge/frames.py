@@ -75,6 +75,8 @@ class FrameTree:
             str, tuple[ReadTransform, float]
         ] = {}  # of each frame where it is, and when that was received
         self._found: dict[tuple[str, str], Placement] = {}  # since a transform last came
+        self._used: set[str] = set()  # frames on the way between those that were found
+        self._all = True  # a frame was looked for in vain: any transform may be on the way to it
 
     def set(self, transform: ReadTransform, received: float) -> None:
         """Store one transform, received then [s], inf: static; one without a pose is ignored."""
@@ -91,8 +93,15 @@ class FrameTree:
             if name in up:
                 pose, received = up[name].pose.inverse() * placement.pose, min(up[name].received, placement.received)
                 self._found[frame, within] = Placement(pose, received)
+                self._used.update(up, (name for name, _ in self.upwards(frame)))
+                self._all = False
                 return self._found[frame, within]
+        self._all = True
         return None
+
+    def wants(self, frame: str) -> bool:
+        """Whether where ``frame`` is matters for what was looked for: of the links of a robot few do."""
+        return self._all or frame in self._used
 
     def moves_far(self, transform: ReadTransform) -> bool:
         """Whether the frame is elsewhere in a transform than it was in the last one."""
@@ -145,6 +154,8 @@ class FrameListener:
         received, now, number = self._node.now, time.monotonic(), info["publication_sequence_number"]
         for transform in self._read(_TF, message):
             frame = transform.child_frame_id
+            if not self.tree.wants(frame):
+                continue
             if number is not None:
                 senders = self._numbers[frame].take(number, now, _PAUSE)
                 if senders >= 2 and self.tree.moves_far(transform):
