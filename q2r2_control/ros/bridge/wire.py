@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -146,15 +147,18 @@ def _joints(data: bytes, arrays: int, before: Callable[[_Walk], bool] = lambda w
 
 def _remembered(make: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
     """The layouts of messages by ``make``, each made once."""
-    layouts: dict[int, Any] = {}
+    layouts: dict[
+        int, tuple[Callable[[bytes], Any], Any, Any]
+    ] = {}  # by a message's length: its parts that are the same
 
     def find(data: bytes) -> Any:
-        layout = layouts.get(len(data))
-        if layout is None or any(data[at : at + len(part)] != part for at, part in layout.same):
+        parts_of, parts, layout = layouts.get(len(data), (None, None, None))
+        if parts_of is None or parts_of(data) != parts:
             if len(layouts) >= _KEPT:
                 layouts.clear()
             if (layout := make(data)) is not None:
-                layouts[len(data)] = layout
+                parts_of = itemgetter(*(slice(at, at + len(part)) for at, part in layout.same))
+                layouts[len(data)] = parts_of, parts_of(data), layout
         return layout
 
     return find
