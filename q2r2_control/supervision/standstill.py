@@ -9,7 +9,7 @@ that stands still does not, which shows within a few states:
 
 with what was asked r and what is measured m, the greatest value of an arm's joints, or the way of its tool. An arm that
 lags by L turns round on a path of W / (4 L) of what it is asked for meanwhile, so one that lags by 0.12 s is not found.
-Where this loop or the states have a gap nothing is judged, since then the arm may have had nothing to follow.
+Where states have a gap nothing is judged. After a gap of this loop an arm has not yet been asked for what counts.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WINDOW = 0.05  # W [s]
 _SHARE = 0.1  # of the way that was asked for, below which an arm stands
 _FOLLOWS = 0.5  # of that way, above which it follows
 _LOOK_PERIOD = 0.0075  # a loop may tick a thousand times a second [s]
-_TICK_GAP, _STATE_GAP = 0.03, 0.045  # between two ticks, and between two states; with more the window begins anew [s]
+_STATE_GAP = 0.045  # between two states; with more the window begins anew [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class StandstillWatch:
         # For each measured state: when, what was asked, the way that was measured since the first.
         self._seen: deque[tuple[float, Array, Array]] = deque()
         self._measured: Array | None = None
-        self._stamp, self._now = -math.inf, -math.inf
+        self._stamp = -math.inf
         self._since, self._follows = math.inf, False
 
     def look(self, asked: Array, measured: Array, stamp: float, now: float) -> float | None:
@@ -69,9 +69,8 @@ class StandstillWatch:
 
         ``asked``: sent before this tick; ``measured`` has the ``stamp`` at which it was received.
         """
-        if now - self._now > _TICK_GAP or now - stamp > _STATE_GAP or stamp < self._stamp:
+        if now - stamp > _STATE_GAP or stamp < self._stamp:
             self.reset()
-        self._now = now
         if stamp != self._stamp:
             self._stamp = stamp
             path = (

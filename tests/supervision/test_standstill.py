@@ -65,9 +65,9 @@ def findings(
     watch, measured, stamp, command = StandstillWatch(limits), asked(0.0), 0.0, asked(0.0)
     seen, next_state = measured, 0.0
     for t in np.arange(0.0, seconds, DT):
-        if t < frozen_at and ticks(t):
-            command = asked(t - delay)
         measured = measured + (command - measured) * (DT / lag)
+        if t < frozen_at and ticks(t):  # what is sent at a tick moves the arm until the next one
+            command = asked(t - delay)
         if t >= next_state and heard(t):
             seen, stamp, next_state = measured, t, next_state + state_period
         if ticks(t) and watch.look(asked(t), seen, stamp, t) is not None:
