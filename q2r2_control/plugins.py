@@ -17,7 +17,7 @@ PRESETS = "q2r2_control.presets"
 
 
 def names_of(group: str) -> tuple[str, ...]:
-    """What installed packages declare, in the order of the alphabet."""
+    """The names that installed packages declare, in the order of the alphabet."""
     return tuple(sorted({point.name for point in entry_points(group=group)}))
 
 

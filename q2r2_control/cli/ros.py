@@ -247,7 +247,7 @@ def up(
 
     With controller: external the robot and its controllers are yours. The arms' teleop and an input run here, and in
     mode filtered the built-in controller between both. A node that ends by itself is reported, and all others are
-    stopped: exit 1. What follows --ros-args is for all nodes: remappings, and parameters as NODE:NAME:=VALUE.
+    stopped: exit 1. Words after --ros-args are for all nodes: remappings, and parameters as NODE:NAME:=VALUE.
     """
     notes = notes_of(task, operator, record)
     recording = None if record is None else {"folder": record, **notes}

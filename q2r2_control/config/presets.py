@@ -153,7 +153,7 @@ class Mode(StrEnum):
     FILTERED = "filtered"  # what the built-in controller makes of it: within limits and free of collisions
 
 
-# What whoever chooses mode raw has to know, at the start and in q2r2 check.
+# A warning about mode raw, at the start and in q2r2 check.
 RAW_WARNING = "raw: no limits, no distances, no self-collision"
 
 

@@ -76,7 +76,7 @@ def _found(data: bytes | bytearray, part: bytes) -> list[int]:
 
 
 class JointNumbers(NamedTuple):
-    """What a JointState, or the one point of a JointTrajectory, says of joints; arrays (n,), or (0,) for none."""
+    """The joints of a JointState, or of the one point of a JointTrajectory; arrays (n,), or (0,) for none."""
 
     name: tuple[str, ...]
     position: Array
@@ -96,7 +96,7 @@ class _Walk:
 
     def __init__(self, data: bytes) -> None:
         self.data, self.place = data, 4  # after the encapsulation, from where alignment counts
-        # Texts and lengths, and where they are. What fills the gaps between aligned parts is any byte.
+        # Texts and lengths, and where they are. The gaps between aligned parts have any bytes.
         self.same = [(1, _LITTLE_ENDIAN)]
         if data[1:2] != _LITTLE_ENDIAN:
             raise SerdeError("not little endian, as every platform of this ROS is")
@@ -224,7 +224,7 @@ def trajectory_reader() -> Callable[[bytes], Any]:
 
 
 class PoseNumbers(NamedTuple):
-    """What a PoseStamped says: its stamp [ns], its frame, position x y z [m] and quaternion x y z w."""
+    """The parts of a PoseStamped: its stamp [ns], its frame, position x y z [m] and quaternion x y z w."""
 
     stamp: int
     frame: str
