@@ -214,13 +214,15 @@ def test_the_launch_file_starts_what_the_command_starts(
     runpy.run_path(str(ROOT / "launch" / "teleop.launch.py"))["generate_launch_description"]()
     given = {call.args[0]: call.kwargs["default_value"] for call in launch.DeclareLaunchArgument.call_args_list}
     given |= {"config": config, "input": source, "record": folder, "separate": separate}
+    given |= {"namespace": "/cell", "use_sim_time": "true"}
     launch.OpaqueFunction.call_args.kwargs["function"](given)
     recording = {"folder": folder} if folder else None
     expected = nodes_of(config, source, separate=separate == "true", recording=recording)
     actions = [call.kwargs for call in launch.Node.call_args_list]
     for action, node in zip(actions, expected, strict=True):
         assert (action["package"], action["executable"]) == ("q2r2_control", node.name)
-        (parameters,) = action["parameters"]
+        parameters, of_all = action["parameters"]
+        assert (action["namespace"], of_all) == ("/cell", {"use_sim_time": True})
         assert parameters == {key: (value, type(value)) for key, value in node.parameters.items()}
     ends = [call.kwargs for call in launch.Shutdown.call_args_list]
     assert ends == [{"reason": f"{node.name} ended"} for node in expected]
