@@ -26,6 +26,10 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "separate", default_value="false", choices=["true", "false"], description="each arm a process"
             ),
+            DeclareLaunchArgument("namespace", default_value="", description="of all nodes, such as /cell"),
+            DeclareLaunchArgument(
+                "use_sim_time", default_value="false", choices=["true", "false"], description="the time is on /clock"
+            ),
             OpaqueFunction(function=_nodes),
         ]
     )
@@ -36,13 +40,19 @@ def _nodes(context):
     folder = LaunchConfiguration("record").perform(context)
     recording = {"folder": folder} if folder else None
     separate = LaunchConfiguration("separate").perform(context) == "true"
+    namespace = LaunchConfiguration("namespace").perform(context)
+    sim_time = LaunchConfiguration("use_sim_time").perform(context) == "true"
     return [
         Node(
             package="q2r2_control",
             executable=node.name,
+            namespace=namespace,
             output="screen",
             # Typed, since launch would otherwise read a text that looks like a number as one.
-            parameters=[{key: ParameterValue(value, value_type=type(value)) for key, value in node.parameters.items()}],
+            parameters=[
+                {key: ParameterValue(value, value_type=type(value)) for key, value in node.parameters.items()},
+                {"use_sim_time": sim_time},
+            ],
             on_exit=Shutdown(reason=f"{node.name} ended"),
         )
         for node in nodes_of(*given, recording, separate)

@@ -122,6 +122,16 @@ class ReasonKind(StrEnum):
         "controller_deactivated",
         "{controller} is deactivated: ros2 lifecycle set {controller} activate takes over where the arms are",
     )
+    CONTROLLER_ABSENT = (
+        "controller_absent",
+        "{controller} is not there: nobody publishes {topic} ({type}); another controller than the built-in one needs "
+        "its preset",
+    )
+    CONTROLLER_STANDS = (
+        "controller_stands",
+        "the {arm} arm's controller{takers} stands still: the arm is measured, and does not go the {way:.3f} {unit} "
+        "that it was asked to in {time:g} s",
+    )
     CONTROLLER_RESTARTED = "controller_restarted", "{controller} was restarted"
     CONTROLLER_ENDED = "controller_ended", "{controller} has ended"
     NODE_BEGINS = "node_begins", "the node has not begun yet"

@@ -1,4 +1,4 @@
-"""Inputs and plants by name: entry points that any installed package may declare.
+"""Inputs, plants and presets by name: entry points that any installed package may declare.
 
 [project.entry-points."q2r2_control.inputs"]
 gamepad = "my_package.gamepad:Gamepad"
@@ -13,10 +13,19 @@ from q2r2_control.errors import ConfigError
 
 INPUTS = "q2r2_control.inputs"
 PLANTS = "q2r2_control.plants"
+PRESETS = "q2r2_control.presets"
+
+
+def names_of(group: str) -> tuple[str, ...]:
+    """The names that installed packages declare, in the order of the alphabet."""
+    return tuple(sorted({point.name for point in entry_points(group=group)}))
 
 
 def load_class(group: str, name: str) -> Any:
-    """The class called ``name``. Raises :class:`ConfigError` where there is none, or it cannot be imported."""
+    """The class, or preset, called ``name``.
+
+    Raises :class:`ConfigError` where there is none, or it cannot be imported.
+    """
     found = {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
     if name not in found:
         kind = group.rpartition(".")[2].removesuffix("s")

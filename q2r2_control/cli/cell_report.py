@@ -16,6 +16,7 @@ from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
+from q2r2_control.config.presets import RAW_WARNING
 from q2r2_control.control.controller import CartesianController, check_settings
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
 from q2r2_control.robot.kept_distances import kept_distances, near_at_home
@@ -92,6 +93,8 @@ def check_cell(config: Config) -> CellCheck:
     arms = [_arm_check(config, robot, name) for name in robot.arms]
     stops = stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit))
     notes = [f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in arms if arm.object]
+    if config.external is not None and not config.external.filtered:
+        notes.append(RAW_WARNING)
     if config.capsules:
         notes.append(_capsules_note(config, robot))
     if config.note_on_grippers is not None:

@@ -14,6 +14,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 from typer import Argument, Exit, Option
+from typer.core import TyperCommand
 
 from q2r2_control.cli.output import (
     DEMO_CONFIG,
@@ -30,13 +31,14 @@ from q2r2_control.cli.output import (
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
-from q2r2_control.ros.launch.processes import check_rclpy, nodes_of, run_together
+from q2r2_control.ros.launch.processes import check_rclpy, in_ros, nodes_of, run_together
 from q2r2_control.ros.watching.findings import Finding, examine_environment, examine_set
 from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView
 from q2r2_control.viewer.tables import Cell, figure_table
 from q2r2_control.viewer.web.page import check_viser
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
+_ROS_ARGUMENTS = "--ros-args"
 _ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
 _TIME = 4.0  # in which a set is found, and a second publisher too [s]
 
@@ -210,8 +212,24 @@ def build_interfaces_command(
         raise Exit(1) from None
 
 
-@app.command(epilog="Example: q2r2 ros up config/dual_iiwa7.yaml --input headset")
+class _WithRosArguments(TyperCommand):
+    """A command whose last words may be for ROS: all between ``--ros-args`` and ``--``, or the end."""
+
+    def parse_args(self, context: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+        """Set them aside, and parse the others."""
+        first = args.index(_ROS_ARGUMENTS) if _ROS_ARGUMENTS in args else len(args)
+        last = args.index("--", first) if "--" in args[first:] else len(args)
+        context.meta[_ROS_ARGUMENTS] = args[first + 1 : last]
+        return super().parse_args(context, args[:first] + args[last + 1 :])
+
+
+@app.command(
+    cls=_WithRosArguments,
+    options_metavar="[OPTIONS] [--ros-args ...]",
+    epilog="Example: q2r2 ros up config/dual_iiwa7.yaml --input headset --ros-args -r joint_trajectory:=/jtc/command",
+)
 def up(
+    context: typer.Context,
     config: Annotated[str, Argument(metavar="CONFIG", help="YAML of the cell.")],
     input: Annotated[str | None, Option(metavar="NAME", help="An installed input, or none for another node.")] = None,
     robot: Annotated[RobotSource, Option(help="auto: mujoco for controller: builtin, else none.")] = RobotSource.AUTO,
@@ -222,12 +240,14 @@ def up(
     web_port: WebPort = 8080,
     task: Task = None,
     operator: Operator = None,
+    namespace: Annotated[str | None, Option(metavar="NAME", help="Of all nodes, such as /cell.")] = None,
+    sim_time: Annotated[bool, Option("--sim-time", help="Take the time from /clock: use_sim_time.")] = False,
 ) -> None:
     """Start what a cell needs as ROS nodes, until Ctrl-C: robot, controller, the arms' teleop and an input.
 
     With controller: external the robot and its controllers are yours. The arms' teleop and an input run here, and in
     mode filtered the built-in controller between both. A node that ends by itself is reported, and all others are
-    stopped: exit 1.
+    stopped: exit 1. Words after --ros-args are for all nodes: remappings, and parameters as NODE:NAME:=VALUE.
     """
     notes = notes_of(task, operator, record)
     recording = None if record is None else {"folder": record, **notes}
@@ -235,4 +255,5 @@ def up(
     if web:
         check_viser()  # before any node starts
     nodes = nodes_of(config, input, robot.value, recording, separate, page)
+    nodes = in_ros(nodes, context.meta[_ROS_ARGUMENTS], namespace, sim_time)
     raise Exit(run_together(nodes, lambda line: print(line, flush=True)))

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from q2r2_control.config.presets import BUILTIN, PRESETS, Mode, Preset, preset_of
+from q2r2_control.config.presets import BUILTIN, PRESETS, Mode, Preset, preset_called, preset_names, preset_of
 from q2r2_control.config.strict import StrictModel
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.errors import ConfigError
@@ -109,9 +109,10 @@ _EXTERNAL = tuple(name for name in PRESETS if name != BUILTIN.name)
 class ExternalConfig(StrictModel):
     """The controller that drives the arms instead of the built-in one, and the messages that it gets."""
 
-    preset: str = Field(description=f"its terms: {', '.join(_EXTERNAL)}")
+    preset: str = Field(description=f"its terms: {', '.join(_EXTERNAL)}, or one that is installed")
     mode: Mode = Field(
-        Mode.RAW, description="raw: the hand's target; filtered: what the built-in controller makes of it"
+        Mode.FILTERED,
+        description="filtered: what the built-in controller makes of the hand's target; raw: that target itself",
     )
     rate: float | None = Field(None, ge=1, le=1000, description="of what it is sent; none: as the preset says [Hz]")
     world_frame: FrameName | None = Field(
@@ -123,8 +124,9 @@ class ExternalConfig(StrictModel):
     @field_validator("preset")
     @classmethod
     def _is_known(cls, name: str) -> str:
-        if name not in _EXTERNAL:
-            raise ValueError(f"allowed are {', '.join(_EXTERNAL)}")
+        allowed = [one for one in preset_names() if one != BUILTIN.name]
+        if name not in allowed:
+            raise ValueError(f"allowed are {', '.join(allowed)}")
         return name
 
     @model_validator(mode="after")
@@ -143,7 +145,7 @@ class ExternalConfig(StrictModel):
     @property
     def terms(self) -> Preset:
         """The preset."""
-        return PRESETS[self.preset]
+        return preset_called(self.preset)
 
     @property
     def filtered(self) -> bool:

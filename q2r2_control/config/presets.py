@@ -1,7 +1,8 @@
 """Terms of community controllers: topic, type, frame, rate, activation, limits.
 
 ``{ctrl}`` stands for the controller's own name with its namespace, the parameter ``ctrl_prefix`` of an arm controller.
-``{robot}`` stands for that namespace alone.
+``{robot}`` stands for that namespace alone. An installed package adds a controller by an entry point of
+``q2r2_control.presets`` that is a :class:`Preset` of the same name.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from enum import StrEnum
 
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.errors import ConfigError
+from q2r2_control.plugins import PRESETS as ENTRY_POINTS
+from q2r2_control.plugins import load_class, names_of
 
 POSE = "geometry_msgs/msg/PoseStamped"
 
@@ -57,7 +60,7 @@ class Preset:
 
 
 _LATCHES = "active; keeps the last target for ever"
-BUILTIN = Preset("builtin", "always on", rate=200.0, lowest_rate=20.0, hold=Hold.SILENCE, guard=_WIDE)
+BUILTIN = Preset("builtin", "always on", rate=100.0, lowest_rate=20.0, hold=Hold.SILENCE, guard=_WIDE)
 _ALL = (
     BUILTIN,
     # Its velocity clamp counts the time since the target last changed: a long pause would let the next one through.
@@ -126,6 +129,23 @@ _ALL = (
 PRESETS = {preset.name: preset for preset in _ALL}
 
 
+def preset_names() -> tuple[str, ...]:
+    """The presets of this package, then those that others have installed."""
+    return (*PRESETS, *(name for name in names_of(ENTRY_POINTS) if name not in PRESETS))
+
+
+def preset_called(name: str) -> Preset:
+    """The preset of this package, or of an installed one. Raises :class:`ConfigError`."""
+    if name in PRESETS:
+        return PRESETS[name]
+    if name not in preset_names():
+        raise ConfigError(f"preset = {name!r:.60}: allowed are {', '.join(preset_names())}")
+    preset = load_class(ENTRY_POINTS, name)
+    if not isinstance(preset, Preset) or preset.name != name:
+        raise ConfigError(f"{ENTRY_POINTS}: {name} is {preset!r:.60}; allowed: a Preset of that name")
+    return preset
+
+
 class Mode(StrEnum):
     """The kind of target that an external controller follows."""
 
@@ -133,13 +153,15 @@ class Mode(StrEnum):
     FILTERED = "filtered"  # what the built-in controller makes of it: within limits and free of collisions
 
 
+# A warning about mode raw, at the start and in q2r2 check.
+RAW_WARNING = "raw: no limits, no distances, no self-collision"
+
+
 def preset_of(name: str, mode: str) -> tuple[Preset, Mode]:
     """Preset and mode by their names. Raises :class:`ConfigError` for names and pairs that are not allowed."""
-    if name not in PRESETS:
-        raise ConfigError(f"preset = {name!r:.60}: allowed are {', '.join(PRESETS)}")
+    preset = preset_called(name)
     if mode not in list(Mode):
         raise ConfigError(f"mode = {mode!r:.60}: allowed are {', '.join(Mode)}")
-    preset = PRESETS[name]
     if mode == Mode.RAW and not preset.takes_poses:
         takes = "it takes joint positions, which the built-in controller has to make of the hand's target"
         raise ConfigError(f"preset = {name!r} with mode = '{Mode.RAW}': {takes}; allowed is mode {Mode.FILTERED}")

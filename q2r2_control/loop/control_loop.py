@@ -19,6 +19,7 @@ from q2r2_control.supervision.arm_skew import skew_window
 from q2r2_control.supervision.gripper_limiter import REMEMBERED, STALL, GraspWatch, GripperLimiter
 from q2r2_control.supervision.joint_watch import ExternalArms, WatchSettings
 from q2r2_control.supervision.measured_lags import MeasuredLags
+from q2r2_control.supervision.standstill import StandstillLimits
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
@@ -63,14 +64,16 @@ class ControlLoop:
         external: ExternalArms | None = None,
         gripper_delay: float = 0.0,
         owns_plant: bool = True,
+        standstill: StandstillLimits | None = None,
     ) -> None:
         """``period`` [s] of the commands; ``gripper_delay`` [s]: until a gripper gets its command, at most.
 
         ``owns_plant``: commands go on while the arms are stopped. Otherwise whatever else holds them is left alone.
+        ``standstill``: see :class:`Supervisor`.
         """
         robot = controller.robot
         self.controller, self.drive, self._owns_plant = controller, drive, owns_plant
-        self.supervisor = Supervisor(robot, controller, streams, watch, origins, external, drive.displaced)
+        self.supervisor = Supervisor(robot, controller, streams, watch, origins, external, drive.displaced, standstill)
         self.acceleration_limit: Array = robot.capped_acceleration(controller.settings.acceleration_limit)
         velocity_limit = robot.velocity_limit * controller.settings.velocity_scale
         self.pacer = TickPacer(period, velocity_limit, self.acceleration_limit, drive.coasts)

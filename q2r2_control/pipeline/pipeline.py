@@ -266,7 +266,10 @@ class Pipeline(RequestedRun):
         watch = watch_settings(self.config.supervision, self.drive.yields)
         streams = StreamSettings(linked=self.config.teleop.linked)
         period, delay = 1.0 / self.config.nominal_rate_hz, self.config.gripper_delay
-        self.loop = ControlLoop(self.controller, self.drive, period, streams, watch, gripper_delay=delay)
+        standstill = getattr(self.plant, "standstill", None)  # of a plant whose arms are moved by another process
+        self.loop = ControlLoop(
+            self.controller, self.drive, period, streams, watch, gripper_delay=delay, standstill=standstill
+        )
 
     def _begin(self, realtime: bool) -> None:
         self._following = True

@@ -65,13 +65,14 @@ def reserve(runtime: float, period: float) -> bool:
     return bool(ctypes.CDLL(None, use_errno=True).syscall(number, 0, attributes, 0) == 0)
 
 
-def schedule_process_first(priority: int) -> str | None:
-    """Let all threads that this process has now run under SCHED_FIFO at ``priority``, 1..99.
+def schedule_thread_first(priority: int) -> str | None:
+    """Let the calling thread run under SCHED_FIFO at ``priority``, 1..99.
 
-    For a process whose other threads bring and take what its loop waits for. Returns None, or one line that says why
-    that is not permitted, and how to permit it. Threads and processes that are started later do not inherit it.
+    Other threads of the process do not: what answers in time goes first, and not what may fall behind. Returns None, or
+    one line that says why that is not permitted, and how to permit it. Threads and processes that are started later do
+    not inherit it.
     """
-    refused = _schedule_first(_threads(), priority)
+    refused = _schedule_first([0], priority)
     return refused if refused is None or sys.platform != "linux" else f"{refused}; {_ADVICE}"
 
 
@@ -80,13 +81,9 @@ def thread_priority() -> int:
     return os.sched_getparam(0).sched_priority if sys.platform == "linux" else 0
 
 
-def schedule_process_as_others() -> None:
-    """Take back what :func:`schedule_process_first` did."""
-    _schedule_as_others(_threads())
-
-
-def _threads() -> list[int]:
-    return [int(thread.name) for thread in Path("/proc/self/task").iterdir()] if sys.platform == "linux" else []
+def schedule_thread_as_others() -> None:
+    """Take back what :func:`schedule_thread_first` did."""
+    _schedule_as_others([0])
 
 
 def _lock_memory() -> str | None:

@@ -33,8 +33,8 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.process.scheduling import (
     LONGEST_END,
     StopRequest,
-    schedule_process_as_others,
-    schedule_process_first,
+    schedule_thread_as_others,
+    schedule_thread_first,
 )
 from q2r2_control.ros.executor import TickExecutor, TickGroup
 from q2r2_control.ros.launch.middleware import set_up_middleware
@@ -73,9 +73,11 @@ class BaseNode(Node):
     def __init__(self, name: str, **kwargs: Any) -> None:
         self.tick_group = TickGroup()
         super().__init__(name, **kwargs)
-        what = "of SCHED_FIFO, where the system permits it; 0: as any other program; of nodes in a process the highest"
+        what = (
+            "of SCHED_FIFO for the thread that ticks, where the system permits it; 0: as others; a process: the highest"
+        )
         self.priority = self.parameter("realtime_priority", self.priority, what, within=(0, 98))
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
         self._ros_time = 0.0, time.monotonic()  # the newest, and the steady time when it was first seen [s]
         self._dropped: set[str] = set()  # topics of which some messages could not be read
@@ -129,6 +131,17 @@ class BaseNode(Node):
         if one_of and value not in one_of:
             raise ConfigError(f"parameter {name}: {value!r}: allowed are {', '.join(one_of)}")
         return value
+
+    def full_name(self, name: str) -> str:
+        """A topic's, service's or node's name in this node's namespace; one that begins with / stays, if it was given.
+
+        It is not remapped: whoever subscribes, publishes or calls by it does that.
+        """
+        return str(self.resolve_topic_name(name, only_expand=True)) if name else name
+
+    def name_in_set(self, name: str) -> str:
+        """The full name of what is called ``name``, such as ``/recorder``, in a set without a namespace."""
+        return self.full_name(name.removeprefix("/"))
 
     @property
     def now(self) -> float:
@@ -279,7 +292,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         gc.collect()
         gc.freeze()
         _take_priority(nodes)
-        while rclpy.ok() and not stop.asked and all(node.exit_code is None for node in nodes):
+        while not stop.asked and all(node.exit_code is None for node in nodes):
             executor.spin_once(timeout_sec=0.1)
     except (Q2R2Error, ParameterException) as error:
         print(f"{name}: {error}", file=sys.stderr)
@@ -291,7 +304,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         for node in reversed(nodes):
             node.close()
         # No arm waits for this process any more. The middleware may take long to end, but neither first nor for ever.
-        schedule_process_as_others()
+        schedule_thread_as_others()
         global _deadline
         _deadline = max(asked + LONGEST_END, time.monotonic() + _LEAST_END)
         end_in_time()
@@ -313,13 +326,13 @@ def _take_priority(nodes: Sequence[BaseNode]) -> None:
     if not priority:
         return
     log = nodes[0].get_logger()
-    if problem := schedule_process_first(priority):
+    if problem := schedule_thread_first(priority):
         log.info(f"real time: {problem}")
         return
     import resource  # on Linux, where alone a process goes first
 
     def give_up(*_: object) -> None:
-        schedule_process_as_others()
+        schedule_thread_as_others()
         log.warning(f"real time: given up, ticks left no time to sleep for {_NEVER_IDLE:g} s; allowed: a lower rate")
 
     signal.signal(signal.SIGXCPU, give_up)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
@@ -15,16 +16,17 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
 from q2r2_control.events import HOLD_REQUESTS, Reason, ReasonKind
-from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS, BaseNode
+from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
-_PERIOD = 0.5  # of asking the graph where no other code asks [s]
+_PERIOD = 2.0  # of asking the graph where no other code asks [s]
 _NO_WAIT = Duration(nanoseconds=0)
 # A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. Messages are therefore left out
 # every _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
 _CHECK, _GAP = 0.05, 0.015
 _ASKED = 0.02  # after all was acknowledged, it is asked again [s]
 _LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # [s]
+_LATELY = 32  # messages; a subscription of the same node keeps fewer
 _STATE = "/state"
 _LOOK_PERIOD = 0.3  # of asking the graph for nodes that report [s]
 _DISCOVERY = 2.0  # an arm that is there has said so by then: nodes report twice a second [s]
@@ -98,14 +100,20 @@ class WatchedPublisher:
         self.topic_name: str = self._publisher.topic_name
         self._timeout = timeout
         self.sent = 0
+        self._lately: deque[bytes] = deque(maxlen=_LATELY)
+        self.own_listeners = 0  # subscriptions of the same node, which acknowledge nothing
         self._streaming = False
         self._acknowledged: float | None = None  # when all messages last were; None: not yet in this stream [s]
         self._gap_began = -math.inf  # [s]
 
     @property
     def listeners(self) -> int:
-        """How many subscribers the graph lists; some may have ended."""
-        return int(self._publisher.get_subscription_count())
+        """How many subscribers of others the graph lists; some may have ended."""
+        return int(self._publisher.get_subscription_count()) - self.own_listeners
+
+    def is_own(self, data: bytes) -> bool:
+        """Whether a serialized message is one of the last that were published here."""
+        return data in self._lately
 
     def begin(self, acknowledged: bool = False) -> None:
         """The next message begins a stream; with ``acknowledged`` all that was sent before counts as acknowledged."""
@@ -114,7 +122,9 @@ class WatchedPublisher:
 
     def publish(self, message: Any, decided: float) -> bool:
         """Publish a message of the stream; ``decided`` and what it returns: see :func:`publish_in_time`."""
-        published = publish_in_time(self._publisher, message, decided)
+        data = message if isinstance(message, bytes) else serialize_message(message)
+        self._lately.append(data)
+        published = publish_in_time(self._publisher, data, decided)
         self.sent += 1
         self._streaming = True
         return published
@@ -145,52 +155,24 @@ class WatchedPublisher:
         return Reason.of(ReasonKind.NOT_ACKNOWLEDGED, topic=self.topic_name, age=now - self._acknowledged)
 
 
-class CommandWatch:
-    """Listens to a node's own command topics while it sends nothing; best effort, so nobody awaits its answers."""
-
-    def __init__(self, node: BaseNode, kind: type, topics: Iterable[str]) -> None:
-        self._node, self._kind = node, kind
-        self._heard = dict.fromkeys(topics, -math.inf)  # the last command on each [s]
-        self._subscriptions: list[Any] = []
-
-    def begin(self) -> None:
-        if self._subscriptions:
-            return
-        for topic in self._heard:
-            on_command = partial(self._on_command, topic)
-            self._subscriptions.append(self._node.create_subscription(self._kind, topic, on_command, STREAM_QOS))
-
-    def end(self) -> None:
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions = []
-
-    def commander(self, within: float) -> Reason | None:
-        """A reason if commands came within the last seconds, else None."""
-        now = time.monotonic()
-        for topic, heard in self._heard.items():
-            if now - heard <= within:
-                own = self._node.get_fully_qualified_name()
-                names = {node_of(info) or "a node" for info in self._node.get_publishers_info_by_topic(topic)} - {own}
-                said = ", ".join(sorted(names)) or "another node"
-                return Reason.of(ReasonKind.OTHER_COMMANDER, nodes=said, topic=topic)
-        return None
-
-    def _on_command(self, topic: str, message: Any) -> None:
-        self._heard[topic] = time.monotonic()
-
-
 class NodeStates:
-    """The newest state of every node in the domain that reports one, by its full name; the node has to be spun."""
+    """The newest state of every node that reports one, by its full name; the node has to be spun."""
 
-    def __init__(self, node: Node, on_state: Callable[[str, dict[str, Any]], None] = lambda name, state: None) -> None:
-        self._node, self._on_state = node, on_state
+    def __init__(
+        self,
+        node: Node,
+        on_state: Callable[[str, dict[str, Any]], None] = lambda name, state: None,
+        namespace: str = "/",
+    ) -> None:
+        """``namespace``: where nodes are that count."""
+        self._node, self._on_state, self._prefix = node, on_state, f"{namespace.rstrip('/')}/"
         self._heard: set[str] = set()  # topics
         self.newest: dict[str, tuple[dict[str, Any], float]] = {}  # and when it came [s]
 
     def look(self) -> None:
         for topic, types in self._node.get_topic_names_and_types():
-            if topic.endswith(_STATE) and types == ["std_msgs/msg/String"] and topic not in self._heard:
+            ours = topic.startswith(self._prefix) and topic.endswith(_STATE)
+            if ours and types == ["std_msgs/msg/String"] and topic not in self._heard:
                 self._heard.add(topic)
                 take = partial(self._take, topic.removesuffix(_STATE))
                 self._node.create_subscription(String, topic, take, STREAM_QOS)
@@ -209,7 +191,7 @@ class HandListeners:
     """The nodes that say on ``~/state`` that they follow one of some hands."""
 
     def __init__(self, node: Node, hands: Sequence[str]) -> None:
-        self._states, self._hands = NodeStates(node), hands
+        self._states, self._hands = NodeStates(node, namespace=node.get_namespace()), hands
         self._began = self._asked_at = 0.0  # [s]
 
     def look(self) -> None:

@@ -28,9 +28,12 @@ from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.gripper_client import GripperClient
 from q2r2_control.ros.bridge.intakes import COMMAND_TIME, Fingers, JointIntake
 from q2r2_control.ros.bridge.joint_outputs import TrajectoryOutput
+from q2r2_control.ros.bridge.wire import JointNumbers
+from q2r2_control.ros.commanders import CommandWatch
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.launch.middleware import set_up_middleware
-from q2r2_control.ros.monitoring import CommandWatch, WatchedPublisher
+from q2r2_control.ros.monitoring import WatchedPublisher
+from q2r2_control.supervision.standstill import JOINTS
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
@@ -49,6 +52,7 @@ class RosPlant:
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
     realtime_only = True
+    standstill = JOINTS  # the arms' controller is another process, which may stand still
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._robot, self._period = robot, 1.0 / config.nominal_rate_hz
@@ -78,7 +82,7 @@ class RosPlant:
         self._executor.add_node(node)
         self._publisher = WatchedPublisher(node, JointTrajectory, TrajectoryOutput.topic, STREAM_TIMEOUT)
         self._grippers = {
-            arm: GripperClient(node, f"/q2r2/{arm}_gripper/gripper_cmd", GripperSettings())
+            arm: GripperClient(node, node.full_name(f"q2r2/{arm}_gripper/gripper_cmd"), GripperSettings())
             for arm in self._fingers.arms
         }
         self._openings = {}
@@ -89,7 +93,7 @@ class RosPlant:
         self._last = -math.inf  # tick [s]
         self._command: Command | None = None  # the newest one
         self._begins = True  # the next command has to be where the arms are
-        others = CommandWatch(node, JointTrajectory, [self._publisher.topic_name])
+        self._others = others = CommandWatch(node, JointTrajectory, [self._publisher])
         others.begin()
         began = time.monotonic()
         while (waits := time.monotonic() - began) < _WAIT and not self._stopped():
@@ -112,7 +116,7 @@ class RosPlant:
     def _take_state(self, state: RobotState | Reason, now: float) -> None:
         self._bad = state if isinstance(state, Reason) else None
 
-    def _take_fingers(self, message: JointState) -> None:
+    def _take_fingers(self, message: JointState | JointNumbers) -> None:
         self._openings |= self._fingers.openings(message)
 
     def due(self, now: float) -> tuple[float, float]:
@@ -121,7 +125,10 @@ class RosPlant:
         gap, self._last = now - self._last, now
         before, self._listeners = self._listeners, self._publisher.listeners
         new = self._listeners > before and self._command is not None and self._is_away(self._command)
-        self._fault = Reason(ReasonKind.NEW_RECEIVER) if new else self._problem()
+        if self._begins:
+            self._others.rest()
+        other = self._others.commander() if self._begins else self._others.intruder()
+        self._fault = Reason(ReasonKind.NEW_RECEIVER) if new else other or self._problem()
         return 0.0, min(gap, 2.0 * self._period)
 
     def _is_away(self, command: Command) -> bool:

@@ -24,6 +24,7 @@ from q2r2_control.robot.stop_torque import joints_that_cannot_hold
 from q2r2_control.supervision.arm_skew import SkewWatch
 from q2r2_control.supervision.homing import Homing
 from q2r2_control.supervision.joint_watch import ExternalArms, JointWatch, WatchSettings
+from q2r2_control.supervision.standstill import StandingArms, StandstillLimits
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
 from q2r2_control.types import Array, Reference, RobotState
@@ -58,13 +59,16 @@ class Supervisor:
         origins: Origins | None = None,
         external: ExternalArms | None = None,
         displace: Displace | None = None,
+        standstill: StandstillLimits | None = None,
     ) -> None:
+        """``standstill``: when what moves the arms counts as standing still; None: it is part of this program."""
         self._robot, self._controller, self._external, self._displace = robot, controller, external, displace
         self._origins = origins or Origins()
         self.targets = TargetStreams(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
         self.skew = SkewWatch()
         self.homing = Homing(robot, controller, tools_only=external is not None)
+        self._standing = None if standstill is None else StandingArms(robot, standstill, self._origins.takers)
         self._stopped: Reason | None = None  # why it takes a reset
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
@@ -192,6 +196,11 @@ class Supervisor:
     def _compare(self, reference: Reference, now: float) -> None:
         """Whether the arms are where the reference is. Those that another controller moves may have none that does."""
         away, state = self._watch.deviates(reference.q, now), self._watch.state
+        standing = None if self._standing is None or state is None else self._standing.look(reference.q, state, now)
+        if standing is not None:
+            self.targets.end(standing)
+            self.start_over(standing, now)
+            return
         if self._external is None or state is None:
             if away is not None:
                 self.stop(self._with_gravity(away, reference))

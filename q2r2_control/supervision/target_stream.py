@@ -36,10 +36,14 @@ class StreamSettings:
 
 @dataclass(frozen=True, slots=True)
 class Origins:
-    """Who sends what, for messages about missing data: " from /node", or "" where that is not known."""
+    """Who sends what, for messages about missing data: " from /node", or "" where that is not known.
+
+    ``takers``: who takes an arm's commands, " /node", or "".
+    """
 
     joint_states: Callable[[], str] = lambda: ""
     targets: Callable[[str], str] = lambda arm: ""
+    takers: Callable[[str], str] = lambda arm: ""
 
 
 class TargetStream:

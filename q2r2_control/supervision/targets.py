@@ -142,6 +142,11 @@ class TargetStreams:
         """The sender ended the arm's stream: it holds, and the next target begins a stream."""
         self._streams[arm].reset()
 
+    def end(self, why: Reason) -> None:
+        """All arms hold, for a reason that is told until they follow again."""
+        self.ended |= dict.fromkeys(self._streams, why)
+        self.drop()
+
     def drop(self) -> None:
         """All arms hold, and the streams that go on now are not followed any more."""
         for stream in self._streams.values():

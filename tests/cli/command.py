@@ -38,7 +38,7 @@ def changed_cell(folder: Path, old: str, new: str) -> str:
     return str(file)
 
 
-def external_cell(folder: Path, old: str = "mode: raw", new: str = "mode: raw") -> str:
+def external_cell(folder: Path, old: str = "mode: filtered", new: str = "mode: filtered") -> str:
     file = folder / "external.yaml"
     file.write_text(external_text().replace(old, new, 1), encoding="utf-8")
     return str(file)

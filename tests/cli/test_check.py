@@ -41,7 +41,7 @@ def test_check_compiles_no_kernel(tmp_path: Path) -> None:
 
 
 def test_check_says_what_drives_the_arms_and_how(tmp_path: Path) -> None:
-    file = external_cell(tmp_path, new="mode: filtered")
+    file = external_cell(tmp_path)
     topic = "/bh_robot/right_arm_clik_controller/target_frame"
     source = "what the built-in controller makes of the hand's target"
     takes = "it takes: active; keeps the last target for ever"
@@ -50,8 +50,14 @@ def test_check_says_what_drives_the_arms_and_how(tmp_path: Path) -> None:
     assert one_object(q2r2("check", file, "--json").stdout)["driven"]["right"] == line
 
 
+def test_check_says_what_raw_targets_lack_where_a_cell_asks_for_them(tmp_path: Path) -> None:
+    line = "raw: no limits, no distances, no self-collision"
+    assert f"NOTE {line}\n" in q2r2("check", external_cell(tmp_path, new="mode: raw")).stdout
+    assert line not in q2r2("check", external_cell(tmp_path)).stdout
+
+
 def test_check_refuses_a_filtered_cell_whose_operator_moves_another_frame_than_the_tool(tmp_path: Path) -> None:
-    text = Path(external_cell(tmp_path, new="mode: filtered")).read_text(encoding="utf-8")
+    text = Path(external_cell(tmp_path)).read_text(encoding="utf-8")
     (file := tmp_path / "cell.yaml").write_text(text.replace("left_arm_link_ee", "left_link_ee"), encoding="utf-8")
     result = q2r2("check", str(file))
     assert result.exit_code == 2

@@ -122,7 +122,6 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         # of a cell with another controller
         ("controller", "kuka", "'builtin' or 'external'"),
         ("external.preset", "kuka", "allowed are kuka_lbr_clik, kuka_lbr_impedance, fzi, mayr, crisp, moveit_servo, "),
-        ("external.preset", "jtc", "it takes joint positions, which the built-in controller has to make"),
         ("external.rate", 20, "preset kuka_lbr_clik needs at least 50 Hz"),
         ("external.arms.left.ctrl_prefix", "left_ctrl", "begins with /"),
         ("external.arms.left.ctrl_prefix", "/left ctrl", "allowed is a ROS name"),

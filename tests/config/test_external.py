@@ -47,8 +47,11 @@ def test_who_drives_the_arms_has_to_be_clear(tmp_path: Path, text: str, says: st
 
 def test_limits_of_targets_are_for_presets_that_take_targets(tmp_path: Path) -> None:
     cell = external()
-    cell["external"] |= {"preset": "jtc", "mode": "filtered"}
-    assert loaded(tmp_path, yaml.safe_dump(cell)).external is not None
+    cell["external"] |= {"preset": "jtc"}
+    del cell["external"]["mode"]
+    loaded_cell = loaded(tmp_path, yaml.safe_dump(cell))
+    assert loaded_cell.external is not None
+    assert loaded_cell.external.filtered, "who does not choose is protected"
     cell["external"]["mode"] = "raw"
     assert fault(tmp_path, yaml.safe_dump(cell)).startswith("external: preset = 'jtc' with mode = 'raw'")
     cell["external"]["mode"] = "filtered"

@@ -1,4 +1,4 @@
-"""An input, a plant and a task of another package, written, declared and named as docs/extending.md says."""
+"""An input, a plant, a task and a preset of another package, written, declared and named as docs/extending.md says."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ import pytest
 import yaml
 
 from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.presets import preset_of
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.types import DeviceControls
 from tests.cli.command import CELL, q2r2
+from tests.support.external_cell import external
 from tests.support.modules import blocks_of, install
 from tests.support.processes import cell
 
@@ -36,6 +38,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for block in blocks_of(PAGE, "toml"):
         groups |= tomllib.loads(block)["project"]["entry-points"]
     groups["q2r2_control.inputs"]["broken"] = "my_package:Nothing"
+    groups["q2r2_control.presets"]["no_preset"] = "my_package:LaggingPlant"
     lines: list[str] = []
     for group, entries in groups.items():
         lines += [f"[{group}]", *(f"{name} = {at}" for name, at in entries.items())]
@@ -69,6 +72,20 @@ def test_an_input_a_plant_and_a_task_written_as_the_page_says_run_in_one_pipelin
     assert "elbows_out" in config.control.tasks
     without = config.model_copy(update={"control": config.control.model_copy(update={"tasks": {}})})
     assert elbow_at_the_end(config) > elbow_at_the_end(without) + 0.05
+
+
+def test_a_preset_of_the_page_is_what_a_cell_or_a_node_may_name(tmp_path: Path, file: Path) -> None:
+    data = external()
+    data["external"] |= {"preset": "compliant"}
+    other = load_config(str(changed(tmp_path / "other.yaml", data))).external
+    assert other is not None
+    assert (other.terms.rate, other.terms.guard.max_velocity) == (125.0, 0.3)
+    assert other.topic("left") == "/bh_robot/left_arm_clik_controller/goal_pose"
+    assert preset_of("compliant", "raw") == (other.terms, "raw")
+    with pytest.raises(ConfigError, match=r"preset = 'unknown': allowed are builtin, .*, jtc, compliant, no_preset"):
+        preset_of("unknown", "raw")
+    with pytest.raises(ConfigError, match=r"no_preset is .*; allowed: a Preset of that name"):
+        preset_of("no_preset", "raw")
 
 
 def test_an_input_of_the_page_engages_by_the_clock_of_a_real_run_too(file: Path) -> None:

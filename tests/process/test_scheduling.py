@@ -19,8 +19,8 @@ from q2r2_control.process.scheduling import (
     few_garbage_collections,
     real_time,
     reserve,
-    schedule_process_as_others,
-    schedule_process_first,
+    schedule_thread_as_others,
+    schedule_thread_first,
 )
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only asked for on Linux")
@@ -124,23 +124,20 @@ def test_a_machine_without_a_known_call_has_no_reservations(monkeypatch: pytest.
     assert not reserve(0.001, 0.002)
 
 
-def test_all_threads_of_a_process_are_scheduled_first_and_as_others_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_thread_that_asks_is_scheduled_first_and_as_others_again(monkeypatch: pytest.MonkeyPatch) -> None:
     system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
     ended = threading.Event()
     thread = threading.Thread(target=ended.wait)
     thread.start()
-    own = {threading.get_native_id(), thread.native_id}
-    assert schedule_process_first(38) is None
-    assert own <= {call[1] for call in system.calls}
-    assert {call[2:] for call in system.calls} == {(os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 38)}
+    assert schedule_thread_first(38) is None
+    assert system.calls == [("sched", 0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 38)]
     system.calls.clear()
-    schedule_process_as_others()
+    schedule_thread_as_others()
     ended.set()
-    last = {call[1]: call[2:] for call in system.calls}
-    assert own <= last.keys()
-    assert set(last.values()) == {(os.SCHED_OTHER, 0)}
+    assert {call[1] for call in system.calls} == {0}
+    assert system.calls[-1] == ("sched", 0, os.SCHED_OTHER, 0)
     FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=False)
-    assert (schedule_process_first(38) or "").startswith("no SCHED_FIFO: Operation not permitted; to permit it")
+    assert (schedule_thread_first(38) or "").startswith("no SCHED_FIFO: Operation not permitted; to permit it")
 
 
 # Sends a signal at every line that the first signal's handler runs, so each of them is interrupted by another handler.

@@ -15,14 +15,15 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from rclpy.qos import QoSProfile
-from std_msgs.msg import String
+from std_msgs.msg import Bool, String
 from tf2_msgs.msg import TFMessage
 
-from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.messages import pose_of, stamped_pose
 from tests.ros.processes import Processes, RosProcess, wait_until
 
 PERIOD = 1.0 / 72.0  # of the hand's messages, as a Quest sends them, and of /tf [s]
+ANSWER_PERIOD = 0.2  # of what the built-in controller says [s]
 HAND = pin.SE3(pin.exp3(np.array([0.2, -0.4, 0.6])), np.array([0.3, 0.1, 1.0]))
 TOOL = pin.SE3(pin.exp3(np.array([3.0, 0.2, 0.1])), np.array([0.5, 0.25, 0.38]))
 # Longer than by default, so that other load on the machine does not look like a fault.
@@ -40,8 +41,15 @@ class ArmRig:
     """The hand and the robot of an arm. While ``follows`` the tool is at the newest target; ``sends_tool``: on /tf."""
 
     def __init__(
-        self, node: Any, arm: str = "left", topic: str | None = None, tool_frame: str | None = None, robot: str = "q2r2"
+        self,
+        node: Any,
+        arm: str = "left",
+        topic: str | None = None,
+        tool_frame: str | None = None,
+        robot: str = "q2r2",
+        answers: bool | None = None,
     ) -> None:
+        """``answers``: as the built-in controller does, by default where the rig takes its targets."""
         self.arm, self.node = arm, node
         self.hand, self.tool = HAND, TOOL
         self.lower = self.upper = False
@@ -58,6 +66,11 @@ class ArmRig:
             node.create_publisher(OVR2ROSInputs, f"q2r_{arm}_hand_inputs", STREAM_QOS),
             node.create_publisher(TFMessage, "/tf", 100),
         ]
+        if topic is None if answers is None else answers:
+            self._answers = node.create_publisher(String, "/cartesian_controller/state", 10)
+            followed = node.create_publisher(Bool, f"/cartesian_controller/following/{arm}", LATCHED_QOS)
+            followed.publish(Bool(data=True))
+            node.create_timer(ANSWER_PERIOD, self._answer)
         self._listens = [
             node.create_subscription(PoseStamped, topic or f"/q2r2/{arm}/target_frame", self._on_target, COMMAND_QOS),
             node.create_subscription(String, f"/{arm}_{robot}_arm_controller/state", self._on_state, 10),
@@ -115,6 +128,10 @@ class ArmRig:
 
         wait_until(rests, "the target comes to rest")
         return self.newest()
+
+    def _answer(self) -> None:
+        said = {f"{self.arm}_state": "holding", "fault": None, "homing_outcome": None}
+        self._answers.publish(String(data=json.dumps(said)))
 
     def _send(self) -> None:
         now = self.node.get_clock().now().nanoseconds * 1e-9

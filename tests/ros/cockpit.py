@@ -25,7 +25,7 @@ class Cockpit:
         }
         self.running = {name: start() for name, start in self._starts.items()}
         self.cell = Cell(node, robot, targets="/not_used/{arm}")  # the arms' nodes publish targets
-        self.left, self.right = ArmRig(node, "left"), ArmRig(node, "right")
+        self.left, self.right = (ArmRig(node, arm, answers=False) for arm in ("left", "right"))
         self.rigs = ArmRigs([self.left, self.right])
         for rig in self.rigs.rigs:
             rig.sends_tool = rig.follows = False

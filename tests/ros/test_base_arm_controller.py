@@ -20,6 +20,7 @@ need_ros()
 import control_msgs.action
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
+from quest2ros.msg import OVR2ROSInputs
 from rclpy.action import ActionServer
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
@@ -165,6 +166,23 @@ def test_services_and_a_second_publisher_of_targets_pause_the_arm(rig: ArmRig, n
     rig.press()
     assert rig.state["state"] == "lost"
     node.destroy_publisher(second)
+    rig.engage()
+
+
+@pytest.mark.parametrize("topic", ["q2r_left_hand_pose", "q2r_left_hand_inputs"])
+def test_a_second_publisher_of_the_same_hand_pauses_the_arm_and_is_named(
+    topic: str, rig: ArmRig, domain: int, processes: Processes
+) -> None:
+    rig.start(processes)
+    rig.engage()
+    with spun_node(domain, "another_headset") as other:
+        other.create_publisher(PoseStamped if topic.endswith("pose") else OVR2ROSInputs, topic, 1)
+        rig.wait(lambda: rig.state.get("kind") == ReasonKind.SEVERAL_PUBLISHERS, "the second publisher is reported")
+        assert rig.state["level"] == "error"
+        rig.wait(lambda: f"/{topic} (/another_headset and /test)" in rig.state["message"], "both are named")
+        assert rig.state["state"] == "lost"
+        rig.press()
+        assert rig.state["state"] == "lost"
     rig.engage()
 
 

@@ -119,3 +119,25 @@ def test_two_publishers_of_a_frame_block_it_if_they_disagree(
     wait_until(lambda: listener.conflict("mount") is None, "it is over when one ends")
     for timer in timers:
         node.destroy_timer(timer)
+
+
+def test_a_listener_keeps_only_the_frames_on_a_way_that_is_asked_for_and_follows_it_elsewhere(node: Any) -> None:
+    node.now = 0.0
+    listener = FrameListener(node)
+    publisher = node.create_publisher(TFMessage, "/tf", 10)
+    sent = [
+        stamped_transform("world", "arm", A),
+        stamped_transform("arm", "tool", B),
+        stamped_transform("arm", "lamp", C),
+    ]
+
+    def found(frame: str, pose: pin.SE3) -> bool:
+        publisher.publish(TFMessage(transforms=sent))
+        placement = listener.tree.find(frame, "world")
+        return placement is not None and placement.pose.isApprox(pose, 1e-9)
+
+    wait_until(lambda: found("tool", A * B), "it is found")
+    assert not listener.tree.wants("lamp")
+    wait_until(lambda: found("lamp", A * C), "a frame that nobody had asked for is found too")
+    sent[:] = [stamped_transform("world", "cart", C), stamped_transform("cart", "arm", A), *sent[1:]]
+    wait_until(lambda: found("tool", C * A * B), "it hangs on another frame")

@@ -23,6 +23,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String
 
+from q2r2_control.ros import BaseArmController
 from q2r2_control.ros.base_node import WARN, BaseNode
 from q2r2_control.ros.bridge.arm_outputs import FollowWatch
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
@@ -208,13 +209,14 @@ def test_an_admittance_has_no_good_state_without_external_torques(context: Any, 
 def test_an_arm_pauses_when_its_controller_does_not_follow_but_not_on_its_way_home(context: Any) -> None:
     node = BaseNode("arm", context=context)
     watch = FollowWatch(node, "/controller", "left", 0.3)
+    node.create_publisher(String, "/controller/state", 1)
     following, states = Arrivals(node, "/controller/following/left"), Arrivals(node, "/controller/state")
+    topic = "/controller/following/left"
     assert watch.refusal(True, 0.0) is None
-    assert watch.refusal(True, 9.0) is None  # a controller that says nothing is taken to follow
+    assert watch.refusal(True, 9.0) == Reason.of(ReasonKind.NOT_FOLLOWED, topic=topic), "one that says nothing"
     following.arrive(Bool(data=False))
     assert watch.refusal(False, 10.0) is None
     assert watch.refusal(True, 10.1) is None
-    topic = "/controller/following/left"
     assert watch.refusal(True, 10.5) == Reason.of(ReasonKind.NOT_FOLLOWED, topic=topic)
     following.arrive(Bool(data=True))
     assert watch.refusal(True, 11.0) is None
@@ -248,6 +250,7 @@ def test_what_keeps_a_controller_from_following_is_read_from_its_state(
     arm: str, fault: Reason | None, unready: str | None, context: Any
 ) -> None:
     node = BaseNode("arm", context=context)
+    node.create_publisher(String, "/c/state", 1)
     watch = FollowWatch(node, "/c", "left", 0.3)
     Arrivals(node, "/c/state").arrive(String(data=controller_state(arm, fault)))
     assert (watch.unready and str(watch.unready.kind)) == unready
@@ -275,6 +278,32 @@ def test_an_arm_is_not_ready_before_each_controller_has_said_whether_it_has_join
             assert obstacle() is kind
         controller.destroy_node()
     arm.destroy_node()
+
+
+def test_a_subclass_without_a_preset_is_not_ready_for_another_projects_controller(context: Any) -> None:
+    """It would get the built-in controller's targets, whose steps are as wide as that one's own limits allow."""
+    prefix = "/bh_robot/left_arm_clik_controller"
+    arm = BaseArmController("left", "bh_robot", ctrl_prefix=prefix, context=context)
+    theirs = BaseNode("left_arm_clik_controller", namespace="/bh_robot", context=context)
+    theirs.create_subscription(PoseStamped, f"{prefix}/target_frame", lambda message: None, 1)
+
+    def unready() -> Reason | None:
+        arm.outputs.take_fault(arm.now)
+        return arm.outputs.unready
+
+    wait_until(lambda: (why := unready()) and why.root.kind is not ReasonKind.NO_SUBSCRIBER, "it has a subscriber")
+    absent = unready()
+    assert absent is not None
+    assert absent.root.kind is ReasonKind.CONTROLLER_ABSENT
+    assert "nobody publishes /cartesian_controller/state (std_msgs/msg/String)" in sentence(absent)
+    controller = BaseNode("cartesian_controller", context=context)
+    wait_until(lambda: (why := unready()) and why.root.kind is ReasonKind.TOPIC_EMPTY, "the built-in controller begins")
+    Arrivals(arm, "/cartesian_controller/state").arrive(String(data=controller_state("holding", None)))
+    assert unready() is None
+    controller.destroy_node()
+    wait_until(lambda: (why := unready()) and why.root.kind is ReasonKind.CONTROLLER_ABSENT, "it has ended")
+    for node in (theirs, arm):
+        node.destroy_node()
 
 
 def test_what_cannot_be_read_is_dropped_with_a_warning_a_topic(context: Any, capfd: pytest.CaptureFixture[str]) -> None:

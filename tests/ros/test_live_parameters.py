@@ -125,9 +125,11 @@ def test_an_impedance_that_is_set_counts_for_both_arms_if_it_is_allowed(context:
     assert [impedance.in_force(arm) for arm in robot.arms] == [asked] * 2
 
 
-def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(context: Any, tmp_path: Path) -> None:
+def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(
+    context: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     cell = external()
-    cell["external"] |= {"preset": "fzi", "rate": 60.0, "limits": {"max_velocity": 0.2}}
+    cell["external"] |= {"preset": "fzi", "mode": "raw", "rate": 60.0, "limits": {"max_velocity": 0.2}}
     cell["teleop"] |= {"stance": "mirror_reflected", "position_scale": 0.5}
     config = tmp_path / "cell.yaml"
     config.write_text(yaml.safe_dump(cell))
@@ -135,6 +137,7 @@ def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(c
     made = RightArmController(context=context, cli_args=arguments)
     values = made.parameters
     assert (values.preset.name, values.mode, values.rate) == ("fzi", "raw", 60.0)
+    assert capfd.readouterr().err.count("raw: no limits, no distances, no self-collision") == 1
     assert (values.teleop.stance, values.teleop.position_scale) == ("mirror_reflected", 0.5)
     assert values.target_topic == "/bh_robot/right_arm_clik_controller/target_frame"
     assert (values.base_frame, values.world_frame, values.tool_frame) == (

@@ -107,8 +107,9 @@ def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_where_its_s
 
 
 def test_a_new_receiver_of_commands_gets_none_while_the_arms_are_not_where_these_are(
-    node: Any, robot: Robot, config: Config, caplog: pytest.LogCaptureFixture
+    node: Any, robot: Robot, config: Config, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(RosPlant, "standstill", None)  # which these arms do
     states = node.create_publisher(JointState, "joint_states", 10)
     still = joint_state_message(robot.joint_names, robot.home, 0.0 * robot.home, 0.0 * robot.home, 0.0)
     timer = node.create_timer(0.01, lambda: states.publish(still))
@@ -125,6 +126,24 @@ def test_a_new_receiver_of_commands_gets_none_while_the_arms_are_not_where_these
             assert "a new receiver takes the commands" in caplog.text
     finally:
         timer.cancel()
+
+
+@pytest.mark.parametrize("begins", ["a publisher that appears", "one that was silent"])
+def test_arms_that_another_node_commands_while_the_loop_does_are_left_alone_and_it_is_named(
+    begins: str, cell: Cell, config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
+    goal, other = cell.q.copy(), None
+    goal[3] += 4.0 * MOVED
+    if begins == "one that was silent":
+        other = cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS)
+    with driven(config, cell.robot, goal) as (ticks, _):
+        wait_until(lambda: len(ticks) > 3.0 * NODE_RATE, "the loop has driven for some seconds")
+        if other is None:
+            other = cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS)
+        else:
+            assert "commands the arms" not in caplog.text
+            other.publish(JointTrajectory())
+        wait_until(lambda: "/test commands the arms on /joint_trajectory" in caplog.text, "the other is named")
 
 
 def test_arms_that_others_command_or_that_are_not_there_are_one_line(

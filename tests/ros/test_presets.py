@@ -221,7 +221,7 @@ def test_the_presets_have_the_topics_of_their_controllers() -> None:
     lbr = PRESETS["lbr_position"].topic_of
     assert lbr("/left/lbr_joint_position_command_controller") == "/left/command/lbr_joint_position_command"
     assert lbr("/lbr_joint_position_command_controller") == "/command/lbr_joint_position_command"
-    assert lbr("/{arm}/lbr_joint_position_command_controller") == KINDS["lbr_position"].topic
+    assert lbr("/{arm}/lbr_joint_position_command_controller") == f"/{KINDS['lbr_position'].topic}"
     assert PRESETS.keys() == {*NAMES, "lbr_position", "lbr_torque"}
     assert {name for name, preset in PRESETS.items() if not preset.takes_poses} == set(JOINTS)
     for name, preset in PRESETS.items():

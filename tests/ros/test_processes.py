@@ -151,6 +151,26 @@ def test_the_command_adds_a_recorder_first_and_a_page_last(monkeypatch: pytest.M
     assert started[-1].parameters["recorded"]
 
 
+def test_what_the_command_is_given_for_ros_reaches_every_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[NodeProcess] = []
+
+    def start(nodes: list[NodeProcess], say: object) -> int:
+        started.extend(nodes)
+        return 0
+
+    monkeypatch.setattr("q2r2_control.cli.ros.run_together", start)
+    command = f"ros up --namespace cell/left --sim-time {CONFIG} --ros-args -r tf:=/tf -p rate:=125.0 -- --input none"
+    assert q2r2(*command.split()).exit_code == 0
+    assert names(started) == ["mujoco_robot", "cartesian_controller", "arm_controllers"]
+    given = ["-r", "__ns:=/cell/left", "-p", "use_sim_time:=true", "-r", "tf:=/tf", "-p", "rate:=125.0"]
+    assert all(node.command()[-len(given) :] == given for node in started)
+    refused = q2r2("ros", "up", CONFIG, "--namespace", "no name")
+    assert (refused.exit_code, refused.stderr) == (
+        2,
+        "q2r2: --namespace = 'no name': allowed is a ROS name such as /cell\n",
+    )
+
+
 def test_arms_have_a_process_each_where_that_is_asked_for_and_a_cell_with_one_arm_has_its_nodes(tmp_path: Path) -> None:
     assert names(nodes_of(CONFIG, "none"))[2:] == ["arm_controllers"]
     assert names(nodes_of(CONFIG, "none", separate=True))[2:] == ["left_arm_controller", "right_arm_controller"]
@@ -194,13 +214,15 @@ def test_the_launch_file_starts_what_the_command_starts(
     runpy.run_path(str(ROOT / "launch" / "teleop.launch.py"))["generate_launch_description"]()
     given = {call.args[0]: call.kwargs["default_value"] for call in launch.DeclareLaunchArgument.call_args_list}
     given |= {"config": config, "input": source, "record": folder, "separate": separate}
+    given |= {"namespace": "/cell", "use_sim_time": "true"}
     launch.OpaqueFunction.call_args.kwargs["function"](given)
     recording = {"folder": folder} if folder else None
     expected = nodes_of(config, source, separate=separate == "true", recording=recording)
     actions = [call.kwargs for call in launch.Node.call_args_list]
     for action, node in zip(actions, expected, strict=True):
         assert (action["package"], action["executable"]) == ("q2r2_control", node.name)
-        (parameters,) = action["parameters"]
+        parameters, of_all = action["parameters"]
+        assert (action["namespace"], of_all) == ("/cell", {"use_sim_time": True})
         assert parameters == {key: (value, type(value)) for key, value in node.parameters.items()}
     ends = [call.kwargs for call in launch.Shutdown.call_args_list]
     assert ends == [{"reason": f"{node.name} ended"} for node in expected]

@@ -114,7 +114,7 @@ def test_the_relation_of_tools_is_corrected_only_by_references_of_one_moment(
     assert update.call_args.kwargs["in_step"] is in_step
 
 
-@pytest.mark.parametrize("given", ["mirror:=true", "rate:=100.0", "teleop.linked:=false", "mode:=filtered"])
+@pytest.mark.parametrize("given", ["mirror:=true", "rate:=125.0", "teleop.linked:=false", "mode:=filtered"])
 def test_nodes_that_cannot_be_one_teleoperation_are_refused(given: str, context: object) -> None:
     left = LeftArmController(context=context)
     with pytest.raises(ConfigError, match=f"{given.split(':')[0].split('.')[0]}.* differ; allowed: the same in both"):

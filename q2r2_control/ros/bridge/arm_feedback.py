@@ -93,12 +93,13 @@ class ArmFeedback:
         self.last_line, self.last_kind = "not engaged yet", ""  # of the last event; the kind of its first cause
         self.paused = "not engaged yet"  # by the last event that let the arm hold
         self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
-        self._markers = node.create_publisher(Marker, "/visualization_marker", 10)
+        self._markers = node.create_publisher(Marker, "visualization_marker", 10)
         self._shown = 0.0
         # For recordings.
-        self._flags = node.create_publisher(Float64MultiArray, arm_flags(arm), RECORDED_QOS)
-        self._events = node.create_publisher(String, arm_events(arm), RECORDED_QOS)
-        self._target = node.create_publisher(PoseStamped, asked_target(arm), RECORDED_QOS)
+        flags, events, target = map(node.name_in_set, (arm_flags(arm), arm_events(arm), asked_target(arm)))
+        self._flags = node.create_publisher(Float64MultiArray, flags, RECORDED_QOS)
+        self._events = node.create_publisher(String, events, RECORDED_QOS)
+        self._target = node.create_publisher(PoseStamped, target, RECORDED_QOS)
 
     def tell(self, event: Event) -> None:
         self.last_line, self.last_kind = event_line(event), str(event.reason.root.kind)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from importlib import import_module
 from typing import Any
 
@@ -18,6 +19,8 @@ from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput
+from q2r2_control.ros.commanders import takers_of
+from q2r2_control.supervision.standstill import LAGGING_TOOL, StandstillWatch, standing
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.hand_motion import MAX_OFFSET
@@ -26,6 +29,9 @@ _POSE = 2  # of moveit_msgs/srv/ServoCommandType
 # Reports of the built-in controller on an arm that takes a stream of targets.
 _READY = ("holding", "following", "homing")
 _ANSWER = 0.2  # the controller has told of all earlier streams by then [s]
+_LOOK_PERIOD = 0.04  # of asking the graph for it [s]
+_STATE_TYPE = "std_msgs/msg/String"
+_SILENT = 2.0  # a controller that has not reported for so long does not answer; it reports twice a second [s]
 _RETRY = 1.0  # the service is called again if it has not answered for this long [s]
 
 
@@ -64,6 +70,10 @@ class ArmOutputs:
         self._command_type = None if service is None else CommandType(node, service.format(ctrl=values.prefix))
         self._safe_problem: Reason | None = self._safe_target.problem  # why the relay could not begin now
         self._relaying = False
+        raw = not self._filtered and preset is not BUILTIN
+        # Of the built-in controller the arm's node knows the reference, which may rightly stand still.
+        self._stands = StandstillWatch(LAGGING_TOOL) if raw else None
+        self._node, self._arm = node, arm
 
     def limit(self, guard: GuardSettings) -> None:
         """Other limits of the targets that go to the preset's controller, from the next one on."""
@@ -116,6 +126,17 @@ class ArmOutputs:
             faults += [self._safe_target.take_silence(now), self._follows.refusal(self.first.following, now)]
         return _refused(next((fault for fault in faults if fault), None))
 
+    def standstill(self, tool: pin.SE3 | None, received: float, now: float) -> Reason | None:
+        """A reason where the controller takes targets and does not move the tool, measured then [s]."""
+        asked = self.first.last_sent
+        if self._stands is None or tool is None or asked is None or not self.first.following:
+            return None
+        if (way := self._stands.look(asked.translation, tool.translation, received, now)) is None:
+            return None
+        self.forget(now)  # nothing is repeated that it would go to in one leap
+        takers = f" {name}" if (name := takers_of(self._node, self.first.topic)) else ""
+        return _refused(standing(self._arm, takers, way, "m"))
+
     def step(
         self,
         target: pin.SE3 | None,
@@ -162,8 +183,8 @@ class FollowWatch:
     """Whether the built-in controller follows the targets of an arm, as it publishes on ``~/following/<arm>``.
 
     It drops a stream for reasons of its own, such as missing joint states. It then accepts only a new one, for which
-    the arm has to be paused. A controller that publishes nothing here is taken to follow. One that reports on
-    ``~/state`` is not ready before it has: it may have no joint states.
+    the arm has to be paused. A controller is ready only while it reports on ``~/state``: it may have no joint states,
+    or be another one, whose terms the built-in controller's targets do not keep.
     """
 
     def __init__(self, node: BaseNode, controller: str, arm: str, timeout: float) -> None:
@@ -174,7 +195,8 @@ class FollowWatch:
         self._followed_since = math.inf  # targets have been sent and followed [s]
         self._node, self._state_topic = node, f"{controller}/state"
         self._unready: Reason | None = None  # by the newest report
-        self._starts, self._reported = 0, False
+        self._starts, self._reported_at = 0, -math.inf  # the newest report came then [s]
+        self._is_there, self._looked = False, -math.inf  # whether somebody reports, and when the graph was asked [s]
         self.homing = False  # whether it says that it goes home
         self.homing_outcome: Reason | None = None  # of the last way, where that ended by itself
         self.gripper_held = ""  # what keeps the gripper from going farther
@@ -184,14 +206,21 @@ class FollowWatch:
     @property
     def unready(self) -> Reason | None:
         """Why the controller would follow no stream of targets now."""
-        if self._reported or not self._node.count_publishers(self._state_topic):
+        if (now := time.monotonic()) - self._looked > _LOOK_PERIOD:
+            self._looked, self._is_there = now, bool(self._node.count_publishers(self._state_topic))
+        if not self._is_there:
+            kind, topic = ReasonKind.CONTROLLER_ABSENT, self._state_topic
+            return Reason.of(kind, controller=self.controller, topic=topic, type=_STATE_TYPE)
+        if (age := now - self._reported_at) <= _SILENT:
             return self._unready
-        return Reason.of(ReasonKind.TOPIC_EMPTY, topic=self._state_topic)
+        if age == math.inf:
+            return Reason.of(ReasonKind.TOPIC_EMPTY, topic=self._state_topic)
+        return Reason.of(ReasonKind.TOPIC_SILENT, topic=self._state_topic, source="", age=age)
 
     def notice(self, starts: int) -> None:
         """The reports of an earlier controller do not count; ``starts``: how often one has appeared."""
         if starts != self._starts:
-            self._starts, self._reported, self._unready = starts, False, None
+            self._starts, self._reported_at, self._unready = starts, -math.inf, None
 
     def refusal(self, sending: bool, now: float) -> Reason | None:
         """A reason if targets are ``sending`` and are followed no more, or not yet after the timeout."""
@@ -205,7 +234,7 @@ class FollowWatch:
         # The end of a stream before this one may be told late, when this one has not been answered yet.
         dropped = now - self._followed_since > _ANSWER
         self._since, self._followed_since = min(self._since, now), math.inf
-        if self._follows is None or not (dropped or now - self._since > self._timeout):
+        if not (dropped or now - self._since > self._timeout):
             return None
         return Reason.of(ReasonKind.FOLLOWED_NO_MORE if dropped else ReasonKind.NOT_FOLLOWED, topic=self._topic)
 
@@ -213,7 +242,7 @@ class FollowWatch:
         self._follows = bool(message.data)
 
     def _on_state(self, message: String) -> None:
-        self._reported = True
+        self._reported_at = time.monotonic()
         try:
             said = json.loads(message.data)
             state, fault, outcome = said[f"{self._arm}_state"], said["fault"], said["homing_outcome"]

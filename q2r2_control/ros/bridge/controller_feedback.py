@@ -31,7 +31,8 @@ from q2r2_control.ros.base_node import LATCHED_QOS, RECORDED_QOS, SENT_COMMAND_Q
 from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers
 from q2r2_control.ros.bridge.gripper_client import wanted_topic
 from q2r2_control.ros.bridge.intakes import Fingers, TargetIntake
-from q2r2_control.ros.bridge.messages import stamped_pose, time_message
+from q2r2_control.ros.bridge.messages import fill_pose, pose_template, time_message
+from q2r2_control.ros.bridge.wire import JointNumbers
 from q2r2_control.ros.monitoring import publish_in_time
 from q2r2_control.types import Array, Reference, RobotState, StepStatus
 
@@ -55,14 +56,15 @@ class ControllerFeedback:
         self._safe_targets = {
             arm: node.create_publisher(PoseStamped, f"~/safe_target/{arm}", SENT_COMMAND_QOS) for arm in targets.topics
         }
+        self._templates = {arm: pose_template(targets.frames[arm].name) for arm in targets.topics}
         self._follows: dict[str, bool | None] = dict.fromkeys(targets.topics)
         self._following = {arm: node.create_publisher(Bool, f"~/following/{arm}", LATCHED_QOS) for arm in self._follows}
         self._conditions = ConditionPublishers(node, self._follows, ArmConditions(controller))
         self._distances = node.create_publisher(Marker, "~/distances", 10)
-        self._recorded_reference = node.create_publisher(JointTrajectory, REFERENCE, RECORDED_QOS)
-        self._recorded_tick = node.create_publisher(Float64MultiArray, CONTROLLER_TICK, RECORDED_QOS)
+        self._recorded_reference = node.create_publisher(JointTrajectory, node.name_in_set(REFERENCE), RECORDED_QOS)
+        self._recorded_tick = node.create_publisher(Float64MultiArray, node.name_in_set(CONTROLLER_TICK), RECORDED_QOS)
         self._last = 0.0  # tick [s]
-        node.create_timer(_MARKER_PERIOD, self._show_distance)
+        self._shown = 0.0  # [s]
 
     def publish(self, reference: Reference, state: RobotState, now: float, dt: float, decided: float) -> None:
         """Of one tick of ``dt`` at ``now`` [s]; see :func:`publish_in_time`."""
@@ -72,13 +74,15 @@ class ControllerFeedback:
         if self._recorded_tick.get_subscription_count():
             self._record(reference, now, dt, decided)
         self._last = now
+        if not 0.0 <= now - self._shown < _MARKER_PERIOD:
+            self._shown = now
+            self._show_distance()
         if self._ticks % self._every:
             return
         for arm, publisher in self._safe_targets.items():
             if publisher.get_subscription_count():
-                frame = self._targets.frames[arm]
-                tool = frame.pose.actInv(self._controller.tool_pose(arm))
-                publish_in_time(publisher, stamped_pose(tool, frame.name, now), decided)
+                tool = self._targets.frames[arm].pose.actInv(self._controller.tool_pose(arm))
+                publish_in_time(publisher, fill_pose(self._templates[arm], tool, now), decided)
 
     def tell_followed(self, follows: Callable[[str], bool]) -> None:
         """Say of each arm whether its targets are followed, when that changes."""
@@ -150,7 +154,7 @@ class GripperLimits:
         pairs = self._loop.held_grippers.items()
         return held | {arm: f"{'|'.join(pair)} would come too close" for arm, pair in pairs}
 
-    def take_joint_state(self, message: JointState) -> None:
+    def take_joint_state(self, message: JointState | JointNumbers) -> None:
         """Note what a message says of fingers; what it says of other joints is not looked at."""
         if self._answers:
             now = self._node.now

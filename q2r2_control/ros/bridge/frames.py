@@ -17,13 +17,14 @@ from rosbags.serde import SerdeError
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.recording.messages import STORE
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import nanoseconds, pose_of, pose_of_numbers
+from q2r2_control.ros.bridge.messages import is_pose, pose_of_numbers
+from q2r2_control.ros.bridge.wire import TransformNumbers, read_pose, transforms_reader
 from q2r2_control.ros.monitoring import Publishers
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.targets import SequenceWatch
 
+_TF, _TF_STATIC = "tf", "tf_static"
 # Two publishers whose poses of a frame differ by more do not tell of the same robot [m], [rad].
 _SAME = 0.05, 0.1
 _REMEMBERED = 2.0  # such a difference [s]
@@ -31,27 +32,32 @@ _PAUSE = 1.0  # after a silence of this long a publisher may have been restarted
 _KEPT = 16  # messages that one node of a process has read and another may still have to
 
 
-class ReadTransform(NamedTuple):
+class ReadTransform:
     """One transform of a message on /tf."""
 
-    child_frame_id: str
-    frame_id: str
-    pose: pin.SE3 | None  # None for numbers that are not finite, or no unit quaternion
+    __slots__ = ("_pose", "child_frame_id", "frame_id", "is_pose", "numbers")
+
+    def __init__(self, read: TransformNumbers) -> None:
+        self.child_frame_id, self.frame_id, self.numbers = _name(read.child), _name(read.parent), read.numbers
+        self.is_pose = is_pose(self.numbers)  # false for numbers that are not finite, or no unit quaternion
+        self._pose: pin.SE3 | None = None
+
+    @property
+    def pose(self) -> pin.SE3:
+        """Made when it is asked for: of the links of an arm few are."""
+        if self._pose is None:
+            self._pose = pose_of_numbers(self.numbers)
+            assert self._pose is not None
+        return self._pose
+
+
+_read = transforms_reader()
 
 
 @lru_cache(maxsize=_KEPT)
 def read_transforms(message: bytes) -> Sequence[ReadTransform]:
-    """The transforms in a serialized TFMessage, else SerdeError; read once for all nodes of a process.
-
-    Read by rosbags: measured with 25 transforms in 0.25 ms, by rclpy in 0.95 ms.
-    """
-    read = []
-    found: Any = STORE.deserialize_cdr(message, "tf2_msgs/msg/TFMessage")
-    for one in found.transforms:
-        p, o = one.transform.translation, one.transform.rotation
-        pose = pose_of_numbers((p.x, p.y, p.z, o.x, o.y, o.z, o.w))
-        read.append(ReadTransform(_name(one.child_frame_id), _name(one.header.frame_id), pose))
-    return tuple(read)
+    """The transforms in a serialized TFMessage, else SerdeError; read once for all nodes of a process."""
+    return tuple(map(ReadTransform, _read(message)))
 
 
 class Placement(NamedTuple):
@@ -65,13 +71,17 @@ class FrameTree:
     """Newest transforms by their receipt time; nothing is interpolated, and a history is not kept."""
 
     def __init__(self) -> None:
-        self._edges: dict[str, tuple[str, Placement]] = {}  # of each frame its parent, and where it is there
+        self._edges: dict[
+            str, tuple[ReadTransform, float]
+        ] = {}  # of each frame where it is, and when that was received
         self._found: dict[tuple[str, str], Placement] = {}  # since a transform last came
+        self._used: set[str] = set()  # frames on the way between those that were found
+        self._all = True  # a frame was looked for in vain: any transform may be on the way to it
 
     def set(self, transform: ReadTransform, received: float) -> None:
         """Store one transform, received then [s], inf: static; one without a pose is ignored."""
-        if transform.pose is not None:
-            self._edges[transform.child_frame_id] = transform.frame_id, Placement(transform.pose, received)
+        if transform.is_pose:
+            self._edges[transform.child_frame_id] = transform, received
             self._found.clear()
 
     def find(self, frame: str, within: str) -> Placement | None:
@@ -83,15 +93,22 @@ class FrameTree:
             if name in up:
                 pose, received = up[name].pose.inverse() * placement.pose, min(up[name].received, placement.received)
                 self._found[frame, within] = Placement(pose, received)
+                self._used.update(up, (name for name, _ in self.upwards(frame)))
+                self._all = False
                 return self._found[frame, within]
+        self._all = True
         return None
+
+    def wants(self, frame: str) -> bool:
+        """Whether where ``frame`` is matters for what was looked for: of the links of a robot few do."""
+        return self._all or frame in self._used
 
     def moves_far(self, transform: ReadTransform) -> bool:
         """Whether the frame is elsewhere in a transform than it was in the last one."""
         before = self._edges.get(transform.child_frame_id)
-        if before is None or transform.pose is None:
+        if before is None or not transform.is_pose:
             return False
-        return any(np.greater(apart(before[1].pose, transform.pose), _SAME))
+        return any(np.greater(apart(before[0].pose, transform.pose), _SAME))
 
     def upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
         """The frame and all its ancestors, with the frame's pose in each; ends also if parents form a ring."""
@@ -102,8 +119,8 @@ class FrameTree:
             seen.add(frame)
             if frame not in self._edges:
                 return
-            parent, placement = self._edges[frame]
-            pose, received, frame = placement.pose * pose, min(received, placement.received), parent
+            transform, at = self._edges[frame]
+            pose, received, frame = transform.pose * pose, min(received, at), transform.frame_id
 
 
 class FrameListener:
@@ -117,11 +134,11 @@ class FrameListener:
         self.tree = FrameTree()
         self._node = node
         self._numbers: defaultdict[str, SequenceWatch] = defaultdict(SequenceWatch)  # of messages with a frame
-        self._publishers = Publishers(node, ["/tf"])
+        self._publishers = Publishers(node, [_TF])
         self._disagree: dict[str, float] = {}  # frames of which two publishers say different things, and when [s]
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        node.create_subscription(TFMessage, "/tf", self._take, 100, raw=True)
-        node.create_subscription(TFMessage, "/tf_static", self._take_fixed, latched, raw=True)
+        node.create_subscription(TFMessage, _TF, self._take, 100, raw=True)
+        node.create_subscription(TFMessage, _TF_STATIC, self._take_fixed, latched, raw=True)
 
     def conflict(self, frame: str) -> Reason | None:
         """A reason while two publishers disagree about ``frame`` or what it hangs on."""
@@ -130,13 +147,15 @@ class FrameListener:
         now = time.monotonic()
         for name, _ in self.tree.upwards(frame):
             if now - self._disagree.get(name, -math.inf) <= _REMEMBERED:
-                return Reason.of(ReasonKind.FRAME_DISPUTED, frame=name, publishers=self._publishers.of("/tf"))
+                return Reason.of(ReasonKind.FRAME_DISPUTED, frame=name, publishers=self._publishers.of(_TF))
         return None
 
     def _take(self, message: bytes, info: Mapping[str, int | None]) -> None:
         received, now, number = self._node.now, time.monotonic(), info["publication_sequence_number"]
-        for transform in self._read("/tf", message):
+        for transform in self._read(_TF, message):
             frame = transform.child_frame_id
+            if not self.tree.wants(frame):
+                continue
             if number is not None:
                 senders = self._numbers[frame].take(number, now, _PAUSE)
                 if senders >= 2 and self.tree.moves_far(transform):
@@ -144,14 +163,14 @@ class FrameListener:
             self.tree.set(transform, received)
 
     def _take_fixed(self, message: bytes) -> None:
-        for transform in self._read("/tf_static", message):
+        for transform in self._read(_TF_STATIC, message):
             self.tree.set(transform, math.inf)
 
     def _read(self, topic: str, message: bytes) -> Sequence[ReadTransform]:
         try:
             return read_transforms(message)
         except SerdeError:  # which is some other node's fault
-            self._node.drop(topic, f"{len(message)} bytes")
+            self._node.drop(f"/{topic}", f"{len(message)} bytes")
             return ()
 
 
@@ -164,16 +183,19 @@ class ToolFrame:
 
     def __init__(self, node: BaseNode, frame: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
-        self._publishers = Publishers(node, ["/tf"])
+        self.received = -math.inf  # the newest pose was [s]
+        self._publishers = Publishers(node, [_TF])
         self.problem: Reason | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
         """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         placement = self._tree.find(self._frame, self._world)
+        if placement is not None:
+            self.received = placement.received
         if placement is None:
             self.problem = Reason.of(ReasonKind.NO_TRANSFORM, frame=self._frame, world=self._world)
         elif (age := now - placement.received) > self._timeout:
-            source = self._publishers.source("/tf")
+            source = self._publishers.source(_TF)
             self.problem = Reason.of(ReasonKind.TRANSFORM_OLD, frame=self._frame, source=source, age=age)
         else:
             self.problem = None
@@ -185,12 +207,14 @@ class PoseTopic:
     """The pose on a topic, in the world; the message's frame is looked up on /tf."""
 
     def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
-        self._tree, self._world, self._timeout = tree, world, timeout
+        self._node, self._tree, self._world, self._timeout = node, tree, world, timeout
         self._newest: tuple[str, int, float] | None = None  # its frame, its stamp [ns], and when it was received [s]
         self._pose: pin.SE3 | None = None  # of the newest, in the message's frame
         self.topic, self._publishers = topic, Publishers(node, [topic])
         self.problem: Reason | None = None
-        node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
+        node.create_subscription(
+            PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS, raw=True
+        )
 
     def at(self, now: float) -> pin.SE3 | None:
         if self._newest is None:
@@ -212,6 +236,11 @@ class PoseTopic:
         return None
 
     @property
+    def received(self) -> float:
+        """When the newest message came [s]; -inf: none has."""
+        return -math.inf if self._newest is None else self._newest[2]
+
+    @property
     def stamp(self) -> int | None:
         """The newest message's own, by its sender's clock [ns]; None: there is none."""
         return None if self._newest is None else self._newest[1]
@@ -224,6 +253,10 @@ class PoseTopic:
         self._newest = None
         return self.problem
 
-    def _take(self, message: PoseStamped, now: float) -> None:
-        self._newest = message.header.frame_id, nanoseconds(message.header.stamp), now
-        self._pose = pose_of(message.pose)
+    def _take(self, message: bytes, now: float) -> None:
+        try:
+            read = read_pose(message)
+        except SerdeError as error:  # which is its sender's fault
+            self._node.drop(self.topic, str(error))
+            return
+        self._newest, self._pose = (read.frame, read.stamp, now), pose_of_numbers(read.numbers)

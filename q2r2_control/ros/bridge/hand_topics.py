@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, Twist
 from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from rosbags.serde import SerdeError
 
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
@@ -18,6 +20,7 @@ from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
 from q2r2_control.recording.messages import RECORDER
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge import messages as convert
+from q2r2_control.ros.commanders import OnePublisher
 from q2r2_control.ros.monitoring import Publishers, node_of
 from q2r2_control.types import SIDES, HandInputs, HandSample, HapticFeedback
 
@@ -27,6 +30,12 @@ _KINDS: dict[MessageType, tuple[type, Callable[[Any], HandMessage]]] = {
     MessageType.TWIST: (Twist, convert.hand_twist),
     MessageType.INPUTS: (OVR2ROSInputs, convert.hand_inputs),
 }
+
+
+@lru_cache(maxsize=32)
+def _serialized(inputs: HandInputs) -> bytes:
+    """The message of a hand's controls, which rest for most of the time."""
+    return bytes(serialize_message(convert.inputs_message(inputs)))
 
 
 class HandPublishers:
@@ -40,6 +49,7 @@ class HandPublishers:
         self._publishers = {
             name: node.create_publisher(_KINDS[topic.kind][0], name, _DEPTH) for name, topic in topics.items()
         }
+        self._template = lru_cache(maxsize=8)(convert.pose_template)  # of each frame
         self.sent: dict[str, int] = {publisher.topic_name: 0 for publisher in self._publishers.values()}
 
     def publish(self, topic: str, message: HandMessage, frame: str, t: float) -> None:
@@ -47,28 +57,39 @@ class HandPublishers:
         publisher = self._publishers[topic]
         self.sent[publisher.topic_name] += 1
         if isinstance(message, HandPose):
-            publisher.publish(convert.hand_pose_message(message, frame, t))
+            publisher.publish(self._template(frame).fill([*message.position.tolist(), *message.quaternion.tolist()], t))
         elif isinstance(message, HandTwist):
             publisher.publish(convert.hand_twist_message(message))
         else:
-            publisher.publish(convert.inputs_message(message))
+            publisher.publish(_serialized(message))
 
-    def publish_sample(self, sample: HandSample, frame: str = "", twist: HandTwist | None = None) -> None:
-        """Publish a sample's messages on those topics that there are; a pose with a fault is left out."""
-        messages: dict[MessageType, HandMessage | None] = {MessageType.INPUTS: sample.inputs, MessageType.TWIST: twist}
-        if sample.fault is None:
-            messages[MessageType.POSE] = HandPose(sample.position, sample.quaternion, sample.pose_stamp, frame)
-        for kind, message in messages.items():
+    def publish_sample(
+        self, sample: HandSample, frame: str = "", twist: Callable[[], HandTwist | None] = lambda: None
+    ) -> None:
+        """Publish a sample's messages on those topics that somebody takes; a pose with a fault is left out.
+
+        ``twist`` makes the hand's, where somebody takes it.
+        """
+        for kind in (MessageType.INPUTS, MessageType.TWIST, MessageType.POSE):
             topic = self._topics.get((sample.hand, kind))
-            if topic is not None and message is not None:
+            if topic is None or not self._publishers[topic].get_subscription_count():
+                continue
+            message: HandMessage | None = sample.inputs
+            if kind is MessageType.TWIST:
+                message = twist()
+            elif kind is MessageType.POSE:
+                pose = HandPose(sample.position, sample.quaternion, sample.pose_stamp, frame)
+                message = pose if sample.fault is None else None
+            if message is not None:
                 self.publish(topic, message, frame, sample.pose_stamp)
 
     def subscribers(self, hand: str) -> int:
         """How many subscribers the topics of ``hand`` have, a recorder aside."""
         publishers = [publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand]
+        recorder = f"{self._node.get_namespace().rstrip('/')}{RECORDER}"
         matched = sum(publisher.get_subscription_count() for publisher in publishers)
         listed = (self._node.get_subscriptions_info_by_topic(publisher.topic_name) for publisher in publishers)
-        return min(matched, sum(node_of(info) not in (None, RECORDER) for infos in listed for info in infos))
+        return min(matched, sum(node_of(info) not in (None, recorder) for infos in listed for info in infos))
 
 
 def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None]) -> None:
@@ -102,13 +123,19 @@ class HandIntake:
         node: BaseNode,
         hand: str,
         timeout: float,
-        on_pose: Callable[[PoseStamped], None],
+        on_pose: Callable[[PoseStamped], None] | None,
         on_inputs: Callable[[OVR2ROSInputs], None],
     ) -> None:
         self._node, self._timeout = node, timeout
-        self._callbacks = (PoseStamped, "pose", on_pose), (OVR2ROSInputs, "inputs", on_inputs)
+        # Without a callback that wants to see it, a pose need not become a message first.
+        take_pose = self.put_pose if on_pose is None else on_pose
+        self._callbacks = (
+            (PoseStamped, "pose", take_pose, on_pose is None),
+            (OVR2ROSInputs, "inputs", on_inputs, False),
+        )
         self._publishers: dict[str, Publishers] = {}  # of each hand
         self._haptics: dict[str, Any] = {}
+        self._one: dict[str, OnePublisher] = {}  # of each hand
         self._samples = SampleQueue()
         self._received = -math.inf  # the message that is being taken was [s]
         self.follow(hand)
@@ -123,12 +150,20 @@ class HandIntake:
             return
         self._publishers[hand] = Publishers(self._node, (_topic(hand, "pose"), _topic(hand, "inputs")))
         self._haptics[hand] = self._node.create_publisher(OVR2ROSHapticFeedback, HAPTIC_TOPICS[hand], COMMAND_QOS)
-        for kind, what, callback in self._callbacks:
+        topics = []
+        for kind, what, callback, raw in self._callbacks:
             take = partial(self._take, hand, callback)
-            self._node.create_subscription(kind, _topic(hand, what), take, STREAM_QOS)
+            made = self._node.create_subscription(kind, _topic(hand, what), take, STREAM_QOS, raw=raw)
+            topics.append(made.topic_name)
+        self._one[hand] = OnePublisher(self._node, topics)
 
-    def put_pose(self, message: PoseStamped) -> None:
-        self._pose = convert.hand_pose(message), self._received
+    def put_pose(self, message: PoseStamped | bytes) -> None:
+        """A pose, serialized or not."""
+        try:
+            self._pose = convert.hand_pose(message), self._received
+        except SerdeError as error:  # which is its sender's fault
+            self._node.drop(_topic(self.hand, "pose"), str(error))
+            return
         self._put()
 
     def put_inputs(self, message: OVR2ROSInputs) -> None:
@@ -155,6 +190,11 @@ class HandIntake:
         if (age := min(missing.values())) == math.inf:
             return Reason.of(ReasonKind.HAND_UNKNOWN, data=what, hand=self.hand, source=source)
         return Reason.of(ReasonKind.HAND_SILENT, data=what, hand=self.hand, source=source, age=age)
+
+    @property
+    def conflict(self) -> Reason | None:
+        """A reason if the hand has more than one publisher: the arm would follow both in turns."""
+        return self._one[self.hand].conflict()
 
     def feel(self, pulse: HapticFeedback) -> None:
         feedback = OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude)

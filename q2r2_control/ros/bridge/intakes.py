@@ -6,11 +6,12 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
+from rosbags.serde import SerdeError
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Empty
 
@@ -27,11 +28,11 @@ from q2r2_control.ros.bridge.messages import (
     called_otherwise,
     delay,
     ended_topic,
-    nanoseconds,
     order_of,
-    pose_of,
+    pose_of_numbers,
     robot_state,
 )
+from q2r2_control.ros.bridge.wire import JointNumbers, joint_state_reader, read_pose
 from q2r2_control.ros.monitoring import Publishers
 from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import ArmTiming, Array, RobotState
@@ -48,6 +49,7 @@ _WARNING_TIME = 1.0  # refused targets are reported for this long [s]
 # target is due [s], or None.
 Take = Callable[[str, pin.SE3 | None, float, int | None, float | None], Reason | None]
 TakeState = Callable[[RobotState | Reason, float], None]
+Look = Callable[[JointNumbers], None]
 
 
 class TargetFrame(NamedTuple):
@@ -65,7 +67,8 @@ class TargetIntake:
         self.frames = {arm: _frame_of(node, robot, arm) for arm in robot.arms}
         self.topics: dict[str, str] = {}
         for arm in robot.arms:
-            topic = node.parameter(f"{arm}.target_topic", f"/q2r2/{arm}/target_frame", "targets of this arm")
+            name = node.parameter(f"{arm}.target_topic", f"q2r2/{arm}/target_frame", "targets of this arm")
+            topic = node.full_name(name)
             if topic in self.topics.values():
                 raise ConfigError(f"{arm}.target_topic = {topic!r:.80}: another arm has it; allowed: one of its own")
             self.topics[arm] = topic
@@ -80,7 +83,7 @@ class TargetIntake:
         """Pass each target to ``take``, and the arm whose sender ends its stream to ``release``."""
         for arm, topic in self.topics.items():
             on_target = partial(self._on_target, take, arm)
-            self._node.create_subscription(PoseStamped, topic, on_target, COMMAND_QOS)
+            self._node.create_subscription(PoseStamped, topic, on_target, COMMAND_QOS, raw=True)
             on_end = partial(lambda arm, _: release(arm), arm)
             self._node.create_subscription(Empty, ended_topic(topic), on_end, COMMAND_QOS)
 
@@ -93,10 +96,15 @@ class TargetIntake:
         self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _WARNING_TIME}
         return {arm: refusal for arm, (refusal, _) in self._refused.items()}
 
-    def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
-        frame, now, frame_id = self.frames[arm], self._node.now, message.header.frame_id
-        pose = pose_of(message.pose) if frame_id == frame.name else None
-        made, received = nanoseconds(message.header.stamp), now - age(info)
+    def _on_target(self, take: Take, arm: str, message: bytes | PoseStamped, info: Mapping[str, int | None]) -> None:
+        try:
+            made, frame_id, numbers = read_pose(message)
+        except SerdeError as error:  # which is its sender's fault
+            self._node.drop(self.topics[arm], str(error))
+            return
+        frame, now = self.frames[arm], self._node.now
+        pose = pose_of_numbers(numbers) if frame_id == frame.name else None
+        received = now - age(info)
         late = self._delays[arm].take(delay(info), time.monotonic()) or self._stood_still(arm, made, received)
         wanted = None if pose is None or late else frame.pose * pose
         due = self._due(arm, made, received)
@@ -185,11 +193,11 @@ class JointIntake:
         self.driver_fault: Callable[[], Reason | None] = lambda: None
         self.driver_held: Callable[[Array], Array | None] = lambda q: None
 
-    def subscribe(self, take: TakeState, look: Callable[[JointState], None]) -> None:
+    def subscribe(self, take: TakeState, look: Look) -> None:
         """Pass states of all arms, or what is wrong, to ``take`` with the time [s], and each message to ``look``."""
         for topic in self._topics:
-            on_message = partial(self._on_message, take, look, topic)
-            self._node.create_subscription(JointState, topic, on_message, STREAM_QOS)
+            on_message = partial(self._on_message, take, look, topic, joint_state_reader())
+            self._node.create_subscription(JointState, topic, on_message, STREAM_QOS, raw=True)
         if self._external_topic:
             self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
 
@@ -210,7 +218,14 @@ class JointIntake:
             for arm in arms
         }
 
-    def _on_message(self, take: TakeState, look: Callable[[JointState], None], topic: str, message: JointState) -> None:
+    def _on_message(
+        self, take: TakeState, look: Look, topic: str, read: Callable[[Any], JointNumbers], data: bytes | JointState
+    ) -> None:
+        try:
+            message = read(data)
+        except SerdeError:  # which is some other node's fault
+            self._node.drop(topic, f"{len(bytes(data))} bytes")
+            return
         look(message)
         names = self._names[topic]
         if not set(names).isdisjoint(message.name):
@@ -285,7 +300,7 @@ class Fingers:
         """Those with a gripper."""
         return tuple(self._grippers)
 
-    def openings(self, message: JointState) -> dict[str, float]:
+    def openings(self, message: JointState | JointNumbers) -> dict[str, float]:
         """Of the arms whose fingers are in the message, 0 closed .. 1 fully open; a little beyond is possible."""
         found: dict[str, float] = {}
         if len(message.position) != len(message.name):

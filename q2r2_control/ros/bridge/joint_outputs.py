@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from functools import lru_cache
 from importlib import import_module
+from itertools import islice
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from builtin_interfaces.msg import Duration
+from builtin_interfaces.msg import Duration, Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -23,14 +25,16 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.messages import joint_state_message
-from q2r2_control.ros.monitoring import CommandWatch, WatchedPublisher
+from q2r2_control.ros.bridge.wire import Template
+from q2r2_control.ros.commanders import CommandWatch, takers_of
+from q2r2_control.ros.monitoring import WatchedPublisher
 from q2r2_control.types import Command, CommandMode, RobotState
 
 NONE = "none"
 
 
 class Kind(ABC):
-    """One kind of message. Made with the control loop's period [s] and the robot."""
+    """One kind of message. Made with the control loop's period [s] and the robot; encoded it may be serialized."""
 
     topic: ClassVar[str]  # where no other is asked for
     older: str | None = None  # last part of the topic in older releases of the receiver, which gets it too
@@ -52,12 +56,24 @@ class TrajectoryOutput(Kind):
     topic = "joint_trajectory"
     message = JointTrajectory
 
-    def encode(
-        self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray
-    ) -> JointTrajectory:
-        q, v = command.q[joints].tolist(), command.v[joints].tolist()
-        point = JointTrajectoryPoint(positions=q, velocities=v, time_from_start=self._due)
-        return JointTrajectory(joint_names=names, points=[point])  # stamp 0 is now, whatever the receiver's clock says
+    def __init__(self, period: float, robot: Robot) -> None:
+        super().__init__(period, robot)
+        self._template = lru_cache(maxsize=8)(self._make)
+
+    def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> bytes:
+        numbers = [*command.q[joints].tolist(), *command.v[joints].tolist()]
+        # Stamp 0 is now, whatever the receiver's clock says.
+        return self._template(tuple(names)).fill(numbers, 0.0)
+
+    def _make(self, names: tuple[str, ...]) -> Template:
+        def make(numbers: Iterator[float], stamp: Any) -> JointTrajectory:
+            q, v = (list(islice(numbers, len(names))) for _ in range(2))
+            point = JointTrajectoryPoint(positions=q, velocities=v, time_from_start=self._due)
+            message = JointTrajectory(joint_names=list(names), points=[point])
+            message.header.stamp = stamp
+            return message
+
+        return Template(make, Time())
 
 
 class PositionArray(Kind):
@@ -92,7 +108,7 @@ class JointStates(Kind):
 class LbrPosition(Kind):
     """LBRJointPositionCommand of lbr_fri_idl, one topic an arm."""
 
-    topic, joints_each, older = "/{arm}/command/lbr_joint_position_command", 7, "joint_position"
+    topic, joints_each, older = "{arm}/command/lbr_joint_position_command", 7, "joint_position"
     type_name = "LBRJointPositionCommand"
 
     def __init__(self, period: float, robot: Robot) -> None:
@@ -166,7 +182,13 @@ class JointOutput:
         self.withheld: Collection[str] = ()  # namespaces of drivers that get nothing
 
     def watch(self, node: BaseNode) -> CommandWatch:
-        return CommandWatch(node, self._kind.message, [channel.publisher.topic_name for channel in self._channels])
+        return CommandWatch(node, self._kind.message, [channel.publisher for channel in self._channels])
+
+    def takers(self, node: BaseNode, joints: np.ndarray) -> str:
+        """Who takes the commands of the joints with these velocity indices: " /node", or "" where that is not known."""
+        topics = [one.publisher.topic_name for one in self._channels if np.isin(joints, one.joints).all()]
+        names = (takers_of(node, topic) for topic in topics)
+        return next((f" {name}" for name in names if name), "")
 
     def send(self, command: Command, state: RobotState, t: float, decided: float) -> None:
         """Send a command of the tick at ``t`` [s] of the node's clock; ``decided``: see :func:`publish_in_time`."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
 from q2r2_control.inputs.messages import HandPose, HandTwist
+from q2r2_control.ros.bridge.wire import JointNumbers, Template, read_pose
 from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, RobotState
 
 _UNIT = 1e-3  # a quaternion's norm may be off by this
@@ -73,30 +75,58 @@ def pose_of(message: Pose) -> pin.SE3 | None:
     return pose_of_numbers((p.x, p.y, p.z, o.x, o.y, o.z, o.w))
 
 
+def is_pose(numbers: Sequence[float]) -> bool:
+    """Whether a position and a quaternion x y z w are finite, and the quaternion a rotation."""
+    # A sum or a norm with NaN or infinity in it is not finite.
+    return math.isfinite(sum(numbers[:3])) and abs(math.hypot(*numbers[3:]) - 1.0) <= _UNIT
+
+
 def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
     """The pose of a position and a quaternion x y z w; None as in :func:`pose_of`."""
-    norm = math.hypot(*numbers[3:])
-    # A sum or a norm with NaN or infinity in it is not finite.
-    if not (math.isfinite(sum(numbers[:3])) and abs(norm - 1.0) <= _UNIT):
+    if not is_pose(numbers):
         return None
     pose = np.array(numbers)
-    pose[3:] /= norm
+    pose[3:] /= math.hypot(*numbers[3:])
     return pin.XYZQUATToSE3(pose)
 
 
-def hand_pose(message: PoseStamped) -> HandPose:
-    p, o = message.pose.position, message.pose.orientation
-    return HandPose(
-        position=np.array([p.x, p.y, p.z]),
-        quaternion=np.array([o.x, o.y, o.z, o.w]),
-        stamp=seconds(message.header.stamp),
-        frame_id=message.header.frame_id,
-    )
+def hand_pose(message: PoseStamped | bytes) -> HandPose:
+    """A hand's pose, unchecked. Raises SerdeError for bytes that are no PoseStamped."""
+    stamp, frame, numbers = read_pose(message)
+    values = np.array(numbers)
+    return HandPose(values[:3], values[3:], stamp * 1e-9, frame)
 
 
-def hand_pose_message(pose: HandPose, frame: str, t: float) -> PoseStamped:
-    """The same as a message in ``frame`` at ``t`` [s], all numbers as they are: the quaternion may be no unit one."""
-    return _stamped(pose.position, pose.quaternion, frame, t)
+def pose_template(frame: str) -> Template:
+    """A PoseStamped in ``frame``, whose numbers are a position and a quaternion x y z w."""
+
+    def make(numbers: Iterator[float], stamp: Any) -> PoseStamped:
+        message = PoseStamped()
+        p, o = message.pose.position, message.pose.orientation
+        p.x, p.y, p.z, o.x, o.y, o.z, o.w = islice(numbers, 7)
+        message.header.frame_id, message.header.stamp = frame, stamp
+        return message
+
+    return Template(make, Time())
+
+
+def fill_pose(template: Template, pose: pin.SE3, t: float) -> bytes:
+    """The message of a pose at ``t`` [s], as :func:`stamped_pose` makes it."""
+    numbers = pin.SE3ToXYZQUAT(pose)
+    numbers[3:] /= math.hypot(*numbers[3:].tolist())
+    return template.fill(numbers.tolist(), t)
+
+
+def joint_state_template(names: Sequence[str], q: bool = True, v: bool = True, tau: bool = True) -> Template:
+    """A JointState of these joints, whose numbers are positions, velocities and torques; those that are not: none."""
+
+    def make(numbers: Iterator[float], stamp: Any) -> JointState:
+        fields = [list(islice(numbers, len(names))) if given else [] for given in (q, v, tau)]
+        message = JointState(name=list(names), position=fields[0], velocity=fields[1], effort=fields[2])
+        message.header.stamp = stamp
+        return message
+
+    return Template(make, Time())
 
 
 def hand_twist(message: Twist) -> HandTwist:
@@ -124,7 +154,7 @@ def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t:
     return message
 
 
-def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotState | str:
+def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: float) -> RobotState | str:
     """State in the order of ``names``, received at ``t`` [s]; or what is wrong with the message, in one line.
 
     Other joints in the message are ignored. Velocities and torques may be missing as a whole and are then zero.

@@ -76,11 +76,12 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
         declare("mode", given.mode.value, "raw: the hand's target; filtered: through the built-in controller"),
     )
     prefix = declare("ctrl_prefix", given.ctrl_prefix, "the controller's node, with its namespace").rstrip("/")
+    prefix = node.full_name(prefix)
     base = declare("base_frame_id", given.base_frame_id, "frame_id of targets")
     world = declare("world_frame_id", given.world_frame_id, 'whose axes the hand\'s are; "": base_frame_id')
     topic = declare("target_topic", given.target_topic, 'where targets go; "": as the preset says')
-    builtin = declare("builtin_node", "/cartesian_controller", "the built-in controller's node")
-    controller = declare("controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix')
+    builtin = node.full_name(declare("builtin_node", "cartesian_controller", "the built-in controller's node"))
+    controller = node.full_name(declare("controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix'))
     rate = declare("rate", given.rate or preset.rate, "of targets [Hz]", within=(1.0, 1000.0))
     if rate < preset.lowest_rate:
         allowed = f"at least {preset.lowest_rate:g}, better {preset.rate:g}"
@@ -94,13 +95,13 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
         target_topic=topic or preset.topic_of(prefix),
         current_pose_topic=declare("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
         builtin_node=builtin,
-        builtin_prefix=declare("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
+        builtin_prefix=declare("builtin_prefix", f"q2r2/{arm}", "where mode filtered sends the hand's target"),
         tool_timeout=declare("tool_timeout", STREAM_TIMEOUT, "of poses of tool and safe target [s]", within=(0.01, 2)),
         listener_timeout=declare("listener_timeout", STREAM_TIMEOUT, "of acknowledgements [s]", within=(0.1, 10)),
         rate=rate,
         preset=preset,
         mode=mode,
-        gripper_topic=declare("gripper_action_topic", given.gripper_action_topic, "action or topic"),
+        gripper_topic=node.full_name(declare("gripper_action_topic", given.gripper_action_topic, "action or topic")),
         gripper=settings_from_parameters(node, "gripper", given.gripper),
         guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), read_only=False),
         teleop=_teleop_settings(node, given.teleop),

@@ -8,12 +8,13 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_msgs.msg import Empty
 
-from q2r2_control.config.presets import BUILTIN, Hold, Preset
+from q2r2_control.config.presets import BUILTIN, POSE, Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import ended_topic, stamped_pose, time_message
+from q2r2_control.ros.bridge.messages import ended_topic, fill_pose, pose_template, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
+from q2r2_control.ros.commanders import OnePublisher
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.tick_pacer import PoseRateLimiter
@@ -50,8 +51,10 @@ class TargetOutput:
         self.preset = preset
         self.guard = PoseRateLimiter(guard, 1.0 / values.rate)
         self._node, self._controller, self._frame = node, controller, frame
+        self._template = pose_template(frame)
         self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
         self.topic = self._publisher.topic_name  # as the graph knows it
+        self._one = OnePublisher(node, [self.topic])
         self._unknown_node = Reason.of(ReasonKind.SUBSCRIBER_UNKNOWN, topic=self.topic)
         self._wrench = None
         if preset.zero_wrench is not None:
@@ -75,15 +78,13 @@ class TargetOutput:
     @property
     def conflict(self) -> Reason | None:
         """A reason if there are other publishers of the same topic."""
-        if (count := self._node.handle.get_count_publishers(self.topic)) <= 1:
-            return None
-        return Reason.of(ReasonKind.SEVERAL_PUBLISHERS, count=count, topic=self.topic)
+        return self._one.conflict()
 
     @property
     def unready(self) -> Reason | None:
         """A reason if the topic has no subscriber, or one whose node is not known yet."""
         if self._publisher.listeners == 0:
-            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=self.topic)
+            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=f"{self.topic} ({POSE})")
         return self._unknown_node if self._unknown and not self.following else None
 
     def take_fault(self, now: float) -> Reason | None:
@@ -140,7 +141,7 @@ class TargetOutput:
             return None
         if self.following and self._publisher.waits():
             return pose
-        if self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now), decided):
+        if self._publisher.publish(fill_pose(self._template, base.actInv(pose), now), decided):
             self.last_sent, self._sent_at = pose, now
         return pose
 

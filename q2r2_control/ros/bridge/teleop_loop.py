@@ -11,6 +11,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from q2r2_control.config.presets import BUILTIN, RAW_WARNING, Mode
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
@@ -104,7 +105,8 @@ class RecorderLink:
         self._heard = 0.0  # [s] of steady time
         self._served: int | None = None  # services that it has answered
         self._reasons: list[Reason] = []
-        node.create_subscription(String, f"{RECORDER}/state", self._on_state, 10)
+        self._topic = f"{node.name_in_set(RECORDER)}/state"
+        node.create_subscription(String, self._topic, self._on_state, 10)
 
     def update(self, marks: EpisodeMarks) -> list[Reason]:
         """Once a tick, before the teleoperation; returns the reasons of new events of its services."""
@@ -123,7 +125,7 @@ class RecorderLink:
                 self._reasons.append(Reason.from_json(state["served_last"]))
             self._served, self._heard = state["served"], time.monotonic()
         except (ValueError, TypeError, KeyError):
-            self._node.drop(f"{RECORDER}/state", f"{message.data!r:.60}")
+            self._node.drop(self._topic, f"{message.data!r:.60}")
 
 
 class TickInputs(NamedTuple):
@@ -157,13 +159,15 @@ class TeleopLoop:
         """After the node's publishers and subscriptions were made."""
         if node is not self.nodes[0]:
             return
+        if node.parameters.mode is Mode.RAW and node.parameters.preset is not BUILTIN:
+            node.get_logger().warning(RAW_WARNING)
         self._recorder = RecorderLink(node)
         self._home = HomeClient(node, node.outputs.home_controller)
         self._ticked = node.now
         self._without_time: Reason | None = None
         node.create_tick(1.0 / node.parameters.rate, self.tick)
         # Without time there are no ticks, and so nothing else that would pause the arms.
-        node.create_timer(_TIME_PERIOD, self._watch_time, clock=STEADY)
+        node.create_tick(_TIME_PERIOD, self._watch_time, clock=STEADY)
 
     def tick(self) -> None:
         """Process what arrived, and publish where the tools should go."""

@@ -6,14 +6,15 @@ import ctypes
 import importlib.util
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
@@ -29,6 +30,7 @@ ROBOTS = ("auto", "mujoco", "none")
 _END_TIMEOUTS = {signal.SIGINT: 5.0, signal.SIGTERM: 3.0}
 # Looked up here, because few calls are safe between fork and exec.
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
+_NAMESPACE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _PR_SET_PDEATHSIG = 1
 _EXECUTABLES = "q2r2_control.ros.launch.executables"
 
@@ -39,6 +41,7 @@ class NodeProcess:
 
     name: str
     parameters: Mapping[str, str | float] = field(default_factory=dict)
+    ros_arguments: tuple[str, ...] = ()  # more for ROS, such as "-r", "__ns:=/cell"
 
     def command(self) -> list[str]:
         """The command that starts it with this Python; a text that looks like a number, as "3", stays one."""
@@ -47,7 +50,7 @@ class NodeProcess:
             for key, value in self.parameters.items()
             for part in ("-p", f"{key}:={json.dumps(value, ensure_ascii=False)}")
         ]
-        return [sys.executable, "-u", "-m", _EXECUTABLES, self.name, "--ros-args", *parameters]
+        return [sys.executable, "-u", "-m", _EXECUTABLES, self.name, "--ros-args", *parameters, *self.ros_arguments]
 
 
 def nodes_of(
@@ -74,7 +77,7 @@ def nodes_of(
     if robot == "mujoco" or (robot == "auto" and cell.controller is ControllerKind.BUILTIN):
         nodes.append(NodeProcess("mujoco_robot", config))
         if cell.external is None:
-            controller["external_torque_topic"] = "/mujoco_robot/external_torque"
+            controller["external_torque_topic"] = "mujoco_robot/external_torque"
     if cell.external is None or cell.external.filtered:
         nodes.append(NodeProcess("cartesian_controller", config | controller))
     arms = [f"{arm}_arm_controller" for arm in SIDES if arm in cell.arms]
@@ -88,6 +91,23 @@ def nodes_of(
         address: dict[str, str | float] = {"web_host": host, "web_port": port, "recorded": recording is not None}
         nodes.append(NodeProcess("web_page", config | address))
     return nodes
+
+
+def in_ros(
+    nodes: Iterable[NodeProcess], arguments: Sequence[str], namespace: str | None, sim_time: bool
+) -> list[NodeProcess]:
+    """``nodes`` with more ``arguments`` for ROS, in a ``namespace``, and with the time on /clock.
+
+    Raises :class:`ConfigError` for what is no namespace.
+    """
+    given: list[str] = []
+    if namespace is not None:
+        if not _NAMESPACE.fullmatch(namespace):
+            raise ConfigError(f"--namespace = {namespace!r:.60}: allowed is a ROS name such as /cell")
+        given += ["-r", f"__ns:=/{namespace.removeprefix('/')}"]
+    if sim_time:
+        given += ["-p", "use_sim_time:=true"]
+    return [replace(node, ros_arguments=(*node.ros_arguments, *given, *arguments)) for node in nodes]
 
 
 def _relayed(external: ExternalConfig) -> dict[str, str | float]:

@@ -51,7 +51,6 @@ class BaseArmController(BaseNode):
     """
 
     ticks = True
-    priority = 38
 
     def __init__(
         self,
@@ -73,10 +72,10 @@ class BaseArmController(BaseNode):
         self.arm_name, self.robot_name = arm_name, robot_name
         self.defaults = ArmDefaults(
             arm_name=arm_name,
-            ctrl_prefix=ctrl_prefix or f"/{robot_name}/{arm_name}",
+            ctrl_prefix=ctrl_prefix or f"{robot_name}/{arm_name}",
             base_frame_id=base_frame_id,
             end_effector_link_name=end_effector_link_name or f"{arm_name}_tool_frame",
-            gripper_action_topic=gripper_action_topic or f"/{robot_name}/{arm_name}_gripper/gripper_cmd",
+            gripper_action_topic=gripper_action_topic or f"{robot_name}/{arm_name}_gripper/gripper_cmd",
             teleop=teleop_defaults(mirror, filter_window_size),
             preset=preset,
         )
@@ -117,7 +116,9 @@ class BaseArmController(BaseNode):
         )
         self._safe_target = PoseTopic(self, f"{values.builtin_node}/safe_target/{self.arm_name}", *within)
         timeout = values.teleop.gate.timeout
-        self.intake = HandIntake(self, self.hand, timeout, self.pose_callback, self.inputs_callback)
+        own = type(self).pose_callback is BaseArmController.pose_callback
+        on_pose = None if own else self.pose_callback
+        self.intake = HandIntake(self, self.hand, timeout, on_pose, self.inputs_callback)
         self.outputs = ArmOutputs(self, self.arm_name, values, self._safe_target)
         self.feedback = ArmFeedback(self, self.arm_name, values, self.intake)
         grants = None
@@ -159,6 +160,7 @@ class BaseArmController(BaseNode):
         self._base_pose = base
         self.inputs = TickInputs(tool, commanded, reference, None if obstacle is None else obstacle[1])
         fault = self.outputs.take_fault(now) or (None if self._refusal is None else self._refusal[1])
+        fault = fault or self.outputs.standstill(tool, self._tool.received, now)
         return None if self.state in HOLDING else fault
 
     def follow(self, target: ArmTarget, now: float, decided: float) -> Reason | None:
@@ -238,7 +240,7 @@ class BaseArmController(BaseNode):
     ) -> tuple[bytes, Reason] | None:
         """Why the arm may not be engaged now, its hand aside, with the level of the diagnostics."""
         values = self.parameters
-        if (conflict := self.outputs.conflict or self._frames.conflict(values.tool_frame)) is not None:
+        if (conflict := self._conflict()) is not None:
             return ERROR, conflict
         if tool is None:
             why = self._tool.problem or Reason(ReasonKind.NO_CURRENT_POSE)
@@ -252,6 +254,10 @@ class BaseArmController(BaseNode):
             if self.state is ArmState.IDLE:
                 self.get_logger().warning(sentence(away), once=True)
         return None if unready is None else (WARN, unready)
+
+    def _conflict(self) -> Reason | None:
+        """Two nodes that say different things where the arm follows one."""
+        return self.outputs.conflict or self.intake.conflict or self._frames.conflict(self.parameters.tool_frame)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
         """For the leash and for anchors. Another controller's is not known: then the tool's, or the last target's."""

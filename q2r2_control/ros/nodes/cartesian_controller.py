@@ -35,6 +35,7 @@ from q2r2_control.supervision.joint_watch import (
     settings_for_external_arms,
     watch_settings,
 )
+from q2r2_control.supervision.standstill import JOINTS, LAGGING_JOINTS, StandstillLimits
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickClock
@@ -44,7 +45,7 @@ from q2r2_control.wording import sentence
 _LONGEST_STOP = 3.0  # [s]
 _QUIET = 0.3  # nobody else commands the arms for so long before this node does [s]
 _LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
-_SAFE_TARGET_PERIOD = 0.012  # [s]
+_SAFE_TARGET_PERIOD = 0.02  # of arms that only listen [s]
 
 
 class CartesianControllerNode(ManagedNode):
@@ -93,10 +94,11 @@ class CartesianControllerNode(ManagedNode):
             self._period,
             streams,
             watch,
-            origins=Origins(self._joints.source, self._targets.source),
+            origins=Origins(self._joints.source, self._targets.source, self._takers),
             external=ExternalArms(robot, self._controller, external, streams, watch) if self._only_leads else None,
             gripper_delay=GRIPPER_DELAY,
             owns_plant=False,
+            standstill=self._standstill(output),
         )
         self._supervisor = self._loop.supervisor
         # Another controller's arms are judged with fingers all of their way.
@@ -105,15 +107,25 @@ class CartesianControllerNode(ManagedNode):
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
         self._commanding, self._advances = False, 0  # ticks that have gone by some time
-        # Another controller follows every safe target; arms that listen tick a hundred times a second.
+        # Another controller follows every safe target; arms that listen need the newest to know where the arm is.
         every = 1 if self._only_leads else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._last_tick = self.now
         self._deactivated = Reason.of(ReasonKind.CONTROLLER_DEACTIVATED, controller=self.get_fully_qualified_name())
         self._others = self._output.watch(self)
+        self._other: Reason | None = None  # who else commands the arms
         self._connect()
         self.start_active()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
+
+    def _standstill(self, output: str) -> StandstillLimits | None:
+        """An arm that yields may be held, and then stands still by design."""
+        if output == NONE:
+            return LAGGING_JOINTS
+        return None if self._output.drive.yields else JOINTS
+
+    def _takers(self, arm: str) -> str:
+        return self._output.takers(self, self._controller.robot.arms[arm].joints)
 
     def _connect(self) -> None:
         self._targets.subscribe(self._supervisor.update_target, self._supervisor.targets.release)
@@ -144,8 +156,12 @@ class CartesianControllerNode(ManagedNode):
         self._advances += 1
         if not self._only_leads:  # another controller's arms are judged by where they are measured
             self._loop.watch_skew(self._joints.timings(now), self._period + COMMAND_TIME, now)
-        if self._supervisor.phase is Phase.INACTIVE and self._grippers.awaits(now):
+        inactive = self._supervisor.phase is Phase.INACTIVE
+        self._other = self._others.intruder() if self._commanding else self._others.commander()
+        if inactive and (self._other is not None or self._grippers.awaits(now)):
             return
+        if self._other is not None and self._supervisor.phase is Phase.ACTIVE:
+            self._supervisor.stop(self._other)
         # Commands that the arms do not follow are not for a receiver that has just come.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
             self._supervisor.let_go(fault, now)
@@ -163,6 +179,8 @@ class CartesianControllerNode(ManagedNode):
         elif self._commanding and state is not None:
             self._output.end(state, now)
         self._commanding = step.reference is not None
+        if not self._commanding:
+            self._others.rest()
         if events := self._supervisor.events:
             log = self.get_logger()
             for event in events:
@@ -179,8 +197,10 @@ class CartesianControllerNode(ManagedNode):
         return _answer(response, None)
 
     def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
-        served = self.is_active or act == self._stop
-        refusal = act() if served else self._deactivated
+        refusal: Reason | None = self._deactivated
+        if self.is_active or act == self._stop:
+            other = None if act == self._stop or self._commanding else self._others.commander()
+            refusal = other or act()
         self.report_health()
         return _answer(response, refusal)
 
@@ -190,7 +210,8 @@ class CartesianControllerNode(ManagedNode):
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         supervisor, now = self._supervisor, self.now
-        fault = supervisor.fault if self.is_active else self._deactivated
+        fault = supervisor.fault or self._other if self.is_active else self._deactivated
+        fault = None if fault is None else self._others.named(fault)
         refused, ended, homed = self._targets.faults(), supervisor.targets.ended, supervisor.homing.outcome
         values: dict[str, Any] = {
             "phase": supervisor.phase,
@@ -279,6 +300,7 @@ class CartesianControllerNode(ManagedNode):
             if self._commanding and self._joints.state is not None:
                 self._output.end(self._joints.state, self.now)
             self._commanding = False
+            self._others.rest()
 
     def _tick_on(self) -> None:
         """One tick in the middle of a service, which the executor waits for."""

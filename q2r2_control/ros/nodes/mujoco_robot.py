@@ -9,19 +9,21 @@ commands the arms brake, and after ``hold_after`` they stand on their position s
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import Any
 
-import mujoco
 import numpy as np
+from builtin_interfaces.msg import Time
 from control_msgs.action import GripperCommand
 from geometry_msgs.msg import TransformStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosbags.serde import SerdeError
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
@@ -33,7 +35,8 @@ from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.plants.simulated_cell import SimulatedCell
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, STEADY, WARN, BaseNode
-from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds, time_message
+from q2r2_control.ros.bridge.messages import age, delay, joint_state_template, seconds
+from q2r2_control.ros.bridge.wire import Template, trajectory_reader
 from q2r2_control.supervision.targets import DelayWatch
 
 _LOG_PERIOD = 1.0  # of lines about refusals [s]
@@ -124,7 +127,6 @@ class MujocoRobot(BaseNode):
     """Runs a :class:`SimulatedCell` in real time between its topics, services and actions."""
 
     ticks = True
-    priority = 39
 
     def __init__(self) -> None:
         super().__init__("mujoco_robot")
@@ -148,7 +150,7 @@ class MujocoRobot(BaseNode):
         self._grippers = {
             arm: GripperServer(
                 self,
-                f"/q2r2/{arm}_gripper/gripper_cmd",
+                f"q2r2/{arm}_gripper/gripper_cmd",
                 partial(self._cell.command_gripper, arm),
                 partial(self._note, f"{arm}_gripper"),
             )
@@ -162,10 +164,11 @@ class MujocoRobot(BaseNode):
 
     def _make_publishers(self) -> None:
         self._joint_states = self.create_publisher(JointState, "joint_states", 10)
-        self._measured_names = (*self._robot.joint_names, *self._cell.fingers)
+        self._measured = joint_state_template((*self._robot.joint_names, *self._cell.fingers))
+        self._felt = joint_state_template(self._robot.joint_names, q=False, v=False)
         self._external = self.create_publisher(JointState, "~/external_torque", 10)
-        self._tf = self.create_publisher(TFMessage, "/tf", 10)
-        self._tf_static = self.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
+        self._tf = self.create_publisher(TFMessage, "tf", 10)
+        self._tf_static = self.create_publisher(TFMessage, "tf_static", LATCHED_QOS)
         self._description = self.create_publisher(String, "robot_description", LATCHED_QOS)
         self._description.publish(String(data=self._robot.urdf))
         self._moving, fixed = link_transforms(self._cell.plant.model, self._cell.loose_objects)
@@ -183,7 +186,20 @@ class MujocoRobot(BaseNode):
             (Float64MultiArray, "torque_commands", lambda m: push(np.array(m.data), self._received)),
         )
         for kind, topic, command in kinds:
-            self.create_subscription(kind, topic, partial(self._take, topic, command), commands)
+            take = partial(self._take, topic, command)
+            if kind is JointTrajectory:  # which comes in every tick
+                take = partial(self._take_serialized, trajectory_reader(), take)
+            self.create_subscription(kind, topic, take, commands, raw=kind is JointTrajectory)
+
+    def _take_serialized(
+        self, read: Callable[[bytes], Any], take: Callable[[Any, Any], None], data: bytes, info: Mapping[str, Any]
+    ) -> None:
+        try:
+            message = read(data)
+        except SerdeError:  # which is its sender's fault
+            self.drop(_TRAJECTORY, f"{len(data)} bytes")
+            return
+        take(message, info)
 
     def _take(self, topic: str, command: Callable[[Any], str | None], message: Any, info: Mapping[str, Any]) -> None:
         # Two controllers of an arm each may send on one topic, from hosts with clocks of their own.
@@ -225,14 +241,12 @@ class MujocoRobot(BaseNode):
         q = np.concatenate([state.q, cell.finger_positions()])
         v = np.concatenate([state.v, cell.finger_velocities()])
         tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])  # fingers' efforts are not measured
-        self._joint_states.publish(joint_state_message(self._measured_names, q, v, tau, stamp))
+        self._joint_states.publish(self._measured.fill([*q.tolist(), *v.tolist(), *tau.tolist()], stamp))
         if state.tau_external is not None and now >= self._external_due:
             # On a grid, half a tick early so that no tick of the grid is too early by its jitter.
             self._external_due = max(self._external_due + self._external_period, now - 0.5 * self._period)
             if self._external.get_subscription_count():
-                none = np.zeros(0)
-                torques = joint_state_message(self._robot.joint_names, none, none, state.tau_external, stamp)
-                self._external.publish(torques)
+                self._external.publish(self._felt.fill(state.tau_external.tolist(), stamp))
         openings = cell.plant.gripper_openings()
         for arm, gripper in self._grippers.items():
             gripper.update(now, openings[arm], cell.gripper_force(arm))
@@ -269,23 +283,33 @@ def link_transforms(model: Any, without: Collection[str]) -> tuple[LinkTransform
 
 
 class LinkTransforms:
-    def __init__(self, model: Any, bodies: list[int]) -> None:
-        self._bodies, self._parents = bodies, model.body_parentid[bodies].tolist()
-        self._message = TFMessage()
-        for body, parent in zip(bodies, self._parents, strict=True):
-            transform = TransformStamped(child_frame_id=model.body(body).name)
-            transform.header.frame_id = model.body(parent).name
-            self._message.transforms.append(transform)
+    """Where bodies are in their parents, as a serialized TFMessage."""
 
-    def at(self, data: Any, t: float) -> TFMessage:
-        """The message for a ``mujoco.MjData`` at ``t`` [s]; the same object each time."""
-        stamp, inverse, position, quaternion = time_message(t), np.zeros(4), np.zeros(3), np.zeros(4)
-        for transform, body, parent in zip(self._message.transforms, self._bodies, self._parents, strict=True):
-            mujoco.mju_negQuat(inverse, data.xquat[parent])
-            mujoco.mju_rotVecQuat(position, data.xpos[body] - data.xpos[parent], inverse)
-            mujoco.mju_mulQuat(quaternion, inverse, data.xquat[body])
-            transform.header.stamp = stamp
-            p, o = transform.transform.translation, transform.transform.rotation
-            p.x, p.y, p.z = position.tolist()
-            o.w, o.x, o.y, o.z = quaternion.tolist()  # MuJoCo has w first
-        return self._message
+    def __init__(self, model: Any, bodies: list[int]) -> None:
+        self._bodies, self._parents = np.array(bodies, dtype=int), model.body_parentid[bodies]
+
+        def make(numbers: Iterator[float], stamp: Any) -> TFMessage:
+            message = TFMessage()
+            for body, parent in zip(bodies, self._parents.tolist(), strict=True):
+                transform = TransformStamped(child_frame_id=model.body(body).name)
+                transform.header.frame_id, transform.header.stamp = model.body(parent).name, stamp
+                p, o = transform.transform.translation, transform.transform.rotation
+                p.x, p.y, p.z, o.x, o.y, o.z, o.w = islice(numbers, 7)
+                message.transforms.append(transform)
+            return message
+
+        self._template = Template(make, Time())
+
+    def at(self, data: Any, t: float) -> bytes:
+        """The message for a ``mujoco.MjData`` at ``t`` [s]."""
+        turned = data.xquat[self._parents]
+        away = data.xpos[self._bodies] - data.xpos[self._parents]
+        numbers = np.empty((len(self._bodies), 7))
+        # A vector turned back by a unit quaternion (w, u) is a - 2 w (u x a) + 2 u x (u x a).
+        w, u = turned[:, :1], turned[:, 1:]
+        across = np.cross(u, away)
+        numbers[:, :3] = away - 2.0 * w * across + 2.0 * np.cross(u, across)
+        its_w, its_u = data.xquat[self._bodies, :1], data.xquat[self._bodies, 1:]  # MuJoCo has w first
+        numbers[:, 3:6] = w * its_u - its_w * u - np.cross(u, its_u)
+        numbers[:, 6:] = w * its_w + (u * its_u).sum(axis=1, keepdims=True)
+        return self._template.fill(numbers.ravel().tolist(), t)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -80,7 +80,7 @@ class RecorderNode(BaseNode):
         self._served = 0
         self._served_last: Reason | None = None
         self._waiting: list[Message] = []
-        self._events = self.create_publisher(String, RECORDER_EVENTS, RECORDED_QOS)
+        self._events = self.create_publisher(String, self.name_in_set(RECORDER_EVENTS), RECORDED_QOS)
         topics = ros_topics(tuple(robot.arms), cameras)
         self._begun, self._epoch, self._looked = time.monotonic_ns(), time.time_ns(), 0
         about = About(
@@ -97,7 +97,7 @@ class RecorderNode(BaseNode):
             notes={**program(), **{name: text for name, text in notes.items() if text}},
         )
         self._recorder.begin(about, topics)
-        self._listen(topics, {arm_events(arm) for arm in robot.arms})
+        self._listen(topics, {arm_events(arm) for arm in robot.arms}, cameras.values())
         for name, kind in _SERVICES.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, kind))
         self.create_tick(HANDOVER_PERIOD, self._write, clock=STEADY)
@@ -105,13 +105,14 @@ class RecorderNode(BaseNode):
         if self._marks.recorded:
             self.get_logger().info(f"records to {self._recorder.file}")
 
-    def _listen(self, topics: Iterable[Topic], told: set[str]) -> None:
+    def _listen(self, topics: Iterable[Topic], told: set[str], cameras: Collection[str]) -> None:
         for topic in topics:
             qos = LATCHED_QOS if is_latched(topic.name) else RECORDED_QOS if is_reliable(topic) else _STREAM_QOS
             take = partial(self._take, topic, topic.name in told)
             package, _, kind = topic.type.split("/")
             message = getattr(import_module(f"{package}.msg"), kind)
-            self.create_subscription(message, heard_on(topic.name), take, qos, raw=True)
+            name = topic.name if topic.name in cameras else self.name_in_set(heard_on(topic.name))
+            self.create_subscription(message, name, take, qos, raw=True)
 
     def _take(self, topic: Topic, told: bool, payload: bytes, info: Mapping[str, Any]) -> None:
         """Keep a message until :meth:`_write`; ``told``: it is an arm's event, which may be about an episode."""

@@ -40,7 +40,6 @@ class SimulationInput(BaseNode):
     """
 
     ticks = True
-    priority = 37
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("simulation_input", **kwargs)
@@ -130,9 +129,12 @@ class SimulationInput(BaseNode):
         would_engage = not self._starts and self._listeners.engaged(sample.hand) is False
         if would_engage or (not self._moves and sample.hand in (self._not_to_press or ())):
             sample = replace(sample, inputs=replace(sample.inputs, button_lower=False))
-        twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
-        self._hand_publishers.publish_sample(sample, self._frame, HandTwist(twist.linear, twist.angular))
+        self._hand_publishers.publish_sample(sample, self._frame, partial(self._twist, sample))
         self._samples += 1
+
+    def _twist(self, sample: HandSample) -> HandTwist:
+        twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
+        return HandTwist(twist.linear, twist.angular)
 
 
 class HandInput(BaseNode):
@@ -142,7 +144,6 @@ class HandInput(BaseNode):
     """
 
     ticks = True
-    priority = 37
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("hand_input", **kwargs)

@@ -38,8 +38,6 @@ class TcpEndpoint(BaseNode):
     Raises :class:`InputError` when host and port cannot be bound, :class:`ConfigError` for what ``allow`` cannot be.
     """
 
-    priority = 37  # hands are heard as soon as scripted ones are sent; behind all that moves and stops arms
-
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("tcp_endpoint", **kwargs)
         config = self.parameter("config", "", 'YAML of the cell, whose block headset counts; "": none')

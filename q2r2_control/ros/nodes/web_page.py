@@ -57,7 +57,6 @@ from q2r2_control.viewer.web.page import Page
 
 _PERIOD = 1.0 / 30.0  # between frames [s]
 _LOOK_PERIOD = 0.5  # between two looks at which nodes there are [s]
-_CONTROLLER = "/cartesian_controller"
 _STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # ticks of a frame, and far more
 _PICTURE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _PICTURE_PERIOD = 0.2  # between two pictures of a camera [s]
@@ -91,7 +90,8 @@ class WebPage(BaseNode):
         self._events: list[Event] = []
         self._marks = EpisodeMarks()
         self._number, self._shown, self._slowest = -1, -1, 0.0  # newest tick, and the last one of a frame
-        self._states, self._notice = NodeStates(self), ""
+        self._states, self._notice = NodeStates(self, namespace=self.get_namespace()), ""
+        self._controller, self._recorder = self.name_in_set("cartesian_controller"), self.name_in_set(RECORDER)
         self._trigger_clients: dict[str, Any] = {}
         requests = [PageRequest.STOP, PageRequest.RESET, PageRequest.ENGAGE, PageRequest.PAUSE, PageRequest.HOME]
         self._requests = (*requests, *((PageRequest.RECORD, PageRequest.MARK) if recorded else ()))
@@ -99,24 +99,26 @@ class WebPage(BaseNode):
         shown = self._ticks.topics - {hand_pose(hand) for hand in SIDES}
         for topic in ros_topics(tuple(self._robot.arms), {}):
             if topic.name in shown:
-                self._listen(topic, partial(self._take, topic), RECORDED_QOS if topic.type == TEXT else _STREAM_QOS)
+                name, qos = self.name_in_set(heard_on(topic.name)), RECORDED_QOS if topic.type == TEXT else _STREAM_QOS
+                self._listen(name, topic.type, partial(self._take, topic), qos)
         self._obstacles: dict[str, tuple[MovingObstacle, float]] = {}  # newest ones, and when they came [s]
         if config.control.moving_obstacles:
-            self.create_subscription(Marker, OBSTACLES.replace("~", _CONTROLLER), self._on_obstacle, 10)
+            self.create_subscription(Marker, OBSTACLES.replace("~", self._controller), self._on_obstacle, 10)
         self._pictures: dict[str, bytes] = {}  # newest messages, by camera
         for camera in [name for name, its in config.cameras.items() if its.topic and is_compressed(its.topic)]:
-            topic = Topic(0, str(config.cameras[camera].topic), PICTURE)
-            self._listen(topic, partial(self._pictures.__setitem__, camera), _PICTURE_QOS)
+            self._listen(
+                str(config.cameras[camera].topic), PICTURE, partial(self._pictures.__setitem__, camera), _PICTURE_QOS
+            )
         self.create_timer(_PICTURE_PERIOD, self._show_pictures, clock=STEADY)
         self.create_timer(_LOOK_PERIOD, self._look, clock=STEADY)
         self.create_tick(_PERIOD, self._show, clock=STEADY)
         for line in self._page.lines:
             self.get_logger().info(line)
 
-    def _listen(self, topic: Topic, take: Callable[[bytes], None], qos: QoSProfile) -> None:
-        package, _, kind = topic.type.split("/")
+    def _listen(self, name: str, type_name: str, take: Callable[[bytes], None], qos: QoSProfile) -> None:
+        package, _, kind = type_name.split("/")
         message = getattr(import_module(f"{package}.msg"), kind)
-        self.create_subscription(message, heard_on(topic.name), take, qos, raw=True)
+        self.create_subscription(message, name, take, qos, raw=True)
 
     def _show_pictures(self) -> None:
         while self._pictures:
@@ -139,7 +141,7 @@ class WebPage(BaseNode):
         self._states.look()
         names = {name for request in self._requests for name in self._services_of(request)}
         if PageRequest.RECORD in self._requests:
-            names |= {f"{RECORDER}/start", f"{RECORDER}/stop"}
+            names |= {f"{self._recorder}/start", f"{self._recorder}/stop"}
         for name in names - self._trigger_clients.keys():
             self._trigger_clients[name] = self.create_client(Trigger, name)
 
@@ -150,16 +152,16 @@ class WebPage(BaseNode):
             case PageRequest.ENGAGE:
                 return [f"{arm}/engage" for arm in arms]
             case PageRequest.PAUSE:  # the way home too
-                return [f"{_CONTROLLER}/hold", *(f"{arm}/pause" for arm in arms)]
+                return [f"{self._controller}/hold", *(f"{arm}/pause" for arm in arms)]
             case PageRequest.RESET:
-                return [f"{_CONTROLLER}/reset", *(f"{arm}/reset" for arm in arms)]
+                return [f"{self._controller}/reset", *(f"{arm}/reset" for arm in arms)]
             case PageRequest.RECORD:
                 # The node's state comes twice a second, later than what the page shows of an episode.
-                told = self._marks.open if self._marks.any else states.get(RECORDER, {}).get("episode_open")
-                return [f"{RECORDER}/{'stop' if told else 'start'}"]
+                told = self._marks.open if self._marks.any else states.get(self._recorder, {}).get("episode_open")
+                return [f"{self._recorder}/{'stop' if told else 'start'}"]
             case PageRequest.MARK:
-                return [f"{RECORDER}/mark"]
-        return [f"{_CONTROLLER}/{request}"]
+                return [f"{self._recorder}/mark"]
+        return [f"{self._controller}/{request}"]
 
     def _serve(self, request: PageRequest) -> None:
         self._notice = ""
@@ -218,7 +220,7 @@ class WebPage(BaseNode):
         now, arms = float(row["now"]), dict(zip(self._robot.arms, row["arms"], strict=True))
         state = RobotState(row["q"], row["v"], row["tau"], None, now)
         self._start = self._start or RunStart(now, state)
-        controller, _ = self._states.newest.get(_CONTROLLER, ({}, 0.0))
+        controller, _ = self._states.newest.get(self._controller, ({}, 0.0))
         closest, tightest = (controller.get(f"{which}_pair", "|").split("|") for which in ("closest", "tightest"))
         report = StepReport(
             status=STATUSES[int(row["status"])],

@@ -31,7 +31,9 @@ _BAD_STATES = (
 )
 # The cure, by the kind of the fault.
 _CURES = {
-    **dict.fromkeys((ReasonKind.NO_SUBSCRIBER, ReasonKind.SUBSCRIBER_UNKNOWN), _START_CONTROLLER),
+    **dict.fromkeys(
+        (ReasonKind.NO_SUBSCRIBER, ReasonKind.SUBSCRIBER_UNKNOWN, ReasonKind.CONTROLLER_ABSENT), _START_CONTROLLER
+    ),
     ReasonKind.NO_TOOL_POSE: (
         "start the robot or robot_state_publisher, or look whether its transforms have stopped; parameters "
         "end_effector_link_name, world_frame_id"

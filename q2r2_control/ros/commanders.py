@@ -1,0 +1,136 @@
+"""Who else publishes where one node may: hands, targets and commands have one publisher each, for every loop.
+
+A publisher that appears is found in the graph, 0.04 s after the middleware has discovered it. One that was there before
+and said nothing is listened to, and found by its first message.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable
+from functools import partial
+from typing import Any
+
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
+from q2r2_control.ros.monitoring import WatchedPublisher, node_of
+
+_DISCOVERY = 1.0  # what a new node discovers by then was there before it [s]
+_GRAPH_PERIOD = 0.04  # of asking the graph [s]
+_UNKNOWN = "a node not known yet"  # the graph knows an endpoint before it knows its node
+HEARD = 0.3  # a commander that was heard within this time commands [s]
+
+
+def publishers_of(node: BaseNode, topic: str, *, own: bool = True) -> str:
+    """Names of the nodes that publish on ``topic``, for a sentence; ``own``: this node's too."""
+    leave_out = None if own else node.get_fully_qualified_name()
+    names = {node_of(info) or _UNKNOWN for info in node.get_publishers_info_by_topic(topic)}
+    return " and ".join(sorted(names - {leave_out})) or "another node"
+
+
+def takers_of(node: BaseNode, topic: str) -> str:
+    """Names of the nodes that take what this one sends on ``topic``, for a sentence."""
+    found = {node_of(info) or _UNKNOWN for info in node.get_subscriptions_info_by_topic(topic)}
+    return " and ".join(sorted(found - {node.get_fully_qualified_name()}))
+
+
+class OnePublisher:
+    """Whether topics, by their full names, have more than one publisher; may be asked at every tick."""
+
+    def __init__(self, node: BaseNode, topics: Iterable[str]) -> None:
+        self._node, self._topics = node, tuple(topics)
+        self._asked_at = -math.inf  # [s]
+        self._found: Reason | None = None
+
+    def conflict(self) -> Reason | None:
+        """A reason for the first topic that has several."""
+        if (now := time.monotonic()) - self._asked_at >= _GRAPH_PERIOD:
+            self._asked_at, self._found = now, next(filter(None, map(self._look, self._topics)), None)
+        return self._found
+
+    def _look(self, topic: str) -> Reason | None:
+        if (count := self._node.handle.get_count_publishers(topic)) <= 1:
+            return None
+        named = f"{topic} ({publishers_of(self._node, topic)})"
+        return Reason.of(ReasonKind.SEVERAL_PUBLISHERS, count=count, topic=named)
+
+
+class CommandWatch:
+    """Other publishers of the topics on which a node commands arms.
+
+    While the node commands, :meth:`intruder` finds one that appears, and one that was there before and begins to send.
+    While it does not, it may listen: :meth:`commander`. It listens by best effort, so nobody awaits its answers. This
+    node's own commands come back too, and are known by their bytes: rclpy does not say who sent a message.
+    """
+
+    def __init__(self, node: BaseNode, kind: type, publishers: Iterable[WatchedPublisher]) -> None:
+        self._node, self._kind = node, kind
+        self._publishers = {publisher.topic_name: publisher for publisher in publishers}
+        self._heard = dict.fromkeys(self._publishers, -math.inf)  # the last command of another node [s]
+        self._subscriptions: list[Any] = []
+        self._born = time.monotonic()
+        self._asked_at = -math.inf  # the graph [s]
+        self._known: int | None = None  # other publishers since the node commands; None: it does not
+        self._found: Reason | None = None  # of this time of commanding
+
+    def begin(self) -> None:
+        """Listen."""
+        if self._subscriptions:
+            return
+        for topic, publisher in self._publishers.items():
+            on_command = partial(self._on_command, topic)
+            made = self._node.create_subscription(self._kind, topic, on_command, STREAM_QOS, raw=True)
+            self._subscriptions.append(made)
+            publisher.own_listeners = 1
+
+    def end(self) -> None:
+        """Listen no more."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        for publisher in self._publishers.values():
+            publisher.own_listeners = 0
+        self._subscriptions = []
+
+    def commander(self, within: float = HEARD) -> Reason | None:
+        """A reason if commands of another node came within the last seconds, else None."""
+        now = time.monotonic()
+        topics = (topic for topic, heard in self._heard.items() if now - heard <= within)
+        return next(map(self._reason, topics), None)
+
+    def intruder(self) -> Reason | None:
+        """Why this node may not go on commanding, or None; to be asked before each command."""
+        if self._known is not None and time.monotonic() - self._asked_at < _GRAPH_PERIOD:
+            self._found = self._found or self.commander()
+            return self._found
+        self._asked_at = time.monotonic()
+        counts = {topic: self._node.handle.get_count_publishers(topic) - 1 for topic in self._publishers}
+        others = sum(counts.values())
+        if self._known is None:
+            self._known, self._found = others, None
+        if others > self._known and time.monotonic() - self._born > _DISCOVERY:
+            self._found = next(self._reason(topic) for topic, count in counts.items() if count > 0)
+        self._known = others
+        if others:
+            self.begin()
+        else:
+            self.end()
+        self._found = self._found or self.commander()
+        return self._found
+
+    def named(self, reason: Reason) -> Reason:
+        """The same reason with the names of nodes that are known by now."""
+        if reason.kind is not ReasonKind.OTHER_COMMANDER or _UNKNOWN not in reason.detail["nodes"]:
+            return reason
+        return self._reason(reason.detail["topic"])
+
+    def rest(self) -> None:
+        """This node commands no more: when it does again, whoever is there then was there before."""
+        self._known = None
+
+    def _reason(self, topic: str) -> Reason:
+        return Reason.of(ReasonKind.OTHER_COMMANDER, nodes=publishers_of(self._node, topic, own=False), topic=topic)
+
+    def _on_command(self, topic: str, message: bytes) -> None:
+        if not self._publishers[topic].is_own(bytes(message)):
+            self._heard[topic] = time.monotonic()

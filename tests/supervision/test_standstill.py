@@ -1,0 +1,181 @@
+"""A controller that stands still while joint states go on, against arms that only lag, turn round, or are not heard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, Robot
+from q2r2_control.events import ReasonKind
+from q2r2_control.supervision.standstill import (
+    JOINTS,
+    LAGGING_JOINTS,
+    LAGGING_TOOL,
+    StandstillLimits,
+    StandstillWatch,
+)
+from q2r2_control.supervision.supervisor import Supervisor
+from q2r2_control.supervision.target_stream import Origins, StreamSettings
+from q2r2_control.types import Array, RobotState
+from tests.supervision.conftest import STRICT
+
+DT = 0.004
+WITHIN = 0.1  # after the controller has stopped [s]
+FROZEN_AT = 0.6  # [s]
+
+
+def swinging(speed: float, hertz: float) -> Callable[[float], Array]:
+    """Joints that begin at rest and go to and fro; ``speed`` is the greatest one [rad/s]."""
+    turn = 2.0 * np.pi * hertz
+    return lambda t: np.array([0.0, 1.0, -0.4]) * speed / turn * (1.0 - np.cos(turn * max(t, 0.0)))
+
+
+def ramp(speed: float, acceleration: float) -> Callable[[float], Array]:
+    """Joints that accelerate to a speed, and keep it."""
+    rise = speed / acceleration
+
+    def at(t: float) -> Array:
+        t = max(t, 0.0)
+        way = 0.5 * acceleration * t * t if t < rise else speed * (t - 0.5 * rise)
+        return np.array([way, 0.0, 0.3 * way])
+
+    return at
+
+
+def findings(
+    limits: StandstillLimits,
+    asked: Callable[[float], Array],
+    *,
+    seconds: float = 2.0,
+    delay: float = 0.0,
+    lag: float = 0.02,
+    frozen_at: float = np.inf,
+    heard: Callable[[float], bool] = lambda t: True,
+    ticks: Callable[[float], bool] = lambda t: True,
+    state_period: float = DT,
+) -> Iterator[float]:
+    """Times of findings about an arm that follows after ``delay`` and a first-order ``lag`` [s], until it is frozen.
+
+    Its controller keeps the command of when it was frozen. ``heard``: whether a state comes; ``ticks``: whether the
+    loop ticks, without which the arm gets no command either.
+    """
+    watch, measured, stamp, command = StandstillWatch(limits), asked(0.0), 0.0, asked(0.0)
+    seen, next_state = measured, 0.0
+    for t in np.arange(0.0, seconds, DT):
+        measured = measured + (command - measured) * (DT / lag)
+        if t < frozen_at and ticks(t):  # what is sent at a tick moves the arm until the next one
+            command = asked(t - delay)
+        if t >= next_state and heard(t):
+            seen, stamp, next_state = measured, t, next_state + state_period
+        if ticks(t) and watch.look(asked(t), seen, stamp, t) is not None:
+            yield float(t)
+
+
+@pytest.mark.parametrize("speed", [0.4, 1.2, 2.0])
+@pytest.mark.parametrize("motion", [lambda speed: ramp(speed, 8.0), lambda speed: swinging(speed, 0.2)])
+def test_a_driver_that_stops_in_mid_motion_is_found_within_a_tenth_of_a_second(
+    speed: float, motion: Callable[[float], Callable[[float], Array]]
+) -> None:
+    found = next(findings(JOINTS, motion(speed), lag=0.008, frozen_at=FROZEN_AT))
+    assert FROZEN_AT < found < FROZEN_AT + WITHIN + DT
+
+
+def test_a_driver_that_never_began_is_found_before_its_arm_is_far_behind() -> None:
+    asked = ramp(1.2, 8.0)
+    found = next(findings(JOINTS, asked, frozen_at=0.0))
+    assert float(np.abs(asked(found)).max()) < 0.1
+
+
+@pytest.mark.parametrize(("limits", "allowed"), [(LAGGING_JOINTS, 0.3), (LAGGING_TOOL, 0.3)])
+def test_a_controller_that_may_lag_is_found_when_it_has_followed_and_stops(
+    limits: StandstillLimits, allowed: float
+) -> None:
+    found = next(findings(limits, ramp(0.6, 8.0), lag=0.03, frozen_at=FROZEN_AT))
+    assert FROZEN_AT < found <= FROZEN_AT + allowed
+
+
+LAGS = {
+    "drivers": (JOINTS, 0.04, 0.02),
+    "a slow driver": (JOINTS, 0.0, 0.08),
+    "a controller of poses": (LAGGING_JOINTS, 0.1, 0.2),
+    "a late controller of poses": (LAGGING_JOINTS, 0.3, 0.03),
+    "a late tool": (LAGGING_TOOL, 0.3, 0.03),
+}
+
+
+@pytest.mark.parametrize(("limits", "delay", "lag"), LAGS.values(), ids=LAGS)
+@pytest.mark.parametrize("hertz", [0.1, 0.4, 1.0, 2.0])
+@pytest.mark.parametrize("speed", [0.3, 1.5])
+def test_an_arm_that_lags_is_not_taken_for_one_that_stands_where_it_begins_and_turns_round(
+    limits: StandstillLimits, delay: float, lag: float, hertz: float, speed: float
+) -> None:
+    assert list(findings(limits, swinging(speed, hertz), seconds=6.0, delay=delay, lag=lag)) == []
+
+
+def test_nothing_is_judged_where_the_loop_or_the_states_have_a_gap() -> None:
+    """A loop that stood still sent nothing to follow; of an arm that is not heard nothing is known."""
+
+    def gap(t: float) -> bool:
+        return not FROZEN_AT < t < FROZEN_AT + 0.08
+
+    asked = ramp(1.2, 8.0)
+    assert list(findings(JOINTS, asked, ticks=gap, lag=0.008)) == []
+    assert list(findings(JOINTS, asked, heard=gap)) == []
+    found = next(findings(JOINTS, asked, ticks=gap, lag=0.008, frozen_at=1.0))
+    assert 1.0 < found <= 1.0 + WITHIN
+
+
+def test_states_that_come_fifty_times_a_second_are_enough() -> None:
+    asked = ramp(1.2, 8.0)
+    assert list(findings(JOINTS, asked, state_period=0.02)) == []
+    assert next(findings(JOINTS, asked, state_period=0.02, lag=0.008, frozen_at=FROZEN_AT)) <= FROZEN_AT + 0.12
+
+
+class Cell:
+    """A supervisor of arms that another process moves, which is named ``/jtc``."""
+
+    def __init__(self, robot: Robot, controller: CartesianController) -> None:
+        self.tool = controller.tool_pose
+        origins = Origins(takers=lambda arm: f" /{arm}_jtc")
+        self.supervisor = Supervisor(robot, controller, StreamSettings(), STRICT, origins, standstill=JOINTS)
+        self.q, self.now, self.frozen = robot.home.copy(), 0.0, np.zeros(len(robot.home), dtype=bool)
+        self.v = np.zeros_like(self.q)
+
+    def run(self, seconds: float, speed: Array, start: dict[str, pin.SE3] | None = None) -> None:
+        began, zero = self.now, np.zeros_like(self.q)
+        for _ in range(round(seconds / DT)):
+            self.now += DT
+            self.supervisor.update_state(RobotState(self.q, self.v, zero, None, self.now), self.now)
+            for arm, pose in (start or {}).items():
+                shifted = pin.SE3(pose.rotation, pose.translation + (self.now - began) * speed)
+                self.supervisor.update_target(arm, shifted, self.now)
+            reference = self.supervisor.tick(self.now, DT)
+            way = zero if reference is None else reference.q - self.q
+            self.v = np.where(self.frozen, 0.0, way / DT)
+            self.q = self.q + self.v * DT
+
+
+def test_both_arms_are_stopped_when_the_driver_of_one_stands_still(
+    robot: Robot, controller: CartesianController
+) -> None:
+    cell = Cell(robot, controller)
+    up = np.array([0.0, 0.0, 0.25])
+    cell.run(0.2, up)
+    start = {arm: cell.tool(arm) for arm in robot.arms}
+    cell.run(0.02, 0.0 * up, start)
+    cell.run(0.5, up, start)
+    assert [cell.supervisor.arm_state(arm) for arm in robot.arms] == ["following"] * 2
+    cell.frozen[robot.arms["left"].joints] = True
+    start = {arm: cell.tool(arm) for arm in robot.arms}
+    cell.run(WITHIN, up, start)
+    assert [cell.supervisor.arm_state(arm) for arm in robot.arms] == ["braking"] * 2
+    fault = cell.supervisor.fault
+    assert fault is not None
+    assert (fault.kind, fault.detail["arm"], fault.detail["takers"]) == (
+        ReasonKind.CONTROLLER_STANDS,
+        "left",
+        " /left_jtc",
+    )
