@@ -50,29 +50,27 @@ def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -
     Needs :func:`look_back`, and what the other proofs write of the step and the stop.
     """
     history, v, v_next, candidate = data.history, data.state.v, data.candidate.v, data.candidate
-    length = duration * _stride(data, duration) / (data.rollout.q.shape[0] - 1)
+    last = data.rollout.q.shape[0] - 1
+    coarse, fine = duration * _stride(data, duration, False) / last, duration * _stride(data, duration, True) / last
     for j in range(v.shape[0]):
         history.deviation[j] = max(data.rollout.deviation[j], history.off[j])
-        history.speed[j] = abs(v_next[j])
-    for j in range(v.shape[0]):
-        bent = candidate.deceleration[j] if v_next[j] != 0.0 else 0.0
-        bent = 0.125 * length * length * (bent + turning(model.collision, history.speed, j))
-        history.bend[1, j] = max(history.bend[0, j], bent)
-    for j in range(v.shape[0]):
         history.speed[j] = max(abs(v[j]), abs(v_next[j]))
     for j in range(v.shape[0]):
+        turned = turning(model.collision, history.speed, j)
         # The acceleration times h^2 is the change of speed times h, also where h is 0.
-        bent = 0.125 * (abs(v_next[j] - v[j]) * h + h * h * turning(model.collision, history.speed, j))
-        history.bend[1, j] = max(history.bend[1, j], bent)
+        bent = max(history.bend[0, j], 0.125 * (abs(v_next[j] - v[j]) * h + h * h * turned))
+        acceleration = (candidate.deceleration[j] if v_next[j] != 0.0 else 0.0) + turned
+        history.bend[1, j] = max(bent, 0.125 * coarse * coarse * acceleration)
+        history.bend[2, j] = max(bent, 0.125 * fine * fine * acceleration)
 
 
 @inlined_kernel
-def _stride(data: SafetyData, duration: float) -> int:
+def _stride(data: SafetyData, duration: float, finely: bool) -> int:
     """From one instant of a stop of ``duration`` [s] that is looked at to the next, in samples."""
     stride = data.rollout.q.shape[0] - 1
     while stride > 1 and duration * stride / (data.rollout.q.shape[0] - 1) > _STOP_SPACING:
         stride //= 2
-    return stride
+    return max(stride // 4, 1) if finely else stride
 
 
 @inlined_kernel
@@ -93,18 +91,27 @@ def keeps_apart_at_any_time(model: SafetyModel, data: SafetyData, p: int, durati
     measure(model.collision, data.collision, p)
     pairs, bodies = model.collision.pairs, model.collision.bodies
     first, second = pairs.first[p], pairs.second[p]
-    needed = threshold + bodies.radius[first] + bodies.radius[second] + way(model, p, data.history.bend[1])
-    gap = _lowest_on_way(model, data, second, 1.0, duration)
-    return gap + _lowest_on_way(model, data, first, -1.0, duration) >= needed
+    needed = threshold + bodies.radius[first] + bodies.radius[second]
+    gap = _lowest_on_way(model, data, second, 1.0, duration, False)
+    gap += _lowest_on_way(model, data, first, -1.0, duration, False)
+    if gap - needed >= way(model, p, data.history.bend[1]):
+        return True
+    if gap - needed < way(model, p, data.history.bend[2]):
+        return False  # a finer look finds no more room
+    gap = _lowest_on_way(model, data, second, 1.0, duration, True)
+    gap += _lowest_on_way(model, data, first, -1.0, duration, True)
+    return gap - needed >= way(model, p, data.history.bend[2])
 
 
 @kernel
-def _lowest_on_way(model: SafetyModel, data: SafetyData, body: int, side: float, duration: float) -> float:
+def _lowest_on_way(
+    model: SafetyModel, data: SafetyData, body: int, side: float, duration: float, finely: bool
+) -> float:
     """Least of a ``body``'s core along the normal times ``side`` at all instants of its way that are looked at [m]."""
     collision, bodies, history = model.collision, model.collision.bodies, data.history
     normal = data.collision.contact.normal
     lowest = _lowest(bodies, data.collision.posed, body, side, normal)
-    i, stride, last = 0, _stride(data, duration), data.rollout.q.shape[0] - 1
+    i, stride, last = 0, _stride(data, duration, finely), data.rollout.q.shape[0] - 1
     while i <= last:
         sample = sample_of(model, data, i, duration)
         lowest = min(lowest, _lowest(bodies, sample.posed, body, side, normal))

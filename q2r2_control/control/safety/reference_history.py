@@ -13,7 +13,7 @@ from q2r2_control.control.kernel_pointers import KernelPointers, pointers_to
 from q2r2_control.types import Array
 
 LONGEST_WINDOW = 0.1  # that the postures of the past reach back [s]
-_POSTURES = 13
+_POSTURES = 21
 _SPACING = LONGEST_WINDOW / (_POSTURES - 1)  # of these in time, or the length of a longer step [s]
 _LONG_AGO = 1e3  # since when arms at rest count as resting [s]
 
@@ -33,7 +33,9 @@ class ReferenceHistory(NamedTuple):
     travel: Array  # (nv,) the farthest that a joint was in the window from where it is now [rad or m]
     off: Array  # (nv,) the most that it was off v t there, with what turning adds [rad or m]
     speed: Array  # (nv,) its greatest speed there [rad/s]
-    bend: Array  # (2, nv) its share in how far corners are off straight lines: in the window, and on the whole way
+    # Its share in how far corners are off straight lines: in the window; and on the whole way, looked at coarsely or
+    # finely (3, nv).
+    bend: Array
     deviation: Array  # (nv,) the most that it is off v t on the whole way, with what turning adds [rad or m]
 
     @classmethod
@@ -58,7 +60,7 @@ class ReferenceHistory(NamedTuple):
             travel=np.zeros(nv),
             off=np.zeros(nv),
             speed=np.zeros(nv),
-            bend=np.zeros((2, nv)),
+            bend=np.zeros((3, nv)),
             deviation=np.zeros(nv),
         )
 
