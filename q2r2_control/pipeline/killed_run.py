@@ -44,7 +44,7 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
     process.send(config)
     try:
         # A loop that was late lately goes up slower than a stop can be measured from.
-        while _led(moments) < led or min(tool_speed(robot, arm, moments[-1]) for arm in robot.arms) < LEAST_SPEED:
+        while _led(moments) < led or not _goes_up(robot, moments[-1]):
             if not process.alive:
                 raise PlantError(process.fault or "the arms did not follow the hands")
             time.sleep(_LOOKS)
@@ -56,8 +56,14 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
             raise PlantError(f"a run that was killed still holds the cabinets' ports after {_PATIENCE:g} s")
         time.sleep(_LOOKS)
     took = time.monotonic() - killed
-    last, rest = moments[-1], posture()
+    # Arms that wait for each other may have begun to brake just before the end.
+    last, rest = next(moment for moment in reversed(moments) if _goes_up(robot, moment)), posture()
     return [stop_report(robot, arm, "program killed", last, last.q, rest, took) for arm in robot.arms]
+
+
+def _goes_up(robot: Robot, moment: Moment) -> bool:
+    """Whether all tools are fast enough for a stop that can be measured."""
+    return min(tool_speed(robot, arm, moment) for arm in robot.arms) >= LEAST_SPEED
 
 
 def _led(moments: list[Moment]) -> float:
