@@ -105,6 +105,15 @@ def test_hostile_ticks_with_another_solver_break_no_promise(name: str) -> None:
     assert report.counts["unsolved"] < 0.01 * report.ticks
 
 
+def test_hostile_ticks_move_no_tool_faster_than_its_limit() -> None:
+    limited = CONFIG.model_copy(update={"control": SETTINGS.model_copy(update={"tool_speed_limit": 0.25})})
+    report = run_soak(limited, 2000, 9)
+    assert report.passed, report.broken
+    (margin,) = [margin for margin in report.margins if margin.name.startswith("tool speed")]
+    assert margin.checked > 1000
+    assert margin.worst > 0.8, "the limit was never met"
+
+
 class Garbage:
     """Of each kind of answer one, in turns, from no answer at all to numbers that look like one."""
 
