@@ -123,6 +123,7 @@ def test_an_argument_of_xacro_that_is_none_is_refused(arguments: tuple[str, ...]
     assert says in q2r2("new-cell", "cell", *arguments, "--yes").stderr
 
 
+@pytest.mark.slow
 def test_both_arms_of_one_model_are_found_with_their_fingers(tmp_path: Path) -> None:
     made = one_object(
         q2r2("new-cell", "cell", "--robot", "example-robot-data:baxter", "--yes", "--samples", "100", "--json").stdout
@@ -150,6 +151,7 @@ def test_links_of_several_shapes_are_left_out_only_where_all_of_these_overlap(tm
     assert ("left_link_1_0", "left_link_3_0") in pair_names(robot.collision_model)
 
 
+@pytest.mark.slow
 def test_meshes_that_one_capsule_holds_badly_get_several_and_the_tools_follow(tmp_path: Path) -> None:
     model = "example-robot-data:ur5"
     made = one_object(

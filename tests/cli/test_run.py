@@ -90,6 +90,7 @@ def test_a_demo_at_a_terminal_shows_the_arms_where_there_is_a_way_to(
     assert ("q2r2_control[web]" in result.stderr) is (not (display or viser))
 
 
+@pytest.mark.slow
 def test_an_episode_of_the_demo_has_the_pictures_of_which_an_export_makes_videos(tmp_path: Path) -> None:
     needs_opengl()
     pytest.importorskip("av", reason="the extra export is not installed")

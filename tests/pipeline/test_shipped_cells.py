@@ -16,8 +16,14 @@ from tests.control.scenarios import into_the_table, overhead
 from tests.support.driven import Driven
 from tests.support.processes import Watch
 
+FIRST = ("dual_iiwa7", "dual_panda")  # the others are looked at by the slow tests
+FILES = [
+    pytest.param(file, id=file.stem, marks=() if file.stem in FIRST else pytest.mark.slow)
+    for file in sorted(SHIPPED.glob("*.yaml"))
+]
 
-@pytest.mark.parametrize("file", sorted(SHIPPED.glob("*.yaml")), ids=lambda file: file.stem)
+
+@pytest.mark.parametrize("file", FILES)
 def test_its_tools_follow_the_hands_around_a_circle_and_keep_the_contract_where_they_cannot(file: Path) -> None:
     # The lowest rate with one substep a tick, since most of a test's time goes by ticks.
     config = load_config(file).model_copy(update={"loop_rate_hz": 500.0})

@@ -61,6 +61,7 @@ def test_a_session_that_ends_is_told_and_the_motion_may_be_asked_for_again(confi
         assert run.lead_to(goal) is not None
 
 
+@pytest.mark.slow
 def test_cabinets_that_do_not_let_a_client_command_are_named(config: Config) -> None:
     def lock(cabinets: PendantCabinets) -> None:
         cabinets.locked = True

@@ -131,6 +131,7 @@ def test_a_loop_that_is_late_brakes_on_the_stop_that_the_cabinets_get(config: Co
     assert all(summary.arms[arm].engaged_s > 1.5 for arm in SIDES), "and the arms go on"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("latest", "thinks", "bound"), [(0.007, False, 1.3), (0.01, True, 2.0)])
 def test_a_loop_whose_ticks_are_all_late_follows_as_one_in_time(
     config: Config, latest: float, thinks: bool, bound: float
