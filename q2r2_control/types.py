@@ -299,7 +299,7 @@ class ArmTarget:
 
 @dataclass(frozen=True, slots=True)
 class ArmTiming:
-    """What is known of when an arm does what the reference says, all in [s]."""
+    """Timing of an arm against the reference that it follows, all in [s]."""
 
     behind: float | None  # the reference, by the newest message of the arm; None: nobody tells, so that it is measured
     silent: float  # time since that message

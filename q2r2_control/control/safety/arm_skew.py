@@ -45,7 +45,7 @@ _STOP_SPACING = 0.015  # of the instants at which a stop is looked at, at most [
 
 @kernel
 def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -> None:
-    """What is known of all joints on their whole way, with a step of ``h`` and a stop of ``duration`` [s].
+    """Write bounds on all joints along their whole way, with a step of ``h`` and a stop of ``duration`` [s].
 
     Needs :func:`look_back`, and what the other proofs write of the step and the stop.
     """

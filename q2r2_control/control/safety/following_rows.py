@@ -4,8 +4,8 @@ The arm in front may be where it was a window D ago. Along the pair's normal n t
 
     B = d - min_distance - buffer - n'(the front's way in the window) - n'(the way of the stop behind).
 
-As in separation_rows.py a step uses up no more than a share of it, B+ >= (1 - gain h) B. What the one in front does now
-counts after D only. In a step B therefore changes by its way of D ago, and by what the one behind decides now.
+As in separation_rows.py a step uses up no more than a share of it, B+ >= (1 - gain h) B. The motion of the one in front
+now counts after D only. In a step B therefore changes by its way of D ago, and by what the one behind decides now.
 """
 
 from __future__ import annotations
