@@ -164,7 +164,7 @@ class Case:
         clock = StageClock(1.0 / rate if paced else 0.0)
         with nullcontext() if folder is None else Recorder(folder, "bench") as recorder:
             if recorder is not None:
-                recorder.begin(About.of(pipeline, True, {}, ()), pipeline.robot)
+                recorder.begin(About.of(pipeline, False, {}, ()), pipeline.robot)
                 pipeline.listeners.append(recorder)
             with clock.watching(pipeline, stages):
                 summary = pipeline.run((engaged + self._ticks) / rate, realtime=False)

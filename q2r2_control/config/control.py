@@ -179,7 +179,8 @@ class ControllerSettings(StrictModel):
         check_kind("control", values, Mapping, f"new values by name, of {', '.join(LIVE)}")
         for name, value in values.items():
             if name not in LIVE:
-                raise ConfigError(f"control.{shown(name)} = {shown(value)}: while a controller runs: {', '.join(LIVE)}")
+                key = name if isinstance(name, str) and name.isidentifier() else shown(name)
+                raise ConfigError(f"control.{key} = {shown(value)}: while a controller runs: {', '.join(LIVE)}")
         return validated(ControllerSettings, "control.", self.model_dump() | dict(values))
 
     @property
