@@ -3,7 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from q2r2_control.control.geometry.collision import CollisionData, CollisionModel
 from q2r2_control.control.geometry.pair_distance import measure
+from q2r2_control.control.jit import kernel
+from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData
 from q2r2_control.control.safety.separating_plane import stays_beyond
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
@@ -16,13 +19,22 @@ def _moved(q: Array, v: Array, v_next: Array, t: Array) -> Array:
     return np.asarray(q + v * t + (v_next - v) * t**2 / (2.0 * H))
 
 
-def _proven(name: str, p: int, q: Array, v: Array, v_next: Array, threshold: float) -> bool:
-    model, data = kernel_model(name).safety, kernel_data(name, q, v).safety
+def _prepared(name: str, q: Array, v: Array, v_next: Array) -> SafetyData:
+    data = kernel_data(name, q, v).safety
     step = data.rollout.step
     step.rate[:], step.change[:] = v, (v_next - v) / H
     step.travel[:] = np.abs(_moved(q, v, v_next, np.linspace(0.0, H, 50)) - q).max(axis=0)
-    measure(model.collision, data.collision, p)
-    return bool(stays_beyond(model.collision, data.collision, p, step, H, step, 0.0, threshold))
+    return data
+
+
+def _proven(name: str, data: SafetyData, p: int, threshold: float) -> bool:
+    return bool(_stays_beyond(kernel_model(name).safety.collision, data.collision, data.rollout.step, p, threshold))
+
+
+@kernel
+def _stays_beyond(model: CollisionModel, data: CollisionData, step: QuadraticPiece, p: int, threshold: float) -> bool:
+    measure(model, data, p)
+    return stays_beyond(model, data, p, step, H, step, 0.0, threshold)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -34,10 +46,11 @@ def test_what_is_proven_is_true_all_along_the_step_and_little_room_suffices(name
         v = 0.3 * random.uniform(-1.0, 1.0, len(q))
         v_next = v + 0.02 * random.uniform(-1.0, 1.0, len(q))
         along = distances(cell(name), _moved(q, v, v_next, np.linspace(0.0, H, 20)))
+        data = _prepared(name, q, v, v_next)
         for p in np.flatnonzero((along[0] > 1e-3) & (along[0] < 0.3)).tolist():
             least = float(along[:, p].min())
-            assert not _proven(name, p, q, v, v_next, least + 1e-9)
-            proven += _proven(name, p, q, v, v_next, least - 2e-5)
+            assert not _proven(name, data, p, least + 1e-9)
+            proven += _proven(name, data, p, least - 2e-5)
     assert proven > 100
 
 
@@ -56,8 +69,9 @@ def test_a_pair_without_any_room_is_proven_to_part(name: str) -> None:
             away = gradient[:, p] / np.abs(gradient[:, p]).max()
             if np.abs(_difference(name, q, away, p) - gradient[:, p] @ away) > 1e-3:
                 continue  # the closest points jump here: there is no gradient
-            parted += _proven(name, p, q, np.zeros(len(q)), 0.02 * away, float(here[p]) - 1e-9)
-            assert not _proven(name, p, q, np.zeros(len(q)), -0.02 * away, float(here[p]) - 1e-9)
+            apart, closer = (_prepared(name, q, np.zeros(len(q)), sign * 0.02 * away) for sign in (1.0, -1.0))
+            parted += _proven(name, apart, p, float(here[p]) - 1e-9)
+            assert not _proven(name, closer, p, float(here[p]) - 1e-9)
     assert parted > 40
 
 

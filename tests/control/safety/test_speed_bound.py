@@ -4,8 +4,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.speed_bound import fastest_approach, least_distance, write_deviations
+from q2r2_control.control.geometry.kinematics import IntArray
+from q2r2_control.control.jit import kernel
+from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
+from q2r2_control.control.safety.speed_bound import BodyVelocities, fastest_approach, least_distance, write_deviations
 from q2r2_control.control.safety.stop_certificate import write_step
 from q2r2_control.control.safety.stop_rollout import OWN, SHAPES, TOGETHER, begin_rollout
 from q2r2_control.types import Array
@@ -28,7 +30,16 @@ def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
 def bounds_of(name: str, motion: Motion) -> Array:
     """The least distance of each pair (p,) by its speed [m]."""
     data, time = prepared(name, motion)
-    return np.array([least_distance(kernel_model(name).safety, data, p, time) for p in range(len(data.distance))])
+    bounds = np.zeros_like(data.distance)
+    _least_distances(kernel_model(name).safety, data, time, bounds)
+    return bounds
+
+
+@kernel
+def _least_distances(model: SafetyModel, data: SafetyData, time: float, out: Array) -> None:
+    """All pairs in one call, since a call from Python hands over all arrays of the model anew."""
+    for p in range(out.shape[0]):
+        out[p] = least_distance(model, data, p, time)
 
 
 def least_along(name: str, motion: Motion) -> Array:
@@ -132,8 +143,15 @@ STEP = 1e-6  # of finite differences [s]
 def bounds_at(name: str, q: Array, v: Array) -> Array:
     """Fastest approach (p,) of every pair [m/s]."""
     model, data = kernel_model(name).safety.collision, kernel_data(name, q, v).safety
-    pairs = zip(model.pairs.first, model.pairs.second, strict=True)
-    return np.array([fastest_approach(data.velocities, first, second) for first, second in pairs])
+    bounds = np.zeros(len(model.pairs.first))
+    _fastest_approaches(data.velocities, model.pairs.first, model.pairs.second, bounds)
+    return bounds
+
+
+@kernel
+def _fastest_approaches(velocities: BodyVelocities, first: IntArray, second: IntArray, out: Array) -> None:
+    for p in range(out.shape[0]):
+        out[p] = fastest_approach(velocities, first[p], second[p])
 
 
 @pytest.mark.parametrize("name", NAMES)
