@@ -92,10 +92,10 @@ class FrameTree:
         for name, placement in self.upwards(frame):
             if name in up:
                 pose, received = up[name].pose.inverse() * placement.pose, min(up[name].received, placement.received)
-                self._found[frame, within] = Placement(pose, received)
+                place = self._found[frame, within] = Placement(pose, received)
                 self._used.update(up, (name for name, _ in self.upwards(frame)))
                 self._all = False
-                return self._found[frame, within]
+                return place  # a transform that comes meanwhile makes what was found forgotten
         self._all = True
         return None
 
