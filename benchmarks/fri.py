@@ -74,7 +74,7 @@ def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) 
 
 
 def undisturbed(answers: list[tuple[float, float]], stills: list[tuple[float, float]]) -> list[float]:
-    """How long those answers took during which no processor stood still [s]; both from when to when [s]."""
+    """Durations [s] of the answers during which no processor stood still; both lists have begin and end [s]."""
     return [end - begin for begin, end in answers if not any(start < end and stop > begin for start, stop in stills)]
 
 

@@ -113,7 +113,7 @@ class WaitingPlant(Protocol):
     """The attributes of a plant that waits in a reset for a person, besides those of :class:`Plant`, for ``--wait``."""
 
     longest_wait: float  # for the robot to be there, without which a reset raises :class:`PlantError` [s]
-    longest_session_wait: float  # for all sessions from the same moment; without them a run begins all the same [s]
+    longest_session_wait: float  # for all sessions, from the same moment; a run then begins without them [s]
 
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:

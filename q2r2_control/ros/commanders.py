@@ -72,7 +72,7 @@ class CommandWatch:
         self._born = time.monotonic()
         self._asked_at = -math.inf  # the graph [s]
         self._known: int | None = None  # other publishers since the node commands; None: it does not
-        self._found: Reason | None = None  # of this time of commanding
+        self._found: Reason | None = None  # another commander, found since this node began to command
 
     def begin(self) -> None:
         """Listen."""

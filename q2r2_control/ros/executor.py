@@ -123,7 +123,7 @@ class TickExecutor(SingleThreadedExecutor):
 
 
 class _RestOfNodes:
-    """The work that rclpy does for some nodes: all that is in no :class:`TickGroup`."""
+    """The callbacks of some nodes that belong to no :class:`TickGroup`; rclpy executes them."""
 
     def __init__(self, nodes: list[Any]) -> None:
         groups = [node.tick_group for node in nodes]

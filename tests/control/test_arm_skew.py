@@ -14,11 +14,12 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, Reference
 from tests.control.hunted_arms import controller_and_solver
 
-DT, WINDOW = 0.002, 0.03  # [s]
+DT = 0.002  # of a control tick [s]
+WINDOW = 0.03  # by how much time one arm may be behind the other [s]
 
 
 class Ways:
-    """Where the reference was lately, and what pairs of two arms keep on the ways of both."""
+    """Recent postures of the reference, and what pairs of two arms keep on the ways of both."""
 
     def __init__(self, controller: CartesianController) -> None:
         self.controller, self.robot = controller, controller.robot

@@ -68,7 +68,7 @@ def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_is_not(
     left, right = world.engage_both()
 
     def go(seconds: float, skew: float) -> float:
-        """Both up by 50 mm; returns how fast the fastest joint is in the end [rad/s]."""
+        """Lead both tools to 50 mm above their start; returns the speed of the fastest joint at the end [rad/s]."""
         for _ in range(round(seconds / DT)):
             world.supervisor.skew.observe(timings(left=skew), world.now)
             world.run(DT, raised(left, 0.05), right=raised(right, 0.05))

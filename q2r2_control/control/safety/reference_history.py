@@ -1,4 +1,4 @@
-"""Where the reference was lately, for the proof that arms may be there still (arm_skew.py), compiled."""
+"""Recent postures of the reference, where real arms may still be: arm_skew.py needs them. Compiled."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LONG_AGO = 1e3  # since when arms at rest count as resting [s]
 
 
 class ReferenceHistory(NamedTuple):
-    """Where the reference was lately; postures of the past are sorted from the newest to the oldest."""
+    """Recent postures of the reference, sorted from the newest to the oldest."""
 
     window: Array  # (2,) in force, and asked for; 0: all arms are one body [s]
     q: Array  # (m, nv) [rad]

@@ -60,7 +60,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     apart = history.window[0] > 0.0
     if apart:
         write_way(model, data, h, duration)
-    farthest = 0.0  # that any joint travels in the step and the stop, or did in the window [rad or m]
+    farthest = 0.0  # longest travel of a joint in the step and the stop, or in the window before [rad or m]
     for j in range(data.rollout.step.travel.shape[0]):
         farthest = max(farthest, data.rollout.step.travel[j] + data.rollout.stop.travel[j], history.travel[j])
     for p in range(data.distance.shape[0]):
@@ -96,7 +96,7 @@ def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duratio
     ):
         return False  # or the digits below would add up, tick by tick, to more than rounding
     threshold = min(model.min_distance[p], data.distance[p] - _LAST_DIGITS)
-    if alone:  # which at the same time is a part of
+    if alone:  # this proof includes the case in which both arms move at the same time
         return keeps_apart_at_any_time(model, data, p, duration, threshold)
     if stays_beyond(model.collision, data.collision, p, data.rollout.step, h, data.rollout.stop, duration, threshold):
         return True

@@ -92,9 +92,10 @@ def keeps_tool_speed(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
     Needs the placements at the reference, where tools are not too fast, or the stop at hand is executed.
     """
-    limits, slow = model.tools, True
+    limits = model.tools
     if limits.speed == np.inf:
-        return slow
+        return True
+    slow = True
     for i in range(limits.joint.shape[0]):
         if fastest_tool(model, data, i, h) > limits.speed:
             data.tools.held[i] = 1

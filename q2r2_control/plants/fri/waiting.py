@@ -1,4 +1,4 @@
-"""A wait for cabinets at which a person still has to do something, with lines that say what and for how long."""
+"""Wait for cabinets that a person has to start; log what there is to do, and how long the wait has lasted."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ _KEPT = 16  # layouts that are remembered of each kind
 
 
 class Template:
-    """A message of which the stamps and the floating-point numbers change, and all else stays."""
+    """A serialized message in which only the time stamps and the floating-point numbers are written anew."""
 
     def __init__(self, make: Callable[[Iterator[float], Any], Any], stamp: Any) -> None:
         """``make`` gets numbers, each once, and a stamp; it puts the numbers where others will be written, in order."""
@@ -42,7 +42,7 @@ class Template:
 
         stamp.sec, stamp.nanosec = _SECOND, _NANOSECOND
         self._data = bytearray(serialize_message(make(numbers(), stamp)))
-        # Little endian, as every platform of ROS 2 Jazzy is.
+        # Numbers are searched for as little-endian bytes: every platform of ROS 2 Jazzy is little endian.
         self._stamps = _found(self._data, _STAMP.pack(_SECOND, _NANOSECOND))
         places = [_found(self._data, struct.pack("<d", mark)) for mark in marks]
         if any(len(found) != 1 for found in places):

@@ -43,7 +43,7 @@ class Outcome:
 
 
 def side_by_side(config: Config, robot: Robot, apart: float) -> Array:
-    """A posture (nv,) [rad] in which both tools point down, as far ``apart`` [m] sidewards."""
+    """A posture (nv,) [rad] in which both tools point down, at a distance ``apart`` [m] along the world's y."""
     controller = CartesianController(robot, config.control.timed(False))
     targets = {}
     for arm, y in zip(SIDES, (0.5 * apart, -0.5 * apart), strict=True):
@@ -158,7 +158,7 @@ def _moves_both(robot: Robot, pair: int) -> bool:
 
 
 def _swing(t: float, frequency: float) -> tuple[Array, Array]:
-    """Sidewards, to and fro; it gathers speed in its first second."""
+    """Offset of both tools at ``t`` [s]: a swing along the world's y whose amplitude grows in its first second."""
     phase = 2.0 * math.pi * frequency * max(t - START, 0.0)
     share = min(max(t - START, 0.0), 1.0)
     return np.array([0.0, share * _AMPLITUDE * math.sin(phase), 0.0]), np.zeros(3)
