@@ -101,7 +101,7 @@ def test_a_cell_that_shows_all_it_has_to_is_signed_off_and_may_run(
     assert f"q2r2 commission {cell}" in before.stderr
     assert "--i-know" in before.stderr
     code, lines, out = commission(cell, TO_THE_END, "--json")
-    assert code == 0, lines[-1]
+    assert code == 0, "\n".join(lines)
     kept = json.loads((cell.parent / "my_cell.commissioned.json").read_text(encoding="utf-8"))
     assert kept == json.loads(out)
     assert (kept["operator"], kept["fingerprint"], kept["repeats"]) == ("Ada", fingerprint(load_config(cell)), 0)
@@ -126,9 +126,10 @@ def test_a_commissioning_goes_through_all_steps_by_sockets_and_processes(tmp_pat
     (cell := tmp_path / "my_cell.yaml").write_text(text, encoding="utf-8")
     config = load_config(cell)
     answers = ["", "confirm", "", "confirm", "keep", "", "", "Ada"]
-    with waiting_cabinets(Robot.from_config(config), config):
+    # On a busy machine, threads are late by milliseconds. Cabinets that ask more often than that fall ever further behind.
+    with waiting_cabinets(Robot.from_config(config), config, period=0.02):
         code, lines, out = commission(cell, answers, "--json")
-    assert code == 0, lines[-1]
+    assert code == 0, "\n".join(lines)
     steps = json.loads(out)["steps"]
     assert all(its["quality"] == "excellent" for its in steps["cabinets"])
     assert [len(steps[name]) for name in ("motion", "stop", "kill")] == [14, 2, 2]

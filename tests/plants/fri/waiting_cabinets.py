@@ -15,17 +15,18 @@ from q2r2_control.plants.fri.wire import CommandKind, write_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES
 
-_PERIOD = 0.005  # [s]
 _LOOKS = 0.02  # between two messages to a client that is not there, and two looks at the end [s]
 _GONE = 1.0  # without an answer: the client has ended before it read the message [s]
 
 
 @contextmanager
-def waiting_cabinets(robot: Robot, config: Config, version: int = 2) -> Iterator[dict[str, Cabinet]]:
-    """One for each arm, in a thread; each starts its overlay whenever it may."""
+def waiting_cabinets(
+    robot: Robot, config: Config, version: int = 2, period: float = 0.005
+) -> Iterator[dict[str, Cabinet]]:
+    """One for each arm, in a thread; each sends every ``period`` [s], and starts its overlay whenever it may."""
     made, done = {}, threading.Event()
     for arm in SIDES:
-        settings = settings_of(robot, arm, CommandKind.POSITION, version, _PERIOD)
+        settings = settings_of(robot, arm, CommandKind.POSITION, version, period)
         made[arm] = Cabinet(settings, StillArm(tuple(robot.home[robot.arms[arm].joints])))
 
     def answer_to(opened: socket.socket) -> bytes | None:
@@ -47,7 +48,7 @@ def waiting_cabinets(robot: Robot, config: Config, version: int = 2) -> Iterator
             opened.connect(("127.0.0.1", port))
             opened.settimeout(_LOOKS)
             while not done.wait(max(due - time.monotonic(), 0.0)):
-                due += _PERIOD
+                due += period
                 cabinet.start_overlay()
                 with suppress(OSError):  # of the message before, which nobody listened to
                     opened.send(write_monitoring(cabinet.send(0.0)))
