@@ -12,9 +12,11 @@ from q2r2_control.config.cell import Config
 from q2r2_control.plants.fri.cabinet import Cabinet, StillArm
 from q2r2_control.plants.fri.cabinet_server import settings_of
 from q2r2_control.plants.fri.wire import CommandKind, write_monitoring
+from q2r2_control.process.scheduling import schedule_thread_first
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES
 
+_PRIORITY = 41  # above the loop's: a real cabinet does not wait for the computer
 _LOOKS = 0.02  # between two messages to a client that is not there, and two looks at the end [s]
 _GONE = 1.0  # without an answer: the client has ended before it read the message [s]
 
@@ -42,6 +44,7 @@ def waiting_cabinets(
         return None
 
     def serve(cabinet: Cabinet, address: str, port: int) -> None:
+        schedule_thread_first(_PRIORITY)  # where that is permitted
         due = time.monotonic()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
             opened.bind((address, 0))
