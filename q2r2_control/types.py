@@ -11,7 +11,7 @@ from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,16 @@ ALL_OF_THE_WAY: Interval = (0.0, 1.0)  # of a gripper's opening, 0 closed .. 1 f
 
 LONGEST_DT = 0.1  # [s] of a tick; after a longer gap nothing moves further than in this time
 _IDENTITY = pin.SE3.Identity()
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether ``value`` is a real number that is finite as a float; a truth value is none."""
+    if not isinstance(value, float | int | np.floating | np.integer) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer that no float can hold
+        return False
 
 
 def pose_of(rotation: Array, translation: Array) -> pin.SE3:

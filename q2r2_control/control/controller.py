@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,12 +29,11 @@ from q2r2_control.control.tasks.external import Task, load_tasks
 from q2r2_control.control.watched_pairs import WatchedPairs
 from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import LONGEST_DT, Array, Reference, StepReport, pose_of
+from q2r2_control.types import LONGEST_DT, Array, Reference, StepReport, is_number, pose_of
 
 if TYPE_CHECKING:
     import qpsolvers
 
-_NUMBER = (float, int, np.floating)
 _TARGETS = "a pin.SE3 or None by arm, such as {'left': pose}"
 
 
@@ -394,10 +392,6 @@ def check_settings(robot: Robot, settings: ControllerSettings) -> None:
     load_tasks(robot, settings.tasks)
 
 
-def _passes(dt: float) -> bool:
+def _passes(dt: object) -> bool:
     """Whether ``dt`` [s] is a time in which something may move."""
-    if not isinstance(dt, _NUMBER) or isinstance(dt, bool):
-        return False
-    with suppress(OverflowError):  # an integer that no float can hold
-        return math.isfinite(dt) and dt > 0.0
-    return False
+    return is_number(dt) and dt > 0.0

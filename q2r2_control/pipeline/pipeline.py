@@ -38,7 +38,7 @@ from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import LONGEST_DT, ArmTarget, Array, CommandMode, RobotState
+from q2r2_control.types import LONGEST_DT, ArmTarget, Array, CommandMode, RobotState, is_number
 from q2r2_control.wording import sentence
 
 STOPPING = "stopping"  # state of every arm while the run ends
@@ -156,8 +156,7 @@ class Pipeline(RequestedRun):
         Raises:
             ConfigError: The duration is not positive, or the plant cannot go by the time that is asked for.
         """
-        number = isinstance(duration, float | int | np.number)
-        if duration is not None and not (number and math.isfinite(duration) and duration > 0.0):
+        if duration is not None and not (is_number(duration) and duration > 0.0):
             raise ConfigError(f"duration = {shown(duration)}: allowed: a positive number of seconds")
         if isinstance(self.plant, SessionPlant) and self.plant.realtime_only and not realtime:
             raise ConfigError("simulated time: allowed with a plant that is simulated only")
@@ -192,7 +191,8 @@ class Pipeline(RequestedRun):
         Raises :class:`PlantError` where supervision has stopped the arms. Raises :class:`ConfigError` for no time, and
         before a run.
         """
-        check_kind("end", end, (float, int, np.number), "a time [s]")
+        if not is_number(end):
+            raise ConfigError(f"end = {shown(end)}: allowed: a time [s]")
         if not hasattr(self, "_clock"):
             raise ConfigError("Pipeline.tick_until: call begin() first")
         while self._clock.now <= end - self._clock.period + _ROUNDING:

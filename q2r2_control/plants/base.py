@@ -14,7 +14,7 @@ from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
+from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState, is_number
 
 # Longest time of one call [s]: a loop that fell further behind must not catch up in one leap.
 MAX_ADVANCE = 1.0
@@ -181,8 +181,8 @@ def check_state(state: RobotState, robot: Robot) -> RobotState:
 
 def check_duration(dt: float) -> None:
     """Raise :class:`PlantError` unless ``dt`` is a time that a plant may be advanced by."""
-    if not (isinstance(dt, float | int | np.number) and math.isfinite(dt) and 0 <= dt <= MAX_ADVANCE):
-        raise PlantError(f"advance by dt = {dt!r:.40} s: allowed: 0 .. {MAX_ADVANCE:g} s")
+    if not (is_number(dt) and 0 <= dt <= MAX_ADVANCE):
+        raise PlantError(f"advance by dt = {shown(dt, 40)} s: allowed: 0 .. {MAX_ADVANCE:g} s")
 
 
 class GripperMotion:

@@ -17,7 +17,7 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances
-from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport
+from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, is_number
 from q2r2_control.verification.promises import PROMISES, RELATIVE, Margin, MeasuredDistances
 from q2r2_control.verification.tool_speeds import MeasuredToolSpeeds
 
@@ -30,9 +30,7 @@ _NEAR, _NEAR_SHARE = 1e-3, 10.0  # with less margin [m] so many times as many ti
 
 def time_of(dt: Any) -> float:
     """Seconds that a tick of ``dt`` moves the reference by: 0 for what is no time, 0.1 s at most."""
-    if not (isinstance(dt, int | float | np.floating) and math.isfinite(dt) and dt > 0.0):
-        return 0.0
-    return min(float(dt), LONGEST_DT)
+    return min(float(dt), LONGEST_DT) if is_number(dt) and dt > 0.0 else 0.0
 
 
 class Contract:
