@@ -61,13 +61,14 @@ def url_of(process: RosProcess) -> str:
 def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
     node: Any, processes: Processes, tmp_path: Path
 ) -> None:
-    cell = changed_cell(tmp_path, cameras=CAMERA, control={"moving_obstacles": ["hand"]})
+    cell = changed_cell(tmp_path, cameras=CAMERA, control={"moving_obstacles": ["hand"], "tool_speed_limit": 0.25})
     up = processes.start(sys.executable, "-u", "-c", SET, cell, str(tmp_path), json.dumps(CHANGES), name="up")
     with PageClient(url_of(up)) as page:
         page.wait_until(lambda: page.row("state") == ["engaged", "engaged"])
         before = page.row("tool [m]")
         page.wait_until(lambda: page.row("tool [m]") != before)
         page.wait_until(lambda: "certified" in page.words and "mm" in page.row("off its target")[0])
+        page.wait_until(lambda: page.row("tool speed [m/s]")[0].endswith(" of 0.25"))
         camera = node.create_publisher(CompressedImage, "/front/compressed", STREAM_QOS)
         picture = CompressedImage(data=b"a JPEG")
         page.wait_until(lambda: camera.publish(picture) or b"a JPEG" in page.pictures)

@@ -11,9 +11,11 @@ from html import escape
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import viser
 
 from q2r2_control.events import Event, ReasonKind
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.live import next_press, why
 from q2r2_control.viewer.state_colours import AMBER, GREEN, RED, state_colour
@@ -71,6 +73,7 @@ class Panel:
         self._rates, self._times = deque[float](maxlen=_HISTORY), deque[float](maxlen=_HISTORY)  # [Hz], [us]
         self._moved: dict[PageSetting, float] = {}  # sliders
         self._shown = time.monotonic()
+        self._drawn_last: tuple[float, Mapping[str, pin.SE3]] = 0.0, {}  # time [s] and tools
         gui = server.gui
         gui.set_panel_label(setup.title)
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(60, 120, 216))
@@ -195,12 +198,14 @@ class Panel:
             ("next press", [escape(next_press(tick, arm, self._bindings)) for arm in arms]),
             ("off its target", [_distance(tick.tracking_error(arm)[0]) for arm in arms]),
             ("hand's age", [_milliseconds(frame.ages.get(arm)) for arm in arms]),
+            ("tool speed [m/s]", [self._tool_speed(tick, arm) for arm in arms]),
             ("tool [m]", ["{:.3f} {:.3f} {:.3f}".format(*tick.tools[arm].translation) for arm in arms]),
             ("gripper", [_share(tick.grippers.get(arm)) for arm in arms]),
             ("joints", [self._bars(frame, arm) for arm in arms]),
         ]
         if tick.sessions:
             rows.insert(1, ("cabinet", [escape(tick.sessions[arm]) for arm in arms]))
+        self._drawn_last = tick.t, tick.tools
         report = tick.reference.report
         certified = _coloured("certified", GREEN) if report.certified else _coloured("not certified", RED)
         lines = [
@@ -228,6 +233,14 @@ class Panel:
 
     def _why(self, frame: Frame, arm: str, binding: list[ActiveLimit]) -> str:
         return frame.why.get(arm) or why(frame.tick, arm, self._names[arm], binding, self._last.get(arm))
+
+    def _tool_speed(self, tick: Tick, arm: str) -> str:
+        """The mean speed of an arm's measured tool since the table was drawn before, beside the cell's limit."""
+        (t, tools), limit = self._drawn_last, self._setup.config.control.tool_speed_limit
+        if arm not in tools or tick.t <= t:
+            return ""
+        speed = float(np.linalg.norm(tick.tools[arm].translation - tools[arm].translation)) / (tick.t - t)
+        return f"{speed:.2f}" if limit is None else f"{speed:.2f} of {limit:g}"
 
     def _bars(self, frame: Frame, arm: str) -> str:
         joints, setup = self._setup.joints[arm], self._setup
