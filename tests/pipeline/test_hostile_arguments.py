@@ -1,4 +1,4 @@
-"""Whatever a program asks of a run with hostile values is refused by ConfigError, or changes no promise of a tick."""
+"""A run refuses hostile values of a program by ConfigError, or keeps every promise of its ticks all the same."""
 
 from __future__ import annotations
 
