@@ -64,7 +64,7 @@ class _Progress(Listener):
             self._tell()
 
     def _tell(self) -> None:
-        left = sum(not kernel.overloads for kernel in _kernels)
+        left = sum(not (kernel.overloads or kernel.parts) for kernel in _kernels)
         self._progress(self._done, self._done + left)
 
 

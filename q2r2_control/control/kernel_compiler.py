@@ -92,6 +92,7 @@ class Kernel(CPUDispatcher):
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=_WholeCompiler)
+        self.parts: dict[tuple[Any, ...], Any] = {}  # what other kernels link, by the types of the arguments
         self._wanted_as_part = False
         part_options = options | {"no_cpython_wrapper": True}
         numba_compiler = type(self._compiler)
@@ -103,25 +104,35 @@ class Kernel(CPUDispatcher):
             self._wanted_as_part = Kernel._being_compiled > 0
             return super().get_call_template(args, kws)
 
+    @property
+    def nopython_signatures(self) -> list[Any]:
+        """The types that this kernel has been compiled for, as a whole or as a part."""
+        return [compiled.signature for compiled in (self.overloads | self.parts).values()]
+
+    def get_overload(self, sig: Any) -> Any:
+        """The part for ``sig`` while a kernel that calls it is compiled, else the whole."""
+        with global_compiler_lock:
+            part = self.parts.get(normalize_signature(sig)[0]) if Kernel._being_compiled else None
+            return super().get_overload(sig) if part is None else part.entry_point
+
     def compile(self, sig: Any) -> Any:
         """Compile for one signature, as a whole unless a kernel's compilation asks for a part."""
         with global_compiler_lock:
             as_part, self._wanted_as_part = self._wanted_as_part, False
             arguments, result = normalize_signature(sig)
-            known = self.overloads.get(tuple(arguments))
             if as_part:
-                return (known or self._compile_part(arguments, result)).entry_point
-            if known is not None and isinstance(known.library, _PartLibrary):
-                del self.overloads[tuple(arguments)]  # Python calls it, too: now it is needed as a whole
+                return self._part(arguments, result).entry_point
             Kernel._being_compiled += 1
             try:
                 return super().compile(sig)
             finally:
                 Kernel._being_compiled -= 1
 
-    def _compile_part(self, arguments: Any, result: Any) -> Any:
-        details = {"dispatcher": self, "args": arguments, "return_type": result}
-        with trigger_event("numba:compile", data=details):
-            part = self._part_compiler.compile(arguments, result)
-            self.overloads[tuple(arguments)] = part
-        return part
+    def _part(self, arguments: Any, result: Any) -> Any:
+        """A part is compiled also where Python calls the kernel: what is left of an optimised whole may lack pieces."""
+        known = self.parts.get(tuple(arguments))
+        if known is None:
+            details = {"dispatcher": self, "args": arguments, "return_type": result}
+            with trigger_event("numba:compile", data=details):
+                known = self.parts[tuple(arguments)] = self._part_compiler.compile(arguments, result)
+        return known

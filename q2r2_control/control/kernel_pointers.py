@@ -51,13 +51,13 @@ for _kind in (_Pointer, _Pointers):
 class KernelPointer:
     """A named tuple of arrays behind one pointer: made by :func:`pointer_to`, read in a kernel by :func:`pointee`."""
 
-    __slots__ = ("address", "kind", "memory", "value")
+    __slots__ = ("address", "memory", "numba_type", "value")
 
-    def __init__(self, value: Any, memory: npt.NDArray[np.int64], kind: _Pointer) -> None:
+    def __init__(self, value: Any, memory: npt.NDArray[np.int64], numba_type: _Pointer) -> None:
         self.value = value  # whose arrays have to stay
         self.memory = memory
         self.address = memory.ctypes.data
-        self.kind = kind
+        self.numba_type = numba_type
 
     def __reduce__(self) -> Any:
         return pointer_to, (self.value,)  # a copy has an address of its own
@@ -66,13 +66,13 @@ class KernelPointer:
 class KernelPointers:
     """Named tuples of one type behind one pointer: made by :func:`pointers_to`, read by :func:`pointee_at`."""
 
-    __slots__ = ("address", "kind", "memory", "pointers")
+    __slots__ = ("address", "memory", "numba_type", "pointers")
 
     def __init__(self, pointers: list[KernelPointer]) -> None:
         self.pointers = pointers
         self.memory = np.array([pointer.address for pointer in pointers], dtype=np.intp)
         self.address = self.memory.ctypes.data
-        self.kind = _Pointers(pointers[0].kind.pointee)
+        self.numba_type = _Pointers(pointers[0].numba_type.pointee)
 
     def __reduce__(self) -> Any:
         return pointers_to, ([pointer.value for pointer in self.pointers],)  # a copy has addresses of its own
@@ -81,7 +81,7 @@ class KernelPointers:
 @extending.typeof_impl.register(KernelPointer)
 @extending.typeof_impl.register(KernelPointers)
 def _kind_of(pointer: KernelPointer | KernelPointers, context: Any) -> _Pointer | _Pointers:
-    return pointer.kind
+    return pointer.numba_type
 
 
 @extending.unbox(_Pointer)
@@ -182,7 +182,7 @@ def _form(value: Any) -> Any:
         return type(value), *[_form(part) for part in value]
     if isinstance(value, np.ndarray):
         return value.dtype, value.ndim, value.flags.num
-    return value.kind if isinstance(value, KernelPointer | KernelPointers) else type(value)
+    return value.numba_type if isinstance(value, KernelPointer | KernelPointers) else type(value)
 
 
 _kinds: dict[Any, _Pointer] = {}  # by the form of the value, since a controller has hundreds of pointers

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -17,14 +17,34 @@ from q2r2_control.control.geometry.collision import (
     collision_model_of,
     update_placements,
 )
+from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.kernel_model import KernelData, KernelModel, kernel_model_of
+from q2r2_control.control.kernel_pointers import KernelPointer, pointer_to
 from q2r2_control.control.safety.speed_bound import update_body_velocities
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
+_Tuple = TypeVar("_Tuple")
 NAMES = ("dual_iiwa7", "dual_panda")
+
+
+class _Behind(KernelPointer):
+    """A pointer whose named tuple Python can read, too."""
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self.value, name)
+        if isinstance(found, tuple):
+            found = behind(found)
+            setattr(self, name, found)
+        return found
+
+
+def behind(value: _Tuple) -> _Tuple:
+    """A named tuple that kernels get by its address, as in the product. By value, they would compile for a minute."""
+    pointer = pointer_to(value)
+    return cast("_Tuple", _Behind(pointer.value, pointer.memory, pointer.numba_type))
 
 
 class CellArrays(NamedTuple):
@@ -50,24 +70,29 @@ def cell(name: str) -> CellArrays:
 
 
 def arrays_of(robot: Robot) -> CellArrays:
-    return CellArrays(robot, collision_model_of(robot))
+    return CellArrays(robot, behind(collision_model_of(robot)))
 
 
 @cache
 def kernel_model(name: str) -> KernelModel:
     """The data of the controller's kernels about one of ``NAMES``, with the default settings."""
-    return kernel_model_of(cell(name).robot, ControllerSettings())
+    return behind(kernel_model_of(cell(name).robot, ControllerSettings()))
 
 
 def kernel_data(name: str, q: Array, v: Array | None = None) -> KernelData:
     """The controller's data with bodies and joints at ``q`` (nv,) and as fast as ``v``, nothing else computed."""
-    data = KernelData.empty(kernel_model(name))
-    data.safety.state.q[:] = q
-    data.safety.state.v[:] = 0.0 if v is None else v
-    model, state = kernel_model(name).safety.collision, data.safety.state
-    update_placements(model, data.safety.collision, state.q)
-    update_body_velocities(model, data.safety.collision, state.v, data.safety.velocities)
+    data = behind(KernelData.empty(kernel_model(name)))
+    move_data(name, data, q, v)
     return data
+
+
+def move_data(name: str, data: KernelData, q: Array, v: Array | None = None) -> None:
+    """Bring bodies and joints of ``data`` to ``q`` (nv,), as fast as ``v``. New data would take 20 ms to make."""
+    model, safety = kernel_model(name).safety, data.safety
+    safety.state.q[:] = q
+    safety.state.v[:] = 0.0 if v is None else v
+    update_placements(model.collision, safety.collision, safety.state.q)
+    update_body_velocities(model.collision, safety.collision, safety.state.v, safety.velocities)
 
 
 def pandas() -> Config:
@@ -91,26 +116,29 @@ def random_posture(robot: Robot, random: np.random.Generator) -> Array:
 
 def placed(cell: CellArrays, q: Array) -> CollisionData:
     """Joint frames and geometries in the world at ``q`` (nv,)."""
-    data = CollisionData.empty(cell.collision)
+    data = behind(CollisionData.empty(cell.collision))
     update_placements(cell.collision, data, q)
     return data
 
 
-def distances(cell: CellArrays, motion: Array, exact_below: float = np.inf) -> Array:
-    """Distance of every pair (s, p) [m] at every posture of ``motion`` (s, nv).
+def distances(cell: CellArrays, motion: Array, exact_below: float = np.inf, pairs: IntArray | None = None) -> Array:
+    """Distance of every pair (s, p) [m], or of those ``pairs`` (p,), at every posture of ``motion`` (s, nv).
 
     Pairs that are clearly farther apart than ``exact_below`` get a lower bound instead, which saves most of the time.
     """
-    out = np.zeros((len(motion), len(cell.pairs.first)))
-    _measure_all(cell.collision, CollisionData.empty(cell.collision), motion, exact_below, out)
+    asked = np.arange(len(cell.pairs.first)) if pairs is None else pairs
+    out = np.zeros((len(motion), len(asked)))
+    _measure_all(cell.collision, behind(CollisionData.empty(cell.collision)), motion, exact_below, asked, out)
     return out
 
 
 @kernel
-def _measure_all(model: CollisionModel, data: CollisionData, motion: Array, exact_below: float, out: Array) -> None:
+def _measure_all(
+    model: CollisionModel, data: CollisionData, motion: Array, exact_below: float, pairs: IntArray, out: Array
+) -> None:
     for i in range(motion.shape[0]):
         update_placements(model, data, motion[i])
-        for p in range(model.pairs.first.shape[0]):
-            out[i, p] = at_least(model, data, p)
-            if out[i, p] < exact_below:
-                out[i, p] = measure(model, data, p)
+        for k in range(pairs.shape[0]):
+            out[i, k] = at_least(model, data, pairs[k])
+            if out[i, k] < exact_below:
+                out[i, k] = measure(model, data, pairs[k])

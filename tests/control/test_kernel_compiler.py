@@ -30,9 +30,9 @@ def chain() -> tuple[Any, Any, Any]:
     return third, sixth, difference
 
 
-def compiled(function: Any) -> Any:
-    """The one thing that a kernel was compiled to."""
-    (found,) = function.overloads.values()
+def compiled(kinds: dict[Any, Any]) -> Any:
+    """The one thing that a kernel was compiled to, as a whole or as a part."""
+    (found,) = kinds.values()
     return found
 
 
@@ -40,9 +40,10 @@ def test_a_kernel_that_only_kernels_call_has_no_machine_code_of_its_own(chain: t
     third, sixth, difference = chain
     assert difference(6.0) == 1.0
     for part in (third, sixth):
-        library = compiled(part).library
+        assert not part.overloads
+        library = compiled(part.parts).library
         assert isinstance(library, _PartLibrary)
-        assert library.get_pointer_to_function(compiled(part).fndesc.llvm_func_name) == 0
+        assert library.get_pointer_to_function(compiled(part.parts).fndesc.llvm_func_name) == 0
 
 
 def test_a_part_that_python_calls_is_compiled_as_a_whole_and_gives_the_same(chain: tuple[Any, Any, Any]) -> None:
@@ -50,12 +51,28 @@ def test_a_part_that_python_calls_is_compiled_as_a_whole_and_gives_the_same(chai
     numbers = np.random.default_rng(1).normal(size=100)
     differences = [difference(x) for x in numbers]
     assert [third(x) - sixth(x) for x in numbers] == differences
-    assert not isinstance(compiled(third).library, _PartLibrary)
+    assert not isinstance(compiled(third.overloads).library, _PartLibrary)
 
 
 def test_a_kernel_that_was_called_first_becomes_part_of_another(chain: tuple[Any, Any, Any]) -> None:
     third, _, difference = chain
     assert (third(6.0), difference(6.0)) == (2.0, 1.0)
+
+
+def test_a_kernel_with_a_builtin_that_was_called_first_becomes_part_of_two_others() -> None:
+    @kernel
+    def at_least_one(x: float) -> float:
+        return max(x, 1.0) + max(int(x), 3)
+
+    @kernel
+    def halved(x: float) -> float:
+        return max(at_least_one(x), 2.0) / 2.0
+
+    @kernel
+    def doubled(x: float) -> float:
+        return 2.0 * at_least_one(x) + max(int(x), 4) + halved(x)
+
+    assert (at_least_one(5.0), halved(5.0), doubled(5.0)) == (10.0, 5.0, 30.0)
 
 
 def test_a_part_that_cannot_be_compiled_says_so_and_the_next_kernel_is_a_whole(chain: tuple[Any, Any, Any]) -> None:

@@ -27,7 +27,7 @@ def test_tuples_with_one_name_and_other_fields_are_not_mixed_up() -> None:
     one = namedtuple("Bodies", "first second")  # type: ignore[name-match]
     other = namedtuple("Bodies", "second first")  # type: ignore[name-match]
     values = np.ones(1), np.zeros(1)
-    kinds = [pointer_to(kind(*values)).kind for kind in (one, other, one)]
+    kinds = [pointer_to(kind(*values)).numba_type for kind in (one, other, one)]
     assert str(kinds[0]) == str(kinds[1])
     assert kinds[0] != kinds[1]
     assert kinds[0] == kinds[2]
@@ -38,7 +38,7 @@ def test_every_pointer_has_the_type_that_numba_gives_its_value() -> None:
     frozen.flags.writeable = False
     parts = [array, array.T, array[:, :1], array[0], frozen, array > 0.0, np.arange(2), 1, 1.0, pointer_to((array,))]
     for part in [*parts, *reversed(parts)]:
-        assert pointer_to((part, (array, part))).kind.pointee == numba.typeof((part, (array, part)))
+        assert pointer_to((part, (array, part))).numba_type.pointee == numba.typeof((part, (array, part)))
 
 
 def test_what_is_not_held_is_an_error_and_no_crash() -> None:

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.control.kernel_pointers import pointer_to
 from q2r2_control.control.safety.safety_filter import measure_pairs
 from q2r2_control.control.safety.separation_rows import write_separation_rows
 from q2r2_control.control.safety.speed_bound import update_body_velocities
@@ -26,7 +25,7 @@ class Seen:
         update_body_velocities(model.collision, data.collision, v, data.velocities)
         write_stop(model, q, v, TOGETHER, data.certified)
         self.closest = measure_pairs(model, data)
-        write_separation_rows(pointer_to(model), pointer_to(data), H)
+        write_separation_rows(model, data, H)
         self.distance, self.near, rows = data.distance, data.near, data.rows
         used = int(rows.used[0])
         self.matrix, self.lower, self.pair = rows.matrix[:used], rows.lower[:used], rows.pair[:used]

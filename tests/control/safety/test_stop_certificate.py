@@ -1,18 +1,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from q2r2_control.control.kernel_model import KernelData
 from q2r2_control.control.safety.joint_limits import next_velocity_box
 from q2r2_control.control.safety.safety_data import ROUNDING, VelocityBox
 from q2r2_control.control.safety.stop_certificate import certify, step_travel
 from q2r2_control.control.safety.stop_rollout import ARM_BY_ARM, OWN, SHAPES, TOGETHER, brake, write_stop
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, CellArrays, cell, distances, kernel_data, kernel_model, random_posture
+from tests.control.cells import NAMES, CellArrays, cell, distances, kernel_data, kernel_model, move_data, random_posture
 from tests.control.safety.motions import ACCELERATION, DENSE, H, Motion, motion_of
 
 MIN_DISTANCE = 0.02
@@ -33,8 +35,14 @@ def _least(name: str, motion: Motion) -> Array:
     return np.asarray(distances(cell(name), samples, exact_below=0.05).min(axis=0))
 
 
+@cache
+def _data(name: str) -> KernelData:
+    return kernel_data(name, cell(name).robot.home)
+
+
 def _certified(name: str, motion: Motion, known: Array | None = None) -> bool:
-    model, data = kernel_model(name).safety, kernel_data(name, motion.q, motion.v).safety
+    model, data = kernel_model(name).safety, _data(name).safety
+    move_data(name, _data(name), motion.q, motion.v)
     data.distance[:] = distances(cell(name), motion.q[None])[0] if known is None else known
     data.candidate.q[:] = motion.q_next
     data.candidate.v[:] = motion.v_next
@@ -238,8 +246,8 @@ def test_a_pair_that_starts_too_close_comes_no_closer_between_the_samples_of_its
     arrays, found = cell(name), 0
     for motion in _turning_at_its_end(name, np.random.default_rng(20), 10):
         found += 1
-        close = distances(arrays, motion.q[None])[0] < MIN_DISTANCE
-        way = distances(arrays, motion.stop(20 * DENSE), exact_below=MIN_DISTANCE)[:, close]
+        close = np.flatnonzero(distances(arrays, motion.q[None])[0] < MIN_DISTANCE)
+        way = distances(arrays, motion.stop(20 * DENSE), exact_below=MIN_DISTANCE, pairs=close)
         # A pair that has come free may come closer again, as far as its distance.
         fall = np.where(way[1:] < MIN_DISTANCE, way[:-1] - way[1:], 0.0)
         assert fall.max() < 1e-9
