@@ -51,6 +51,7 @@ def test_answers_are_told_apart_by_whether_a_processor_stood_still_meanwhile() -
     assert bench.held_up(answers, stills) == 1
 
 
+@pytest.mark.slow
 def test_the_loop_s_benchmark_times_every_stage() -> None:
     cases = json.loads(run("loop_times.py", "--ticks", "100", "--rounds", "1", "--record", "--json"))["cases"]
     assert set(cases) == {"kinematic position", "mujoco position", "mujoco torque"}
@@ -58,6 +59,7 @@ def test_the_loop_s_benchmark_times_every_stage() -> None:
         assert all(case[stage]["median_us"] > 0.0 for case in cases.values()), stage
 
 
+@pytest.mark.slow
 def test_qps_of_motions_are_a_test_set_that_qpbenchmark_loads_and_daqp_solves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

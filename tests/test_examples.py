@@ -52,6 +52,7 @@ def as_main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", [script for script in SCRIPTS if script.name != ROS], ids=lambda script: script.stem)
 def test_an_example_runs_and_prints_what_came_of_it(script: Path, tmp_path: Path, as_main: Callable[..., str]) -> None:
     code = script.read_text(encoding="utf-8")

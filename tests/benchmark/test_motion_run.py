@@ -90,6 +90,7 @@ def test_what_happens_during_the_approach_is_not_measured(robot: Robot) -> None:
     assert (figures.max_acceleration, figures.failures) == (0.0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("goal", "arrival"), [(0.0099, 0.0), (0.0101, None)])
 def test_who_is_within_10_mm_of_the_goal_has_arrived(robot: Robot, goal: float, arrival: float | None) -> None:
     away = replace(SHORT, path=lambda t, home: home + np.array([[0.0, goal, 0.0], [0.0, 0.0, 0.0]]))

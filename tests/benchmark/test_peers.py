@@ -34,6 +34,7 @@ def peer(request: pytest.FixtureRequest) -> BenchController:
     return make_peer(request.param, PeerSettings(ROBOT, CONFIG, DT))
 
 
+@pytest.mark.slow
 def test_a_peer_stays_at_its_targets_and_goes_to_others_within_the_limits(peer: BenchController) -> None:
     peer.reset(ROBOT.home)
     for _ in range(20):

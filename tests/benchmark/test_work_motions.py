@@ -28,6 +28,7 @@ def ways(motion: WorkMotion, start: dict[str, pin.SE3]) -> Array:
     return np.array([[pose.translation for pose in motion.targets(tick * DT, start).values()] for tick in ticks])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", WORK_MOTIONS.values(), ids=WORK_MOTIONS)
 def test_targets_begin_at_home_move_smoothly_at_bounded_speed_and_end_still(
     motion: WorkMotion, start: dict[str, pin.SE3]
@@ -45,6 +46,7 @@ def test_targets_begin_at_home_move_smoothly_at_bounded_speed_and_end_still(
     assert np.abs(v[began:]).max() > 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gap", "speed"), [(0.40, 0.15), (0.20, 0.50), (0.16, 0.04)])
 def test_a_carry_keeps_its_gap_and_has_the_speed_of_its_name(
     gap: float, speed: float, start: dict[str, pin.SE3]

@@ -14,6 +14,7 @@ from q2r2_control.verification.soak import SoakReport, run_soak
 from tests.cli.command import CELL, FAST, changed_cell, external_cell, one_object, q2r2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -80,6 +81,7 @@ def test_a_wrong_key_ends_in_one_line_that_names_file_key_and_what_is_allowed(tm
     assert "obstacles" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_fast_run_prints_one_json_object_and_nothing_else() -> None:
     arguments = (*FAST, "--duration", "1.2", "--human", "--seed", "7", "--trajectory", "circle")
     result = q2r2(*arguments)
@@ -154,6 +156,7 @@ def test_a_soak_asks_the_solver_of_its_option_and_says_so() -> None:
     assert (report["solver"], report["passed"]) == ("osqp", True)
 
 
+@pytest.mark.slow
 def test_a_soak_prints_every_promise_and_ends_in_0_when_all_were_kept() -> None:
     result = q2r2("soak", "--ticks", "400", "--seed", "1", "--json")
     report = one_object(result.stdout)

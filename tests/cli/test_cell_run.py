@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from collections.abc import Iterable
 
 from q2r2_control.cli.cell_run import show_window
@@ -30,6 +32,7 @@ class PlantWithWindow(RecordingPlant):
         return len(self.shown) < self.looks
 
 
+@pytest.mark.slow
 def test_a_window_shows_moving_obstacles_and_its_end_is_the_end_of_the_run() -> None:
     config = cell()
     control = config.control.model_copy(update={"moving_obstacles": ("hand",)})

@@ -32,6 +32,7 @@ def test_check_prints_arms_limits_obstacles_and_the_nearest_pairs_of_a_good_cell
     assert "FAULT" not in result.stdout
 
 
+@pytest.mark.slow
 def test_check_compiles_no_kernel(tmp_path: Path) -> None:
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
     command = [sys.executable, "-m", "q2r2_control", "check", CELL]
@@ -82,6 +83,7 @@ def test_check_as_json_has_limits_and_distances_in_order() -> None:
     assert 0.0 < joint["gravity"] < joint["stop"] < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "fault"),
     [
@@ -97,6 +99,7 @@ def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old:
     assert any(fault in line for line in one_object(data.stdout)["faults"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("written", "says"),
     [

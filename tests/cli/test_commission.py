@@ -160,6 +160,7 @@ def test_cabinets_that_stand_in_need_no_sign_off() -> None:
     assert "a tenth" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("report", "told"),
     [
@@ -198,6 +199,7 @@ def test_an_input_that_ends_ends_it(cell: Path, virtual: Callable[..., None], an
     assert "no more input; allowed: " in refused(cell, answers)
 
 
+@pytest.mark.slow
 def test_an_arm_that_does_not_move_ends_the_motion(cell: Path, virtual: Callable[..., None]) -> None:
     virtual(partial(slow_run, arm=StuckArm))
     line = refused(cell, [*TO_THE_END[:-1], "n"])

@@ -20,6 +20,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Path]:
     return record_two(tmp_path_factory.mktemp("recordings"))
 
 
+@pytest.mark.slow
 def test_a_folder_of_recordings_is_a_folder_of_tables_with_or_without_the_time_before_the_first_engagement(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:

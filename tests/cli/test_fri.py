@@ -49,6 +49,7 @@ def test_a_safety_stop_ends_a_session_and_lasts_a_second() -> None:
     assert (cabinets["left"].trips, cabinets["right"].trips) == ([Trip.SAFETY], [])
 
 
+@pytest.mark.slow
 def test_enter_at_the_terminal_stops_all_overlays_and_starts_them_again(fri_cell: str) -> None:
     ours, theirs = os.openpty()
     # The first terminal that a new session opens is its own.
@@ -126,6 +127,7 @@ def test_a_rehearsal_begins_when_all_cabinets_send(tmp_path: Path, monkeypatch: 
     assert next(looks, None) is None
 
 
+@pytest.mark.slow
 def test_a_rehearsal_whose_cabinets_cannot_begin_says_why(fri_cell: str) -> None:
     port = load_config(fri_cell).fri["left"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
@@ -137,6 +139,7 @@ def test_a_rehearsal_whose_cabinets_cannot_begin_says_why(fri_cell: str) -> None
             pass
 
 
+@pytest.mark.slow
 def test_a_run_says_that_it_waits_for_a_cabinet_and_ctrl_c_ends_the_wait(fri_cell: str) -> None:
     words = ("run", fri_cell, "--input", "scripted", "--trajectory", "circle", "--wait", "600")
     command = (sys.executable, "-m", "q2r2_control", *words)

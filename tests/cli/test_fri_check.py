@@ -28,6 +28,7 @@ def test_jitter_is_about_the_cabinets_own_period_also_where_messages_are_missing
     assert report.joints_deg == pytest.approx([28.65] * 7)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
 def test_what_both_cabinets_send_is_said_and_where_one_does_not_command_the_exit_code_is_1(fri_cell: str) -> None:
     done = q2r2("fri-check", fri_cell, "--duration", "1", "--json")
@@ -41,6 +42,7 @@ def test_what_both_cabinets_send_is_said_and_where_one_does_not_command_the_exit
     assert done.exit_code == (0 if active else 1)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
 def test_a_line_says_of_each_gripper_by_modbus_whether_it_answers_and_none_is_moved(fri_cell: str) -> None:
     cell = yaml.safe_load(Path(fri_cell).read_text(encoding="utf-8"))

@@ -67,6 +67,7 @@ def test_a_headset_server_on_every_network_says_what_to_enter_in_the_app_and_who
     assert drivers.startswith("headset: whoever reaches this port can drive the arms; headset.allow")
 
 
+@pytest.mark.slow
 def test_a_host_outside_the_cells_headset_allow_is_refused(tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
     cell.write_text(Path(CELL).read_text(encoding="utf-8").replace("allow: null", "allow: [10.0.0.0/8]"), "utf-8")

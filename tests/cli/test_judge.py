@@ -26,6 +26,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_each_episode_has_a_row_and_a_line_with_the_reasons(recordings: Path) -> None:
     result = q2r2("judge", str(recordings))
     assert (result.exit_code, result.stderr) == (0, "")
@@ -51,6 +52,7 @@ def test_json_has_every_number_and_every_reason(recordings: Path, tmp_path: Path
     assert [episode["verdict"] for episode in episodes] == ["keep", "keep"]
 
 
+@pytest.mark.slow
 def test_a_report_is_one_page_of_all_of_them(recordings: Path, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     result = q2r2("report", str(recordings), "--output", str(page))

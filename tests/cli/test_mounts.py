@@ -56,6 +56,7 @@ def test_written_postures_give_the_mount_of_arms_without_cabinets(tmp_path: Path
     assert max(report["off_mm"]) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -105,6 +106,7 @@ def test_a_count_of_points_beside_a_file_of_them_is_refused(tmp_path: Path) -> N
     assert "--points: allowed without --postures, whose file has a line a point" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
 def test_arms_that_were_not_moved_between_the_points_tell_nothing(fri_cell: str) -> None:
     done = q2r2("mounts", fri_cell, typed="\n" * 6)

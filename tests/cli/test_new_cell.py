@@ -60,6 +60,7 @@ def test_a_file_that_is_there_is_kept() -> None:
     assert Path("cell.yaml").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_links_without_masses_are_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
     result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
@@ -68,6 +69,7 @@ def test_links_without_masses_are_left_to_do() -> None:
     assert "left to do" in result.stdout
 
 
+@pytest.mark.slow
 def test_answers_are_those_of_the_user(tmp_path: Path) -> None:
     typed = "0.9\n0.1\n0 0.4 0 -1.6 0 1.1 0\n\n"
     models = ("--left", "iiwa7", "--right", "iiwa7")
@@ -78,6 +80,7 @@ def test_answers_are_those_of_the_user(tmp_path: Path) -> None:
     assert left.home == right.home == (0.0, 0.4, 0.0, -1.6, 0.0, 1.1, 0.0), "a twin's home is taken"
 
 
+@pytest.mark.slow
 def test_arguments_of_xacro_go_into_the_cell(tmp_path: Path) -> None:
     argument = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="arm"><xacro:arg name="fast" default="1.0"/>'
     text = re.sub(r"<robot[^>]*>", argument, re.sub(r'velocity="[^"]*"', 'velocity="$(arg fast)"', IIWA))
@@ -90,6 +93,7 @@ def test_arguments_of_xacro_go_into_the_cell(tmp_path: Path) -> None:
     assert Robot.from_config(cell).velocity_limit.tolist() == [1.25] * 7
 
 
+@pytest.mark.slow
 def test_an_mjcf_becomes_a_urdf_beside_the_cell_which_runs(tmp_path: Path) -> None:
     bodies = "".join(
         f"""<body name="link_{i}" pos="0 0 {0.1 if i == 1 else 0.25}"><joint name="j{i}" axis="{axis}"
@@ -141,6 +145,7 @@ def test_both_arms_of_one_model_are_found_with_their_fingers(tmp_path: Path) -> 
         assert arm.gripper.open_position > arm.gripper.closed_position == 0.0
 
 
+@pytest.mark.slow
 def test_links_of_several_shapes_are_left_out_only_where_all_of_these_overlap(tmp_path: Path) -> None:
     ball = '<collision><origin xyz="0 0 0.2"/><geometry><sphere radius="0.17"/></geometry></collision></link>'
     head, tail = re.split(r"</link>\s*(?=<joint name=\"A2\")", IIWA)

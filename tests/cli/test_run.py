@@ -36,6 +36,7 @@ def test_with_force_it_says_what_is_wrong_and_runs(tmp_path: Path) -> None:
     assert one_object(result.stdout)["ticks"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "home", "said"),
     [
@@ -106,6 +107,7 @@ def test_an_episode_of_the_demo_has_the_pictures_of_which_an_export_makes_videos
     assert len(list((tmp_path / "grasp/videos").rglob("episode_000000.mp4"))) == 3
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_drawn_one_line_says_so_and_all_else_is_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,6 +120,7 @@ def test_where_nothing_can_be_drawn_one_line_says_so_and_all_else_is_recorded(
     assert recording["ticks"] >= 100
 
 
+@pytest.mark.slow
 def test_a_plant_without_pictures_is_named_and_recorded_without(tmp_path: Path) -> None:
     result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path / "recordings"))
     assert result.exit_code == 0
@@ -134,6 +137,7 @@ class Still:
 """
 
 
+@pytest.mark.slow
 def test_a_policy_of_this_folder_runs_and_is_refused_with_another_input(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -79,6 +79,7 @@ def _ratio(x: Array) -> float:
 AXES = pytest.mark.parametrize("axis", [0, 2, 4], ids=["along x", "along z", "about y"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "ratio", "dt"), [(0, 0.2, 0.001), (5, 0.6, 0.01)], ids=["moved", "turned"])
 def test_released_it_returns_with_the_damping_ratio_asked_for(axis: int, ratio: float, dt: float) -> None:
     admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=ratio))
@@ -87,6 +88,7 @@ def test_released_it_returns_with_the_damping_ratio_asked_for(axis: int, ratio: 
     assert _ratio(back) == pytest.approx(ratio, abs=0.05)
 
 
+@pytest.mark.slow
 def test_critically_damped_it_returns_steadily_and_in_the_end_leaves_the_target_as_it_is() -> None:
     admittance = Admittance(ROBOT)
     _displaced(admittance, _touch(_wrench(2, -20.0)), 2000)
@@ -107,6 +109,7 @@ def test_below_the_dead_band_nothing_moves_however_long(axis: int) -> None:
     assert admittance.report().arms["left"].wrench[axis] == pytest.approx(0.99 * band)
 
 
+@pytest.mark.slow
 def test_the_dead_band_ends_without_a_step_and_soon_leaves_the_whole_force() -> None:
     forces = np.linspace(1.5, 30.0, 115)
     ends = np.array([_displaced(Admittance(ROBOT), _touch(_wrench(0, force)), 100, 0.1)[-1][0] for force in forces])
@@ -117,6 +120,7 @@ def test_the_dead_band_ends_without_a_step_and_soon_leaves_the_whole_force() -> 
     assert lost[forces >= 14.0].max() < 0.02 * 14.0 + 0.02
 
 
+@pytest.mark.slow
 def test_any_wrench_at_any_tick_keeps_the_displacement_inside_its_limits() -> None:
     random, admittance = np.random.default_rng(53), Admittance(ROBOT, AdmittanceSettings(damping_ratio=0.1))
     farthest = np.zeros(2)
@@ -177,6 +181,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", BAD)
 def test_a_measurement_that_is_no_number_holds_the_last_wrench_and_is_reported(kind: str) -> None:
     admittance, (tau, q) = Admittance(ROBOT), BAD[kind]
@@ -235,6 +240,7 @@ def _loop(goals: dict[str, pin.SE3 | None], dt: float, ticks: int) -> Iterator[A
         yield _away(controller.tool_pose("left"), goals["left"])
 
 
+@pytest.mark.slow
 @AXES
 def test_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_and_the_servos_give(axis: int) -> None:
     push = _wrench(axis, 20.0 if axis < 3 else 5.0)
@@ -253,6 +259,7 @@ def test_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_and_th
     np.testing.assert_allclose(x, 0.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_leaning_on_a_body_of_ten_kilonewtons_per_metre_it_comes_to_rest() -> None:
     body = 10000.0
     surface = ROBOT.tool_pose(ROBOT.home, "left").translation[2] - 0.02

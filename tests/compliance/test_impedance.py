@@ -207,6 +207,7 @@ class TestAnImpedanceThatChanges:
         assert controller.in_force("left") == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "tool", "joints"), [("panda", "panda_hand", 7), ("ur5", "tool0", 6)])
 def test_robots_whose_rotors_are_unknown_have_usual_ones(model: str, tool: str, joints: int) -> None:
     import example_robot_data

@@ -49,6 +49,7 @@ def test_each_part_of_an_error_is_clipped_by_its_length_and_keeps_its_direction(
 
 
 class TestASingularPosture:
+    @pytest.mark.slow
     def test_has_no_direction_heavier_than_1000_kg(self) -> None:
         J, M = left_arm(ROBOT, STRETCHED)
         assert np.linalg.matrix_rank(J) < 6

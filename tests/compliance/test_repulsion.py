@@ -160,6 +160,7 @@ def test_the_damping_takes_energy_at_every_velocity() -> None:
         assert (wall().update(q, v).tau - report.tau) @ v <= 1e-9
 
 
+@pytest.mark.slow
 def test_the_torque_grows_gradually_into_the_shell_while_closing() -> None:
     crossed = 0
     for q, report in _postures()[:12]:
@@ -259,6 +260,7 @@ def _pushed(
         plant.advance(dt)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("friction", "dt", "stiffness", "least"),
     [

@@ -52,6 +52,7 @@ def test_every_file_of_config_and_robots_is_part_of_the_installation() -> None:
         assert shipped == {file for file in (CHECKOUT / folder).iterdir() if file.suffix in (".yaml", ".urdf", ".srdf")}
 
 
+@pytest.mark.slow
 def test_installed_beside_the_package_they_are_found_without_the_checkout(tmp_path: Path) -> None:
     """The layout that pip makes with --target, run as a process of its own."""
     shutil.copytree(CHECKOUT / "q2r2_control", tmp_path / "q2r2_control", ignore=shutil.ignore_patterns("__pycache__"))

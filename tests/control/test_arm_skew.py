@@ -84,6 +84,7 @@ def test_two_arms_that_swing_alike_keep_apart_wherever_on_its_way_each_is(robot:
     assert np.sqrt(np.mean(np.square(errors[800:]))) < 0.02, "they are still followed"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [0.0, WINDOW])
 def test_only_arms_that_may_be_apart_in_time_are_kept_apart_so_against_hostile_solvers(window: float) -> None:
     controller, solver = controller_and_solver()

@@ -45,6 +45,7 @@ def towards_the_table(controller: CartesianController, speed: float, seconds: fl
     return np.array(heights), -np.diff(heights, prepend=heights[0]) / DT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.2, 5.0])
 def test_a_finger_that_may_touch_gets_in_by_the_depth_and_no_faster_than_it_may(speed: float) -> None:
     allowed = settings({"pair": ["left_*finger*", "table"], "depth": DEPTH, "speed": SPEED})
@@ -65,6 +66,7 @@ def test_what_is_not_named_keeps_its_distance_to_the_same_table() -> None:
     assert 0.001 < tips["right"] < 0.002
 
 
+@pytest.mark.slow
 def test_fingers_of_both_hands_may_touch_each_other() -> None:
     """Hands that face each other: their tools are asked to change sides, and their fingers get in by the depth."""
     depth = 0.005

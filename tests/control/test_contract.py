@@ -37,6 +37,7 @@ def run(controller: CartesianController, scenario: Any, duration: float, dt: flo
     return driven.contract
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "duration"),
     [

@@ -93,6 +93,7 @@ def test_the_margin_that_a_report_tells_is_to_what_the_pairs_keep_at_that_tick(
     assert grown > 0, "what the pair with the table keeps grows as the object is lifted"
 
 
+@pytest.mark.slow
 def test_one_that_is_drawn_too_large_may_overlap_the_table_as_it_is_gripped_and_no_more(robot: Robot) -> None:
     large = cell({"box": (0.04, 0.04, 0.08), "at": (0.0, 0.0, 0.013)})
     controller = CartesianController(Robot.from_config(large), large.control)
@@ -134,6 +135,7 @@ def test_gripped_in_mid_motion_the_stop_that_is_known_keeps_what_it_then_keeps(
     assert height(controller) > GRIP - 0.031
 
 
+@pytest.mark.slow
 def test_a_hand_that_drives_a_held_bar_into_the_other_arm_stops_at_its_distance() -> None:
     long = cell({"box": (0.03, 0.25, 0.03)})
     controller = CartesianController(Robot.from_config(long), long.control)
@@ -148,6 +150,7 @@ def test_a_hand_that_drives_a_held_bar_into_the_other_arm_stops_at_its_distance(
     assert 0.02 - 1e-6 < nearest[1] < 0.03
 
 
+@pytest.mark.slow
 def test_two_held_blocks_are_kept_apart_and_one_that_both_hold_leaves_them_free(
     controller: CartesianController,
 ) -> None:
@@ -174,6 +177,7 @@ def test_two_held_blocks_are_kept_apart_and_one_that_both_hold_leaves_them_free(
     run.drive(0.2, tilted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forget", ["let go", "reset"])
 def test_once_it_is_let_go_no_report_names_a_pair_of_it_even_if_no_time_passes(
     forget: str, controller: CartesianController, at_grip: Array

@@ -67,6 +67,7 @@ def test_a_distance_grows_no_faster_than_it_may_and_falls_at_once(controller: Ca
     assert controller.kept_distances.max() == NEAR
 
 
+@pytest.mark.slow
 def test_changes_drawn_at_random_in_mid_motion_break_no_promise(controller: CartesianController) -> None:
     random, run = np.random.default_rng(3), Driven(controller)
     scenarios = [SCENARIOS[name] for name in ("crossing", "same point", "teleport", "into the table")] + [circle]
@@ -97,6 +98,7 @@ def test_arms_that_close_in_are_slowed_by_a_smaller_gain_of_separation_and_not_w
     assert np.abs(changes[0.5] - changes[10.0]).max() < 3e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in LIVE if name != "min_distance"])
 def test_what_was_changed_is_what_a_controller_that_is_made_with_it_has(name: str) -> None:
     """To the bit, after a reset, with one arm that gives way to the other one, out of reach and near it."""
@@ -122,6 +124,7 @@ def test_a_setting_is_live_if_the_model_of_a_task_has_it_in_an_array() -> None:
     assert found | {"min_distance", "separation_gain"} == set(LIVE)
 
 
+@pytest.mark.slow
 def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(controller: CartesianController) -> None:
     run = Driven(controller)
     run.drive(4.0, SCENARIOS["crossing"])
@@ -139,6 +142,7 @@ def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(co
     assert run.contract.uncertified == 0
 
 
+@pytest.mark.slow
 def test_a_distance_that_has_grown_falls_back_to_what_a_reset_leaves_it(controller: CartesianController) -> None:
     run = Driven(controller)
     run.drive(4.0, SCENARIOS["crossing"])
@@ -154,6 +158,7 @@ def test_a_distance_that_has_grown_falls_back_to_what_a_reset_leaves_it(controll
     assert again.contract.uncertified == 0
 
 
+@pytest.mark.slow
 def test_arms_that_were_left_within_their_buffer_rest_after_a_reset_and_it_grows_as_they_part(
     controller: CartesianController,
 ) -> None:

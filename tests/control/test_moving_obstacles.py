@@ -33,6 +33,7 @@ def controller() -> Iterator[CartesianController]:
     made.move_obstacle("hand", None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("speed", "period", "acceleration", "box"),
     [
@@ -52,6 +53,7 @@ def test_no_body_that_moves_comes_near_a_hand_that_hunts_it(
     assert hunt.moved > 500, "and arms move whenever they may"
 
 
+@pytest.mark.slow
 def test_a_hand_that_is_faster_than_it_says_gets_to_an_arm_that_moves(controller: CartesianController) -> None:
     hunt = Hunt(controller, controller_and_solver()[1], seed=1, lie=5.0)
     hunt.run(6.0, 0.25, 0.1)

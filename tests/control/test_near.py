@@ -62,6 +62,7 @@ def test_tools_driven_down_onto_the_table_end_with_their_tips_between_1_and_2_mm
     assert any("hand_e_finger" in name for name in report.closest_pair)
 
 
+@pytest.mark.slow
 def test_hands_driven_at_each_other_end_at_the_distance_that_fingers_keep(controller: CartesianController) -> None:
     """Tools that point at each other, their tips asked to overlap by 50 mm."""
     goal = {
@@ -178,6 +179,7 @@ def test_where_nothing_can_be_certified_the_report_names_the_pairs_that_hold_the
 SHAPES = {"box": [0.1, 0.1, 0.5], "cylinder": [0.06, 0.5]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_tool_pushed_into_an_obstacle_stops_before_it_and_rests(shape: str) -> None:
     post = {"shape": shape, "size": SHAPES[shape], "position": [0.65, 0.1, 0.55], "rpy": [0.3, 0.2, 0.0]}
@@ -204,6 +206,7 @@ def test_a_target_that_bends_the_hand_to_the_forearm_is_followed_to_the_distance
     assert reference.report.closest_pair == ("left_link_5_0", "left_hand_e_envelope_0")
 
 
+@pytest.mark.slow
 def test_a_circle_is_followed_no_worse_because_the_hand_is_near_its_own_forearm(
     controller: CartesianController,
 ) -> None:

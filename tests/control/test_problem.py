@@ -101,6 +101,7 @@ NO_SOLUTION: tuple[Any, ...] = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", NO_SOLUTION, ids=lambda x: repr(x)[:12])
 def test_what_is_no_solution_brakes_along_the_certified_stop_as_an_unsolved_step(robot: Robot, x: Any) -> None:
     controller = CartesianController(robot)

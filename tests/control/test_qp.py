@@ -153,6 +153,7 @@ def circling(home: pin.SE3, t: float, side: float) -> pin.SE3:
     return pin.SE3(home.rotation, home.translation + by)
 
 
+@pytest.mark.slow
 def test_the_minimum_is_the_solution_wherever_it_is_one() -> None:
     robot, solver = cell("dual_iiwa7").robot, BothWays()
     controller = CartesianController(robot, ControllerSettings(), solver=solver)

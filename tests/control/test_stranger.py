@@ -61,6 +61,7 @@ def cell() -> Config:
     return load_config("config/dual_iiwa7.yaml")
 
 
+@pytest.mark.slow
 def test_a_stranger_adds_a_task_and_a_constraint_and_solves_the_qp_by_a_solver_of_choice(cell: Config) -> None:
     robot = Robot.from_config(cell)
     tasks: list[Task] = [LookAt(robot, (0.7, 0.0, 0.2), arms=["right"]), Slowly()]
@@ -89,6 +90,7 @@ def test_a_stranger_adds_a_task_and_a_constraint_and_solves_the_qp_by_a_solver_o
     assert controller.tool_pose("left").translation[2] > goals["left"].translation[2] - 0.08
 
 
+@pytest.mark.slow
 def test_a_solver_of_a_strangers_own_keeps_every_distance(cell: Config) -> None:
     robot, solver = Robot.from_config(cell), OwnSolver()
     typed: Solver = solver

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 import numpy as np
 import pinocchio as pin
 
@@ -37,6 +39,7 @@ def test_an_undone_step_leaves_state_and_stop_as_they_were(robot: Robot) -> None
     np.testing.assert_allclose(controller.tool_pose("left"), robot.tool_pose(before.q, "left"), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_arms_that_are_sent_into_each_other_keep_every_promise_with_late_steps(robot: Robot) -> None:
     controller, random = CartesianController(robot), np.random.default_rng(0)
     cap = robot.capped_acceleration(controller.settings.acceleration_limit)

@@ -60,6 +60,7 @@ def trials_of(demo: subprocess.Popen[str]) -> list[int]:
     return trials
 
 
+@pytest.mark.slow
 def test_ctrl_c_does_not_wait_for_trials(demo: subprocess.Popen[str]) -> None:
     wait_until(lambda: trials_of(demo))
     trial = trials_of(demo)[0]
@@ -70,6 +71,7 @@ def test_ctrl_c_does_not_wait_for_trials(demo: subprocess.Popen[str]) -> None:
     assert "Traceback" not in demo.communicate()[1]
 
 
+@pytest.mark.slow
 def test_trials_end_with_a_demo_that_is_killed(demo: subprocess.Popen[str]) -> None:
     wait_until(lambda: len(trials_of(demo)) == min(2, os.cpu_count() or 1))
     trials = trials_of(demo)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +17,7 @@ from tests.pipeline.loops import pipeline
 from tests.support.processes import Watch, cell
 
 
+@pytest.mark.slow
 def test_in_velocity_mode_both_arms_follow_their_reference_within_every_limit() -> None:
     loop = pipeline(plant="mujoco", mode="velocity")
     watch = Watch(loop)

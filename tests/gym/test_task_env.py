@@ -52,6 +52,7 @@ def test_every_task_is_registered_and_lasts_as_long_as_its_work_takes() -> None:
         assert spec.max_episode_steps >= RATE * WORKS[task].duration
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("space", list(ActionSpace))
 def test_gymnasiums_own_checks_pass(space: ActionSpace) -> None:

@@ -46,6 +46,7 @@ def test_stamps_are_on_the_callers_clock_and_never_in_its_future() -> None:
             last[sample.hand] = sample.pose_stamp
 
 
+@pytest.mark.slow
 @EVERY
 @pytest.mark.parametrize("hand", SIDES)
 def test_hands_move_smoothly_calmly_and_within_reach(trajectory: str, hand: str) -> None:
@@ -213,6 +214,7 @@ def test_the_hand_is_where_its_way_points_say_and_rests_at_each() -> None:
     assert [minimum_jerk(fraction) for fraction in (-1.0, 0.0, 0.5, 1.0, 2.0)] == [0.0, 0.0, 0.5, 1.0, 1.0]
 
 
+@pytest.mark.slow
 def test_shaky_hands_are_lost_for_a_second_engage_anew_and_do_all_of_the_work() -> None:
     for seed in range(20):
         calm, hasty = trajectory_named("carry"), hurried(trajectory_named("carry"), seed)

@@ -49,6 +49,7 @@ class Page(HTMLParser):
         return [b64decode(packed).decode() for packed in data]
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched_from_elsewhere_and_each_episode_has_a_row_with_its_verdict_and_a_section() -> None:
     text = page_of([moving(), judged(episode())], "<script>alert(1)</script> & {braces}")
     page = Page(text)
@@ -66,6 +67,7 @@ def test_nothing_is_fetched_from_elsewhere_and_each_episode_has_a_row_with_its_v
     assert len(page.all("td")) == 2 * (1 + len(COLUMNS))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "of",
     [

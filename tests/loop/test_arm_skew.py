@@ -74,6 +74,7 @@ class TwoDrivers:
             self.tick()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("are_watched", [True, False])
 def test_an_arm_that_stands_still_is_not_met_by_the_other_one_if_both_are_watched(are_watched: bool) -> None:
     arms = TwoDrivers(are_watched)

@@ -131,6 +131,7 @@ class ReportedHand(Arms):
         return self.loop.controller.obstacle_reports["hand"].age
 
 
+@pytest.mark.slow
 def test_a_report_of_a_hand_is_as_old_as_the_clock_says_when_the_loop_stalls() -> None:
     arms = ReportedHand(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)

@@ -62,6 +62,7 @@ def cell_robot() -> Robot:
     return Robot.from_config(cell())
 
 
+@pytest.mark.slow
 def test_a_press_on_the_way_home_ends_it_where_the_arms_come_to_rest() -> None:
     ticks = played((1.5, "press_middle"), (1.9, "button_lower"))
     assert {event.kind for tick in ticks if tick.t > 1.6 for event in tick.events} == {"homing_interrupted"}
@@ -72,6 +73,7 @@ def test_a_press_on_the_way_home_ends_it_where_the_arms_come_to_rest() -> None:
     assert max(map(speed, after)) < 0.02
 
 
+@pytest.mark.slow
 def test_a_stop_brings_both_arms_to_rest_and_only_taking_it_back_and_a_press_move_them() -> None:
     ticks = played((1.5, "press_index"), (2.0, "button_lower"), (2.3, "press_middle"), (3.0, "press_index"))
     stopped = [tick for tick in ticks if set(tick.states.values()) == {"stopped"}]
@@ -81,6 +83,7 @@ def test_a_stop_brings_both_arms_to_rest_and_only_taking_it_back_and_a_press_mov
     assert all(tick.targets[arm].pose is None for tick in resting for arm in tick.targets)
 
 
+@pytest.mark.slow
 def test_a_program_may_send_the_arms_home_too() -> None:
     loop = pipeline(PlayingHands())
     watch = Watch(loop)
@@ -120,6 +123,7 @@ def test_two_tools_that_carry_keep_their_relation_while_one_hand_moves_and_turns
         assert np.degrees(max(map(np.linalg.norm, turns))) > 12.0
 
 
+@pytest.mark.slow
 def test_what_a_program_changes_counts_from_the_next_tick_on_without_a_jump() -> None:
     loop = pipeline(PlayingHands())
     watch = Watch(loop)

@@ -25,6 +25,7 @@ def robot(config: Config) -> Robot:
     return Robot.from_config(config)
 
 
+@pytest.mark.slow
 def test_a_joint_goes_a_degree_and_back_alone(config: Config) -> None:
     with slow_run(config) as run:
         start = run.reference
@@ -36,6 +37,7 @@ def test_a_joint_goes_a_degree_and_back_alone(config: Config) -> None:
     assert motion.others_deg < 0.01
 
 
+@pytest.mark.slow
 def test_a_joint_that_does_not_move_is_named(config: Config) -> None:
     with slow_run(config, StuckArm) as run, pytest.raises(PlantError, match=r"left_A1: commanded .* measured 0\.00"):
         measure_joint(run, 0)
@@ -57,6 +59,7 @@ def test_a_joint_has_to_follow_and_to_move_alone(motion: JointMotion) -> None:
         motion.check()
 
 
+@pytest.mark.slow
 def test_an_arm_that_a_hand_leads_stops_within_its_certified_stop_and_the_latency(config: Config) -> None:
     with slow_run(config) as run:
         report = measure_stop(run, "left")

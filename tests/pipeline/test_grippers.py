@@ -23,6 +23,7 @@ from tests.support.object_cell import cell as object_cell
 from tests.support.processes import Watch, cell
 
 
+@pytest.mark.slow
 def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick() -> None:
     loop = pipeline(ScriptedInput("meet"), "mujoco")
     watch, widest = Watch(loop), list[float]()
@@ -130,6 +131,7 @@ class LeftUpperPresses(ScriptedInput):
         ]
 
 
+@pytest.mark.slow
 def test_a_gripper_that_something_keeps_from_closing_holds_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(GripperLimiter, "limit", lambda *_: {"left": 0.5, "right": 1.0})
     loop = Pipeline.from_config(object_cell({}), input=LeftUpperPresses("circle"), plant="mujoco")

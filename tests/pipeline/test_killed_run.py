@@ -30,6 +30,7 @@ def config() -> Config:
     return load_config("config/dual_iiwa7_fri.yaml").model_copy(update={"fri": cabinets})
 
 
+@pytest.mark.slow
 def test_arms_of_a_killed_run_come_to_rest_within_their_certified_stop(config: Config) -> None:
     with waiting_cabinets(Robot.from_config(config), config) as cabinets:
         reports = measure_kill(config, lambda: np.concatenate([cabinets[arm].arm.q for arm in SIDES]), led=0.3)
@@ -65,6 +66,7 @@ class LeadingThread:
         self._thread.join()
 
 
+@pytest.mark.slow
 def test_arms_that_hardly_go_up_are_not_killed_and_it_says_where_to_begin(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -82,6 +84,7 @@ def test_arms_that_hardly_go_up_are_not_killed_and_it_says_where_to_begin(
     assert not led[0].killed_too_early
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_begin_says_why(config: Config) -> None:
     port = config.fri["left"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:

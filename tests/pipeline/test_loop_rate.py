@@ -57,6 +57,7 @@ def ticks_of(duration: float, *, paced: bool, busy_s: float = 0.0) -> list[objec
     return seen
 
 
+@pytest.mark.slow
 def test_a_paced_run_is_the_same_to_the_bit_as_a_fast_one_and_as_one_on_a_slow_computer() -> None:
     fast = ticks_of(0.9, paced=False)
     assert len(fast) >= 450
@@ -137,11 +138,13 @@ def error_in_free_air(rate: float, mode: str) -> float:
     return max(error for error in errors if error is not None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["position", "torque"])
 def test_tools_are_followed_at_250_hz_as_at_1000_hz_and_the_contract_holds(mode: str) -> None:
     assert error_in_free_air(250.0, mode) <= 1.5 * error_in_free_air(1000.0, mode)
 
 
+@pytest.mark.slow
 def test_arms_that_block_each_other_come_to_rest_at_250_hz(robot: Robot) -> None:
     controller = CartesianController(robot, ControllerSettings(acceleration_limit=10.0))
     controller.reset(robot.home)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from itertools import pairwise
 from typing import ClassVar
 
@@ -60,6 +62,7 @@ def test_engaging_is_felt_by_both_hands_and_every_vibration_ends_before_the_next
         assert all(after - before > 0.04 for (before, on), (after, _) in pairwise(sent) if not on)
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_driven_at_the_other_is_felt_by_both_hands_stronger_and_stronger_and_then_no_more() -> None:
     hands = FeltHands(left=straight(0.5 * -np.eye(3)[1]))
     pipeline(hands).run(5.0, realtime=False)
@@ -70,6 +73,7 @@ def test_an_arm_that_is_driven_at_the_other_is_felt_by_both_hands_stronger_and_s
     assert max(t for t, _ in hands.felt) < 4.0
 
 
+@pytest.mark.slow
 def test_a_hand_that_goes_out_of_reach_feels_its_target_slip_and_one_that_turns_too_far_a_joint_at_its_limit() -> None:
     def turn(t: float) -> Array:
         return np.append(np.zeros(3), 40.0 * straight(0.1 * UP, 4.0)(t)[:3])
@@ -81,6 +85,7 @@ def test_a_hand_that_goes_out_of_reach_feels_its_target_slip_and_one_that_turns_
     assert not hands.by("left", LIMIT)
 
 
+@pytest.mark.slow
 def test_a_push_at_the_tool_is_felt_by_its_hand_only() -> None:
     hands = FeltHands()
     loop = pipeline(hands, "mujoco")
@@ -94,6 +99,7 @@ def test_a_push_at_the_tool_is_felt_by_its_hand_only() -> None:
     assert not hands.by("left", CONTACT)
 
 
+@pytest.mark.slow
 def test_a_gripper_that_closes_on_a_block_is_felt_once_and_an_empty_one_is_not() -> None:
     class FeltScript(ScriptedInput):
         grasps: ClassVar[dict[str, int]] = {}

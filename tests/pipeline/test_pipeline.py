@@ -45,6 +45,7 @@ class Counting:
         return DaqpSolver(len(problem.g)).solve(problem)
 
 
+@pytest.mark.slow
 def test_a_loop_asks_a_program_s_own_tasks_constraints_and_solver_at_every_tick_of_each_run() -> None:
     own = Counting()
     config = cell().model_copy(update={"loop_rate_hz": 500.0})
@@ -138,6 +139,7 @@ def without_times(summary: RunSummary) -> str:
     return json.dumps(data)
 
 
+@pytest.mark.slow
 def test_a_run_starts_paused_even_when_the_one_before_ended_engaged() -> None:
     loop = pipeline()
     assert loop.run(2.0, realtime=False).arms["left"].engaged_s > 1.0
@@ -158,6 +160,7 @@ def test_runs_by_the_clock_keep_the_solver_s_time_limit_and_simulated_ones_have_
         assert loop.controller.settings.solve_time_limit == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "may_touch"), [("position", 0), ("velocity", 0), ("torque", 1)])
 def test_pairs_may_touch_in_torque_mode_only(mode: str, may_touch: int) -> None:
     contact = (ContactPair(pair=("*_finger_*", "table")),)
@@ -168,6 +171,7 @@ def test_pairs_may_touch_in_torque_mode_only(mode: str, may_touch: int) -> None:
     assert len(running.controller.settings.contact_allowed) == may_touch
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [50.0, 333.0, 1000.0])
 def test_a_run_takes_as_many_ticks_as_its_duration_has_periods(rate: float) -> None:
     summary = pipeline(loop_rate_hz=rate).run(0.4, realtime=False)
@@ -241,6 +245,7 @@ def test_five_thousand_ticks_of_hostile_samples_break_no_limit_and_raise_nothing
         assert_begins_at_the_tool(watch, arm)
 
 
+@pytest.mark.slow
 def test_a_torque_that_is_not_renewed_in_time_does_not_throw_a_simulated_arm() -> None:
     config = cell().model_copy(update={"loop_rate_hz": 500.0})
     robot = Robot.from_config(config)

@@ -67,6 +67,7 @@ def elbow_at_the_end(config: Config) -> float:
     return angles[-1]
 
 
+@pytest.mark.slow
 def test_an_input_a_plant_and_a_task_written_as_the_page_says_run_in_one_pipeline(file: Path) -> None:
     config = load_config(str(file))
     assert "elbows_out" in config.control.tasks
@@ -88,12 +89,14 @@ def test_a_preset_of_the_page_is_what_a_cell_or_a_node_may_name(tmp_path: Path, 
         preset_of("no_preset", "raw")
 
 
+@pytest.mark.slow
 def test_an_input_of_the_page_engages_by_the_clock_of_a_real_run_too(file: Path) -> None:
     loop = Pipeline.from_config(load_config(str(file)), plant="kinematic")
     summary = loop.run(1.0)
     assert {event.destination for event in summary.events} >= {"engaged"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "told"),
     [

@@ -28,6 +28,7 @@ def test_a_pause_holds_both_arms_until_a_new_press() -> None:
     assert summary.at_rest
 
 
+@pytest.mark.slow
 def test_a_press_of_a_program_engages_arms_whose_hands_are_there_and_pauses_none() -> None:
     loop = pipeline()
     loop.listeners.append(when_moving(loop.pause))
@@ -53,6 +54,7 @@ def test_a_press_of_a_program_holds_no_dead_man() -> None:
     assert not any(event.destination == "engaged" for event in loop.run(1.0, realtime=False).events)
 
 
+@pytest.mark.slow
 def test_springs_of_torque_mode_change_on_a_ramp_and_no_others() -> None:
     loop = pipeline(plant="mujoco", mode="torque")
     seen: list[float] = []
@@ -90,6 +92,7 @@ def test_a_report_of_a_hand_gets_older_between_two_runs_of_one_pipeline() -> Non
     assert loop.controller.obstacle_reports["hand"].age >= 0.2
 
 
+@pytest.mark.slow
 def test_a_hand_that_a_program_reports_in_front_of_an_arm_is_named_once_and_brakes_it() -> None:
     loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     ticks: list[Tick] = []
@@ -113,6 +116,7 @@ def test_a_hand_that_a_program_reports_in_front_of_an_arm_is_named_once_and_brak
         loop.move_obstacle("foot", None)
 
 
+@pytest.mark.slow
 def test_in_torque_mode_the_wall_knows_a_box_that_was_put_down_until_it_is_gone() -> None:
     loop = pipeline(
         plant="mujoco", mode="torque", control=cell().control.model_copy(update={"moving_obstacles": ("box",)})
@@ -138,6 +142,7 @@ def test_in_torque_mode_the_wall_knows_a_box_that_was_put_down_until_it_is_gone(
     assert {t for t, pressing in pressed.items() if pressing} == {t for t in pressed if 0.101 < t < 0.201}
 
 
+@pytest.mark.slow
 def test_a_mark_without_a_recording_is_refused() -> None:
     loop = pipeline()
     loop.listeners.append(when_moving(lambda: loop.mark(Action.RECORD_MARK)))

@@ -23,6 +23,7 @@ FILES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", FILES)
 def test_its_tools_follow_the_hands_around_a_circle_and_keep_the_contract_where_they_cannot(file: Path) -> None:
     # The lowest rate with one substep a tick, since most of a test's time goes by ticks.

@@ -16,6 +16,7 @@ def config() -> Config:
     return load_config("config/dual_iiwa7_fri.yaml")
 
 
+@pytest.mark.slow
 def test_no_joint_is_faster_than_a_twentieth_of_its_limit_and_at_the_end_all_rest(config: Config) -> None:
     cabinets: list[PendantCabinets] = []
     with slow_run(config, prepare=cabinets.append) as run:
@@ -43,6 +44,7 @@ def test_a_straight_way_that_is_not_free_is_not_gone(config: Config) -> None:
         assert np.abs(run.reference - start).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_a_session_that_ends_is_told_and_the_motion_may_be_asked_for_again(config: Config) -> None:
     cabinets: list[PendantCabinets] = []
     with slow_run(config, prepare=cabinets.append) as run:
@@ -70,6 +72,7 @@ def test_cabinets_that_do_not_let_a_client_command_are_named(config: Config) -> 
         pytest.fail("nothing may be led")
 
 
+@pytest.mark.slow
 def test_arms_that_do_not_follow_at_all_end_the_run_which_says_why(config: Config) -> None:
     with slow_run(config, StuckArm) as run:
         with pytest.raises(PlantError, match=r"left_A7"):

@@ -66,6 +66,7 @@ def along(axis: int, force: float = FORCE) -> Array:
     return force * np.eye(6)[axis]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "axis"), [("home", 0), ("reaching far", 1), ("drawn in", 2), ("high", 0), ("elbow out", 1)]
 )
@@ -101,6 +102,7 @@ def fitted_ratio(z: Array) -> float:
     return float(damping / (2 * np.sqrt(square)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.7, 1.0])
 def test_released_every_mode_returns_with_its_damping_ratio(bare: MujocoPlant, robot: Robot, ratio: float) -> None:
     settings = SETTINGS.model_copy(update={"damping_ratio": ratio})
@@ -125,6 +127,7 @@ def test_released_every_mode_returns_with_its_damping_ratio(bare: MujocoPlant, r
             assert -logarithm / np.hypot(np.pi, logarithm) == pytest.approx(ratio, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["home", "reaching far", "elbow out"])
 def test_arms_of_other_masses_stay_stable_and_within_2_cm(reweighed: MujocoPlant, robot: Robot, name: str) -> None:
     loop = TorqueLoop(reweighed, robot, SETTINGS, posture(robot, name), SLOW)
@@ -138,6 +141,7 @@ def test_arms_of_other_masses_stay_stable_and_within_2_cm(reweighed: MujocoPlant
     assert np.abs(loop.state.v).max() < 2e-3, message
 
 
+@pytest.mark.slow
 def test_it_meets_the_table_at_0_1_m_s_and_bounces_at_most_twice(bare: MujocoPlant, robot: Robot) -> None:
     loop = TorqueLoop(bare, robot, SETTINGS.model_copy(update={"damping_ratio": 0.7}), robot.home)
     way = list(tool_motion(robot, "left", np.array([0.0, 0.0, -0.1]), 2.5, DT, robot.home))

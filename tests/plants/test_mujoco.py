@@ -168,6 +168,7 @@ class TestGripper:
 
 
 class TestTime:
+    @pytest.mark.slow
     @pytest.mark.parametrize("dt", [0.0001, 0.00037, 0.001, 0.0013, 1 / 60, 1 / 72])
     def test_the_stamp_never_strays_from_the_sum_of_ticks_by_a_step(self, plant: MujocoPlant, dt: float) -> None:
         for tick in range(1, 301):

@@ -89,6 +89,7 @@ def test_what_really_can_meet_collides(plant: MujocoPlant, q: list[float], prefi
 SLAB = ObstacleConfig(shape="box", size=(9.0, 9.0, 0.1), position=(0.0, 0.0, -0.25))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("floor", "obstacles", "height"),
     [(0.0, {}, 0.03), (-0.4, {}, -0.37), (None, {}, -4.405), (None, {"floor": SLAB}, -0.17)],

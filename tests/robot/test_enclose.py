@@ -59,6 +59,7 @@ def _geometry(model: str) -> pin.GeometryModel:
     return pin.buildGeomFromUrdfString(pin.buildModelFromXML(text), text, pin.GeometryType.COLLISION)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["panda", "ur5", "xarm7"])
 def test_the_capsules_of_a_real_arm_hold_every_vertex_of_its_meshes(model: str) -> None:
     meshes, enclosed = _geometry(f"example-robot-data:{model}"), _geometry(f"example-robot-data:{model}")
@@ -165,6 +166,7 @@ def _volume(capsules: list[pin.GeometryObject]) -> float:
     return float(sum(np.pi * one.radius**2 * (2 * one.halfLength + 4 / 3 * one.radius) for one in shapes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 3, 4])
 @pytest.mark.parametrize("link", ["forearm_link", "upper_arm_link", "thing"])
 def test_capsules_of_a_link_hold_all_of_its_mesh_together(link: str, count: int) -> None:

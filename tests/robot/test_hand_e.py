@@ -38,6 +38,7 @@ def _outside(point: Array, capsule: pin.GeometryObject, placement: pin.SE3) -> f
     return float(np.linalg.norm(local - [0, 0, np.clip(local[2], -half, half)])) - float(capsule.geometry.radius)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opening", [0.0, 0.005, 0.0125, 0.02, 0.025])
 def test_envelopes_hold_body_and_fingers_at_every_opening(
     hand: tuple[pin.Model, pin.GeometryModel], opening: float

@@ -63,6 +63,7 @@ def test_what_the_warning_says_is_python_that_leaves_nothing_to_say(
     assert (left, preflight_faults(parted, ControllerSettings(), None)) == ([], ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "tools"),
     [

@@ -151,6 +151,7 @@ def test_a_robot_without_collision_shapes_loads_and_watches_no_pair() -> None:
     assert robot.ignored_pairs == ()
 
 
+@pytest.mark.slow
 def test_a_link_and_a_fixed_joint_may_have_one_name() -> None:
     file = load_description("example-robot-data:z1").file
     robot = Robot.from_urdf(file, {"left": "gripperMover"})

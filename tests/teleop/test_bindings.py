@@ -38,6 +38,7 @@ def shift(driver: Operator, way: np.ndarray, turn: np.ndarray, duration: float =
 WAY, TURN = np.array([0.1, -0.05, 0.08]), np.array([0.1, 0.3, -0.2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("action", "position", "rotation"),
     [("precision", 0.25, 0.25), ("rotation_lock", 1.0, 0.0), ("translation_lock", 0.0, 1.0)],

@@ -211,6 +211,7 @@ HELD, BACK = 6.0, 0.002  # the hand goes back after so long, by so much [s, m]
 RATE = 500.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("out", OUT.values(), ids=OUT)
 def test_an_arm_held_up_rests_and_follows_the_first_millimetres_back_at_once_and_without_a_lurch(out: Array) -> None:
     """The left hand goes out smoothly within 2.5 s, trembles there, and comes back at ``HELD``."""

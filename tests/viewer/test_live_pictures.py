@@ -14,6 +14,7 @@ from q2r2_control.viewer.live_pictures import LivePictures
 from tests.support.processes import cell, wait_until
 
 
+@pytest.mark.slow
 def test_a_picture_of_the_cell_comes_and_a_lost_process_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
     camera = CameraConfig(position=(1.5, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48)
     loop = Pipeline.from_config(cell().model_copy(update={"cameras": {"front": camera}}), plant="mujoco")

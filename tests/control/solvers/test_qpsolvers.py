@@ -58,6 +58,7 @@ def _problem(random: np.random.Generator, rows: int, hard: int = 0) -> QpProblem
     return QpProblem(H, random.normal(size=NV), -wide, wide, matrix, lower, hard=hard)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in INSTALLED if name != "daqp"])
 def test_arms_go_with_each_solver_where_they_go_with_daqp(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     chosen = CartesianController(ROBOT, ControllerSettings(), solver=name)

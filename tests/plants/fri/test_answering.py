@@ -107,6 +107,7 @@ def test_the_loop_gets_the_state_after_each_message_and_an_answer_goes_by_what_w
     assert between.ask().io == {"Gripper.Opening": 0.5}
 
 
+@pytest.mark.slow
 def test_messages_from_elsewhere_are_not_answered(between: Between) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.2", 0))
@@ -123,6 +124,7 @@ def test_it_ends_with_the_loop(between: Between) -> None:
         os.kill(between.process.pid, 0)
 
 
+@pytest.mark.slow
 def test_it_outlives_the_loop_until_the_arms_rest() -> None:
     with between_of(LongMotion(ANSWERS)) as between:
         between.process._commands.close()  # as the end of the loop's process does

@@ -53,6 +53,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", list(CASES))
 def test_the_cabinet_sees_no_more_speed_and_acceleration_than_stated(case: str) -> None:
     period = CASES[case][0]

@@ -137,6 +137,7 @@ def test_an_answer_that_came_while_the_cabinet_stood_still_is_heard(config: Conf
     assert (one.cabinet.session, one.cabinet.missed) == (Session.COMMANDING_ACTIVE, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("network", "faults"),
     [

@@ -53,6 +53,7 @@ def error(summary: RunSummary, arm: str) -> float:
     return found
 
 
+@pytest.mark.slow
 def test_a_run_waits_for_the_cabinets_and_refuses_presses_until_then(config: Config) -> None:
     pipeline = make_loop(config)
     told: dict[str, str] = {}
@@ -65,6 +66,7 @@ def test_a_run_waits_for_the_cabinets_and_refuses_presses_until_then(config: Con
     assert {event.kind for event in events} == {ReasonKind.NOT_ENGAGED}
 
 
+@pytest.mark.slow
 def test_an_activation_is_told_and_is_no_warning(config: Config, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     pipeline = make_loop(config)
@@ -74,6 +76,7 @@ def test_an_activation_is_told_and_is_no_warning(config: Config, caplog: pytest.
     assert told == ["INFO"]
 
 
+@pytest.mark.slow
 def test_missing_messages_are_said_once_a_run_for_each_cabinet(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -87,6 +90,7 @@ def test_missing_messages_are_said_once_a_run_for_each_cabinet(
         assert sorted(line.partition(":")[0] for line in lines if "10 messages lost and 0 unreadable" in line) == said
 
 
+@pytest.mark.slow
 def test_a_cabinet_without_the_grippers_output_is_named_once_and_gets_no_write(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -103,6 +107,7 @@ def test_a_cabinet_without_the_grippers_output_is_named_once_and_gets_no_write(
     assert all(cabinet.session is Session.COMMANDING_ACTIVE for cabinet in plant.cabinets.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "network",
     [
@@ -118,6 +123,7 @@ def test_no_guard_trips_through_a_bad_network(config: Config, network: dict[str,
     assert all(summary.arms[arm].engaged_s > 1.5 for arm in SIDES)
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_late_brakes_on_the_stop_that_the_cabinets_get(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
@@ -163,6 +169,7 @@ def test_before_a_session_is_known_to_follow_each_tick_moves_the_reference_by_it
         assert plant.due(0.002 * tick) == pytest.approx((0.0, 0.002))
 
 
+@pytest.mark.slow
 def test_a_command_that_answers_have_passed_is_withdrawn_and_the_arms_go_on(config: Config) -> None:
     pipeline = make_loop(config, jitter=0.0005)
     plant, random, period = started(pipeline), np.random.default_rng(0), 1.0 / config.nominal_rate_hz
@@ -187,6 +194,7 @@ def test_a_command_that_answers_have_passed_is_withdrawn_and_the_arms_go_on(conf
         assert (np.abs(to - q - 0.5 * step * (speed + v)) <= 0.5 * ACCELERATION * step**2 + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_arms_go_on_although_each_tick_takes_longer_than_the_loop_allows_for(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
@@ -203,6 +211,7 @@ def test_arms_go_on_although_each_tick_takes_longer_than_the_loop_allows_for(con
         assert summary.arms[arm].engaged_s > 1.5
 
 
+@pytest.mark.slow
 def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_afterwards(config: Config) -> None:
     blocks, begins_within, period = 0.2, 0.015, 0.005
     pipeline = make_loop(config, (period, period))
@@ -238,6 +247,7 @@ def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_after
         assert summary.arms[arm].engaged_s > 2.0
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_always_too_late_says_so(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
@@ -253,6 +263,7 @@ def test_a_loop_that_is_always_too_late_says_so(config: Config) -> None:
     assert ReasonKind.FRI_OVERTAKEN in {event.reason.root.kind for event in events}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [CommandMode.POSITION, CommandMode.TORQUE])
 def test_arms_follow_as_well_as_without_cabinets(config: Config, mode: CommandMode) -> None:
     robot = Robot.from_config(config)
@@ -278,6 +289,7 @@ class ShiftedArm(SimulatedArm):
         return joints_of(np.add(super().q, self.shift))
 
 
+@pytest.mark.slow
 def test_arms_with_a_state_that_is_not_believed_are_braked_at_every_tick(config: Config, robot: Robot) -> None:
     arms = SimulatedArms(robot, config)
     arms.arms["left"] = left = ShiftedArm(arms, "left")
@@ -320,6 +332,7 @@ def test_the_reference_brakes_as_the_path_does(robot: Robot) -> None:
         np.testing.assert_allclose(controller.step({}, 1e-9).q, path.at(t), atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [CommandMode.POSITION, CommandMode.TORQUE])
 def test_sessions_end_in_every_way_without_a_jump_and_begin_again(config: Config, mode: CommandMode) -> None:
     soak = Soak(make_loop(config, mode=mode, jitter=0.0004, drift=200e-6), sessions=4, seed=1).run()

@@ -23,6 +23,7 @@ from tests.support.headset_server import eventually
 from tests.support.robotiq_gripper import SimulatedGripper
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [1, 2])
 def test_the_sessions_of_both_cabinets_come_to_commanding_where_the_arms_are_held(
     robot: Robot, fri_config: Config, version: int

@@ -331,6 +331,7 @@ def test_a_message_that_cannot_be_the_cabinets_changes_nothing(wrong: bytes) -> 
     assert cabinet.session.state.unreadable == 1
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_wrong_datagrams_raise_nothing() -> None:
     random = np.random.default_rng(0)
     session = ArmSession("left", "cabinet")

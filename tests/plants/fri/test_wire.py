@@ -146,6 +146,7 @@ def test_a_name_that_is_no_text_is_read_all_the_same() -> None:
     assert read_monitoring(datagram.replace(b"valve", b"val\xff\xfe")).io == {"val\ufffd\ufffd": True}
 
 
+@pytest.mark.slow
 @given(edits=st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=8), end=st.integers(0, 400))
 @settings(derandomize=True, max_examples=500, deadline=None)
 def test_changed_bytes_are_read_or_refused_and_never_raise_anything_else(
