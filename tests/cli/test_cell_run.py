@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
-
 from collections.abc import Iterable
+
+import pytest
 
 from q2r2_control.cli.cell_run import show_window
 from q2r2_control.config.moving_obstacle import MovingObstacle

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
-
 import numpy as np
 import pinocchio as pin
+import pytest
 
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot

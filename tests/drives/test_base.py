@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
-
 from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
+import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.drives.base import FEEDBACK_GAIN, TorqueDrive, VelocityDrive

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
-
 from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
+import pytest
 
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.plants.mujoco import MujocoPlant
