@@ -18,7 +18,10 @@ from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
 from q2r2_control.config.presets import RAW_WARNING
 from q2r2_control.control.controller import CartesianController, check_settings
+from q2r2_control.errors import Q2R2Error
+from q2r2_control.plants.base import make_plant
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
+from q2r2_control.robot.cell_parts import load_model
 from q2r2_control.robot.kept_distances import kept_distances, near_at_home
 from q2r2_control.robot.near_pairs import lines_to_paste
 from q2r2_control.robot.pairs import link_of
@@ -75,6 +78,7 @@ class CellCheck:
     driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
     controls: dict[str, str]  # what those of each hand do
     notes: list[str]  # a line for each thing that a user should know of and that is no fault
+    verdict: str  # whether the cell can run
 
 
 def check_cell(config: Config) -> CellCheck:
@@ -95,6 +99,7 @@ def check_cell(config: Config) -> CellCheck:
     notes = [f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in arms if arm.object]
     if config.external is not None and not config.external.filtered:
         notes.append(RAW_WARNING)
+    notes += _notes_on_models(config)
     if config.capsules:
         notes.append(_capsules_note(config, robot))
     if config.note_on_grippers is not None:
@@ -102,6 +107,9 @@ def check_cell(config: Config) -> CellCheck:
     for allowed in config.control.contact_allowed:
         inside = f"the reference gets inside by up to {1e3 * allowed.depth:g} mm at {1e3 * allowed.speed:g} mm/s"
         notes.append(f"{' and '.join(allowed.pair)} may touch in torque mode: {inside}")
+    # Without a controller, whose kernels take minutes to compile: at rest its certificate says no more than this.
+    faults = (*preflight_faults(robot, settings, None), *_plant_faults(config, robot))
+    number = f"{len(faults)} fault{'s' * (len(faults) > 1)}"
     return CellCheck(
         name=config.name,
         arms=arms,
@@ -112,14 +120,33 @@ def check_cell(config: Config) -> CellCheck:
         min_distance=settings.min_distance,
         contacts=tuple(config.control.contact_allowed),
         nearest=[KeptPair(pair.name_a, pair.name_b, pair.distance, least) for pair, least in distances[:_NEAREST]],
-        # Without a controller, whose kernels take minutes to compile: at rest its certificate says no more than this.
-        faults=preflight_faults(robot, settings, None),
+        faults=faults,
         remedies=lines_to_paste(robot, config, near_at_home(robot, kept)),
         stop_torques=stops,
         driven={} if config.external is None else describe(config.external),
         controls=config.teleop.bindings.meanings(),
         notes=notes + [_stop_note(stop) for stop in stops if stop.stop.ratio > 1.0],
+        verdict=f"this cell cannot run: {number}" if faults else "this cell can run",
     )
+
+
+def _plant_faults(config: Config, robot: Robot) -> list[str]:
+    """Why the simulation of a run cannot be made, such as an inertia that no body has."""
+    if config.plant != "mujoco":  # others may hold a device, which no check may take
+        return []
+    try:
+        make_plant(config.plant, robot, config).close()
+    except Q2R2Error as error:
+        return [f"plant {config.plant}: {error}"]
+    return []
+
+
+def _notes_on_models(config: Config) -> list[str]:
+    """What a user should look at in the models, as they were written."""
+    if config.robot is not None:
+        return [f"robot: {note}" for note in load_model(config.robot, config.packages, "robot").notes]
+    arms = {side: load_model(arm, config.packages, f"arms.{side}") for side, arm in config.arms.items()}
+    return [f"{side} arm: {note}" for side, model in arms.items() for note in model.notes]
 
 
 def _capsules_note(config: Config, robot: Robot) -> str:

@@ -95,6 +95,7 @@ def _print_cell(cell: CellCheck) -> None:
         console.print(f"FAULT {fault}", style="red", markup=False)
     for line in cell.remedies:
         console.print(line, markup=False)
+    console.print(cell.verdict, style="red" if cell.faults else "green", markup=False)
 
 
 def _cell_tables(cell: CellCheck) -> Iterator[Table]:

@@ -32,6 +32,7 @@ from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_na
 from q2r2_control.robot.reachability import nearest_approaches, srdf_text
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
+from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
 
@@ -51,6 +52,7 @@ class _Draft:
 
     file: Path
     data: dict[str, Any]
+    notes: list[str] = field(default_factory=list)  # of what was guessed
     faults: list[str] = field(default_factory=list)  # that the check of a cell does not look for
     fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # by model
     always: list[tuple[str, str]] = field(default_factory=list)  # links that overlap by construction
@@ -127,11 +129,11 @@ def new_cell(
         draft.data["srdf"] = srdf.name
     file.write_text(commented_yaml(draft.data, cell), encoding="utf-8")
     result = check_cell(load_config(file))
-    faults = [*draft.faults, *result.faults]
+    notes, faults = [*draft.notes, *result.notes], [*draft.faults, *result.faults]
     if json:
-        print(as_json_text({"file": str(file), "capsules": draft.fits, "notes": result.notes, "faults": faults}))
+        print(as_json_text({"file": str(file), "capsules": draft.fits, "notes": notes, "faults": faults}))
     else:
-        _print(draft, result.notes, faults)
+        _print(draft, notes, faults)
     raise Exit(1 if faults else 0)
 
 
@@ -154,7 +156,11 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         chains[side] = tree.chain(tip)
         if len(chains[side]) < _LEAST_JOINTS:
             moves = f"joints that move {tip}: {len(chains[side])}"
-            raise ConfigError(f"{models[side]!r:.120}: {moves}; allowed: an arm, of {_LEAST_JOINTS} or more")
+            mimics = [
+                f"{name} mimics {mimic[0]}" for name, joint in tree.movable().items() if (mimic := mimic_of(joint))
+            ]
+            but = f"; {', '.join(mimics):.200}, so that it ends the arm like a gripper's" if mimics else ""
+            raise ConfigError(f"{models[side]!r:.120}: {moves}; allowed: an arm, of {_LEAST_JOINTS} or more{but}")
         limits, masses = lacks_of(described[side], tree, tip)
         if limits:
             lacks.append(f"{models[side]}: {', '.join(limits)}")
@@ -175,6 +181,8 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         arms[side] |= {"tip": found[side], "home": [float(np.mean(joint_limits(joint))) for joint in joints]}
         if gripper := gripper_of(described[side], tree, found[side]):
             arms[side]["gripper"] = gripper
+            driven = ", ".join(gripper["joints"])
+            draft.notes.append(f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints")
     # Fingers are all that they sweep, which finer shapes would hardly make smaller.
     moved = {
         side: links_moved_by(tree, [joint.get("name", "") for joint in chains[side]])

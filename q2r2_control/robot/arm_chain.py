@@ -18,6 +18,8 @@ from q2r2_control.robot.description import LinkTree, joint_end
 from q2r2_control.robot.pinocchio_models import joint_origin
 
 _GRIPPER_JOINT = re.compile(r"gripper|finger|jaw|thumb|knuckle", re.IGNORECASE)
+# A wrist that turns the gripper is the arm's, such as gripper_roll_joint.
+_WRIST_JOINT = re.compile(r"gripper_?(roll|rotat|twist|yaw|pitch|swivel)", re.IGNORECASE)
 # Links beside the tool. A sensor may carry the tool.
 _SIDE_BRANCH = re.compile(r"finger|jaw|thumb|knuckle|camera|antenna|imu", re.IGNORECASE)
 _SENSOR = re.compile(r"sensor|accelerometer|_range", re.IGNORECASE)
@@ -115,7 +117,9 @@ def named_joints(tree: LinkTree, tip: str, names: Sequence[str], key: str) -> li
 def _is_gripper_joint(tree: LinkTree, joint: ET.Element) -> bool:
     name = joint.get("name", "")
     mimicked = any(found.get("joint") == name for other in tree.joint_to.values() for found in other.findall("mimic"))
-    return mimicked or joint.find("mimic") is not None or _GRIPPER_JOINT.search(name) is not None
+    if mimicked or joint.find("mimic") is not None:
+        return True
+    return _GRIPPER_JOINT.search(name) is not None and _WRIST_JOINT.search(name) is None
 
 
 def _place_in(tree: LinkTree, link: str, end: str) -> np.ndarray:

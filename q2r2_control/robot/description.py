@@ -15,6 +15,7 @@ from pathlib import Path
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.packages import expand_xacro, package_file
+from q2r2_control.robot.urdf_forms import notes_on, scale_to_metres, unify
 from q2r2_control.robot.urdf_parts import ATTRIBUTES
 
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
@@ -39,6 +40,7 @@ _SCALARS = {
     "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
     "limit": ("lower", "upper", "velocity", "effort", *ATTRIBUTES),
     "rotor": ("inertia", "gear"),
+    "safety_controller": ("soft_lower_limit", "soft_upper_limit"),
     "mimic": ("multiplier", "offset"),
 }
 
@@ -50,6 +52,7 @@ class Description:
     urdf: ET.Element
     srdf: ET.Element | None
     file: Path
+    notes: tuple[str, ...] = ()  # of what was written, each for a user to look at
 
     @property
     def name(self) -> str:
@@ -83,14 +86,15 @@ def load_description(
             file = _shipped_model(model)
         srdf_file = file.with_name(file.name.removesuffix(".xacro").removesuffix(".urdf") + ".srdf")
     if file.suffix == ".xacro":
-        text = expand_xacro(file, xacro_args or {}, packages)
+        text: str | bytes = expand_xacro(file, xacro_args or {}, packages)
     elif xacro_args:
         raise ConfigError(f"{model}: xacro_args are for models that end in .xacro")
     else:
         text = _read(file)
     urdf = parse_urdf(text, str(file), file.parent, packages)
+    scale_to_metres(urdf)
     srdf = parse_srdf(_read(srdf_file), str(srdf_file)) if srdf_file is not None and srdf_file.is_file() else None
-    return Description(urdf=urdf, srdf=srdf, file=file)
+    return Description(urdf, srdf, file, tuple(notes_on(parse_srdf(text, str(file)))))
 
 
 def _shipped_model(model: str) -> Path:
@@ -108,7 +112,7 @@ def _shipped_model(model: str) -> Path:
 
 
 def parse_urdf(
-    text: str, where: str, folder: Path | None = None, packages: Mapping[str, str] | None = None
+    text: str | bytes, where: str, folder: Path | None = None, packages: Mapping[str, str] | None = None
 ) -> ET.Element:
     """Parse a URDF, check that it is one tree with unique names and finite numbers, and make mesh paths absolute.
 
@@ -118,6 +122,7 @@ def parse_urdf(
     """
     root = parse_srdf(text, where)  # both begin alike
     _check_numbers(root, where)
+    unify(root, where)
     # A shape that a reader skips would be a body that nobody watches.
     for link in root.findall("link"):
         for collision in link.findall("collision"):
@@ -141,7 +146,7 @@ def parse_urdf(
     return root
 
 
-def parse_srdf(text: str, where: str) -> ET.Element:
+def parse_srdf(text: str | bytes, where: str) -> ET.Element:
     """Parse an SRDF. Raises :class:`RobotError` that begins with ``where``."""
     try:
         root = ET.fromstring(text)
@@ -267,10 +272,11 @@ def _example_robot(name: str) -> tuple[Path, Path | None]:
     return folder / loader.urdf_subpath / loader.urdf_filename, srdf
 
 
-def _read(file: Path) -> str:
+def _read(file: Path) -> bytes:
+    """The bytes of an XML file, whose first line may name their encoding."""
     try:
-        return file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        return file.read_bytes()
+    except OSError as error:
         raise RobotError(f"{file}: cannot be read: {error}") from error
 
 

@@ -7,6 +7,7 @@ in it. Loops that constraints close stay open.
 from __future__ import annotations
 
 import os
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from q2r2_control.robot.urdf_parts import numbers
 from q2r2_control.types import Array
 
 _MESHES = (".stl", ".obj")  # that others than MuJoCo read
+_TOOL_SITE = re.compile(r"attachment|tcp|tool|end_?eff|(^|_)eef?(_|$)|grasp|pinch|flange", re.IGNORECASE)
 _Joint, _Geom = mujoco.mjtJoint, mujoco.mjtGeom
 _ON_JOINTS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 # Of links between two joints of one body, without which no simulation takes them [kg], [kg m^2].
@@ -100,6 +102,18 @@ class _Writer:
             if not joints:
                 self._add_joint(self._new_name(f"{name}_fixed"), "fixed", link, name, at)
         self._add_link(body, name, within)
+        if body in self._links:
+            self._add_tool_sites(body)
+
+    def _add_tool_sites(self, body: int) -> None:
+        """A URDF has no sites, so those with the name of a tool's frame become links, which a cell can name as tips."""
+        model = self._model
+        for i in np.flatnonzero(model.site_bodyid == body).tolist():
+            if _TOOL_SITE.search(site := model.site(i).name):
+                at = self._within[body].inverse() * _pose(model.site_pos[i], model.site_quat[i])
+                link = self._new_name(site)
+                ET.SubElement(self._urdf, "link", name=link)
+                self._add_joint(self._new_name(f"{link}_fixed"), "fixed", self._links[body], link, at)
 
     def _new_name(self, wanted: str) -> str:
         while wanted in self._names:

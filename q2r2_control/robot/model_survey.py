@@ -18,6 +18,7 @@ from q2r2_control.robot.arm_chain import arm_ends, default_tip, end_of
 from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits
 from q2r2_control.robot.enclose import Capsule, capsules_around, enclose_shapes
 from q2r2_control.robot.pairs import link_of, links_moved_by
+from q2r2_control.robot.pinocchio_models import read_models
 from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 
@@ -67,6 +68,9 @@ def lacks_of(description: Description, tree: LinkTree, tip: str) -> tuple[list[s
     limits, masses, links = [], [], description.urdf.findall("link")
     for joint in tree.chain(tip):
         limit, name = joint.find("limit"), joint.get("name", "")
+        if (kind := joint.get("type")) in ("floating", "planar"):
+            limits.append(f"{name} is {kind}, and the base of an arm is fixed: make it fixed")
+            continue
         written = {} if limit is None else limit.attrib
         lacking = [what for what in ("velocity", "effort") if not float(written.get(what, "0")) > 0.0]
         lower, upper = joint_limits(joint)
@@ -97,9 +101,7 @@ def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, 
     travels = [joint_limits(beyond[name]) for name in driven]
     ends = max(travels, key=travels.count)
     driven = [name for name, travel in zip(driven, travels, strict=True) if travel == ends]
-    text = ET.tostring(description.urdf, encoding="unicode")
-    model = pin.buildModelFromXML(text)
-    geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+    model, geometry = read_models(description.urdf, str(description.file))
     enclose_shapes(geometry)
     moved = links_moved_by(tree, driven)
     shapes = [item for item in geometry.geometryObjects if link_of(item.name) in moved]
@@ -159,9 +161,7 @@ def capsule_fits(description: Description, several: Collection[str]) -> list[Cap
 
     Several capsules are tried for the meshes of links in ``several``.
     """
-    text = ET.tostring(description.urdf, encoding="unicode")
-    model = pin.buildModelFromXML(text)
-    meshes = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+    _, meshes = read_models(description.urdf, str(description.file))
     capsules = meshes.copy()
     enclose_shapes(capsules)
     fits = []
@@ -169,6 +169,8 @@ def capsule_fits(description: Description, several: Collection[str]) -> list[Cap
         if not isinstance(mesh.geometry, coal.BVHModelBase) or not isinstance(item.geometry, coal.Capsule):
             continue
         points = np.array(mesh.geometry.vertices())
+        if len(points) <= points.shape[1]:  # a single triangle
+            continue
         hull = ConvexHull(points, qhull_options="QJ")  # QJ: flat ones too
         radius, half = float(item.geometry.radius), float(item.geometry.halfLength)
         surface = mesh.placement.actInv(item.placement)

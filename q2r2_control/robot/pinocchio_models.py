@@ -6,7 +6,9 @@ import copy
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Mapping
+from pathlib import Path
 
+import coal
 import numpy as np
 import pinocchio as pin
 
@@ -107,16 +109,49 @@ def build_models(
     """
     locked = copy.deepcopy(urdf)
     lock_joints(locked, {name for chain in chains.values() for name in chain}, home)
-    try:
-        text = ET.tostring(locked, encoding="unicode")
-        model = pin.buildModelFromXML(text)
-        geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
-        if geometry.ngeoms != (written := len(urdf.findall("link/collision"))):
-            raise RobotError(f"{where}: Pinocchio read {geometry.ngeoms} of {written} collision shapes")
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise RobotError(f"{where}: Pinocchio cannot read it: {' '.join(str(error).split())}") from error
+    model, geometry = read_models(locked, where)
+    if geometry.ngeoms != (written := len(urdf.findall("link/collision"))):
+        raise RobotError(f"{where}: Pinocchio read {geometry.ngeoms} of {written} collision shapes")
     _set_rotors(model, urdf)
     return model, geometry
+
+
+def read_models(urdf: ET.Element, where: str) -> tuple[pin.Model, pin.GeometryModel]:
+    """Kinematics and collision shapes as Pinocchio reads them, each mesh with some extent.
+
+    Raises :class:`RobotError` that begins with ``where``, and names the mesh that cannot be read.
+    """
+    text = ET.tostring(urdf, encoding="unicode")
+    try:
+        model = pin.buildModelFromXML(text)
+        geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+    except (ValueError, RuntimeError, IndexError) as error:
+        for mesh in urdf.iterfind("link/collision/geometry/mesh"):
+            _check_mesh(mesh.get("filename", ""), where)
+        raise RobotError(f"{where}: Pinocchio cannot read it: {' '.join(str(error).split())}") from error
+    for item in geometry.geometryObjects:
+        if isinstance(item.geometry, coal.BVHModelBase) and not _has_extent(item.geometry):
+            has = "has no triangles, or all in one line"
+            raise RobotError(f"{where}: mesh {item.meshPath!r:.200} {has}; allowed: a body")
+    return model, geometry
+
+
+def _check_mesh(file: str, where: str) -> None:
+    try:
+        coal.MeshLoader().load(file, np.ones(3))
+    except (ValueError, RuntimeError, IndexError) as error:
+        is_pointer = Path(file).read_bytes().startswith(b"version https://git-lfs")
+        allowed = "the file itself, for which this is Git LFS's pointer: git lfs pull" if is_pointer else "a whole mesh"
+        raise RobotError(f"{where}: mesh {file!r:.200} cannot be read; allowed: {allowed}") from error
+
+
+def _has_extent(mesh: coal.BVHModelBase) -> bool:
+    """Whether the corners of a mesh lie in more than one line."""
+    points = np.array(mesh.vertices()).reshape(-1, 3)
+    if len(points) < 3 or not np.isfinite(points).all():
+        return False
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] > 1e-9 * max(float(spread[0]), 1e-12))
 
 
 def _set_rotors(model: pin.Model, urdf: ET.Element) -> None:

@@ -32,6 +32,7 @@ _SAMPLES_A_TICK = 2
 _RANDOM_WAYS = 300
 _SPREAD = 0.6  # of random way points [rad]
 _INSIDE = 0.02  # of joint limits [rad]
+_NARROWEST = 1e-3  # range of a joint in which a home can be written down [rad or m]
 
 
 class HomingStep(NamedTuple):
@@ -248,7 +249,20 @@ def preflight_faults(
     no controller is about to move the arms: a stop of arms at rest keeps all apart where the distances are kept.
     """
     lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
+    change = "to change: control.position_margin, or a fixed joint in the model"
+    # A joint's index in Pinocchio's model is one more than in the vectors, since the world comes first.
+    shaped = {item.parentJoint - 1 for item in robot.collision_model.geometryObjects}
     faults = [
+        f"{name} arm: no link between its base and its tool has a collision shape; allowed: a model with <collision>"
+        for name, arm in robot.arms.items()
+        if not shaped & set(arm.joints[:-1].tolist())  # the last one moves the tool
+    ]
+    faults += [
+        f"{name}: position_margin leaves {max(left, 0.0):g} rad of its range; {change}"
+        for name, left in zip(robot.joint_names, upper - lower, strict=True)
+        if left < _NARROWEST
+    ]
+    faults += [
         f"home: {name} = {q:g}; allowed: {least:g} .. {most:g} rad, position_margin included"
         for name, q, least, most in zip(robot.joint_names, robot.home, lower, upper, strict=True)
         if not least <= q <= most

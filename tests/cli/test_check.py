@@ -30,9 +30,37 @@ def test_check_prints_arms_limits_obstacles_and_the_nearest_pairs_of_a_good_cell
         assert expected in result.stdout
     assert "arms driven by the built-in controller\n" in result.stdout
     assert "FAULT" not in result.stdout
+    assert result.stdout.endswith("\nthis cell can run\n")
 
 
 @pytest.mark.slow
+def other_arms(folder: Path, pattern: str, new: str) -> str:
+    """The shipped cell with arms of its own, in whose model each text that fits ``pattern`` is another one."""
+    text = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
+    (folder / "other.urdf").write_text(re.sub(pattern, new, text, flags=re.DOTALL), encoding="utf-8")
+    cell = find_resource(CELL).read_text(encoding="utf-8").replace("model: iiwa7", f"model: {folder / 'other.urdf'}")
+    (folder / "cell.yaml").write_text(cell, encoding="utf-8")
+    return str(folder / "cell.yaml")
+
+
+@pytest.mark.parametrize(
+    ("pattern", "new", "fault"),
+    [
+        (r'ixx="[^"]*"', 'ixx="9"', "inertia must satisfy"),
+        (r"<collision>.*?</collision>", "", "left arm: no link between its base and its tool has a collision shape"),
+    ],
+    ids=["an inertia that no body has", "no collision shapes"],
+)
+def test_check_refuses_arms_that_a_run_refuses(tmp_path: Path, pattern: str, new: str, fault: str) -> None:
+    cell = other_arms(tmp_path, pattern, new)
+    checked, ran = q2r2("check", cell), q2r2("run", cell, "--fast", "--headless", "--duration", "0.1")
+    assert checked.exit_code == 1
+    assert re.search(f"FAULT .*{fault}", checked.stdout)
+    assert re.search(r"\nthis cell cannot run: \d faults?\n$", checked.stdout)
+    assert ran.exit_code == 2
+    assert fault in ran.stderr
+
+
 def test_check_compiles_no_kernel(tmp_path: Path) -> None:
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
     command = [sys.executable, "-m", "q2r2_control", "check", CELL]
@@ -125,7 +153,8 @@ def test_the_lines_that_check_prints_for_links_that_are_too_near_make_the_cell_g
     refused = q2r2("check", str(cell))
     assert refused.exit_code == 1
     assert says in refused.stdout
-    lines = refused.stdout.splitlines()
+    *lines, verdict = refused.stdout.splitlines()
+    assert verdict.startswith("this cell cannot run")
     last_fault = max(number for number, line in enumerate(lines) if line.startswith("FAULT"))
     for line in lines[last_fault + 1 :]:
         if line.endswith(".srdf:"):

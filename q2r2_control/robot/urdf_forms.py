@@ -1,0 +1,118 @@
+"""Parts of a URDF that its readers take in different ways: each is brought to one form, refused, or told.
+
+Readers of URDF skip what they do not know without a word. What is skipped could be a hand, a mass or half of a joint's
+range.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.errors import RobotError
+
+_LARGEST_ANGLE = 6.0 * math.pi  # that a joint which counts its turns usually has [rad]
+_LARGEST_SPEED = 40.0  # of an arm's joint [rad/s]
+_UNIT = re.compile(r"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]+)[\"']")
+_HEADER = 20_000  # characters of a COLLADA file, in which its unit stands
+_UNIT_LENGTH = 1e-3  # that a quaternion's length may be off 1
+
+
+def unify(root: ET.Element, where: str) -> None:
+    """Bring origins by quaternion to roll, pitch and yaw, in place.
+
+    Raises :class:`RobotError` that begins with ``where`` for elements of xacro, which all readers skip, and for links
+    with a mass and no inertia, which Pinocchio leaves out with their shapes.
+    """
+    _refuse_xacro(root, where)
+    for origin in root.iter("origin"):
+        _unify_origin(origin, where)
+    for link in root.findall("link"):
+        _check_inertial(link, where)
+
+
+def notes_on(root: ET.Element) -> list[str]:
+    """A line for each joint of a model, as it was written, that a user should look at."""
+    notes = []
+    for joint in root.findall("joint"):
+        name, limit = joint.get("name", ""), joint.find("limit")
+        if (soft := _soft_limits(joint)) is not None:
+            range_ = f"{soft[0]:g} .. {soft[1]:g}"
+            notes.append(
+                f"{name} may leave the soft limits of its safety_controller, {range_}; to keep them: its <limit>"
+            )
+        if limit is None or joint.get("type") != "revolute":
+            continue
+        lower, upper, speed = (float(limit.get(what, "0")) for what in ("lower", "upper", "velocity"))
+        if max(-lower, upper) > _LARGEST_ANGLE or speed > _LARGEST_SPEED:
+            limits = f"{lower:g} .. {upper:g} rad and {speed:g} rad/s"
+            notes.append(f"{name} has limits of {limits}; a URDF has radians: are these degrees?")
+    return notes
+
+
+def scale_to_metres(root: ET.Element) -> None:
+    """Scale collision meshes by their files' units, in place. COLLADA names one, which RViz applies, not Pinocchio."""
+    for mesh in root.iterfind("link/collision/geometry/mesh"):
+        if (unit := _unit_of(mesh.get("filename", ""))) != 1.0:
+            scale = [unit * float(part) for part in mesh.get("scale", "1 1 1").split()]
+            mesh.set("scale", " ".join(map(repr, scale)))
+
+
+def _soft_limits(joint: ET.Element) -> tuple[float, float] | None:
+    """The range that a joint's ``safety_controller`` leaves of its position limits; None if it leaves all of it.
+
+    A range of no width counts as none, since both of its ends are 0 where they are not written.
+    """
+    safety, limit = joint.find("safety_controller"), joint.find("limit")
+    if safety is None or limit is None or joint.get("type") not in ("revolute", "prismatic"):
+        return None
+    hard = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
+    soft = float(safety.get("soft_lower_limit", "0")), float(safety.get("soft_upper_limit", "0"))
+    left = max(hard[0], soft[0]), min(hard[1], soft[1])
+    return left if soft[0] < soft[1] and left != hard and left[0] < left[1] else None
+
+
+def _unit_of(file: str) -> float:
+    """The length of a mesh file's unit [m]."""
+    if not file.lower().endswith(".dae"):
+        return 1.0
+    with Path(file).open(encoding="utf-8", errors="replace") as opened:
+        found = _UNIT.search(opened.read(_HEADER))
+    return float(found[1]) if found else 1.0
+
+
+def _refuse_xacro(root: ET.Element, where: str) -> None:
+    found = dict.fromkeys(
+        one.tag.rpartition("}")[2] for one in root.iter() if "xacro" in str(one.tag).partition("}")[0]
+    )
+    if found:
+        names = ", ".join(f"xacro:{name}" for name in found)
+        allowed = "what xacro makes of it, or a name that ends in .xacro"
+        raise RobotError(f"{where}: has {names:.100}, which readers of URDF skip; allowed: {allowed}")
+
+
+def _unify_origin(origin: ET.Element, where: str) -> None:
+    text = origin.attrib.pop("quat_xyzw", None)
+    if text is None:
+        return
+    try:
+        x, y, z, w = map(float, text.split())
+    except ValueError:
+        x = y = z = w = math.nan
+    if not abs(math.hypot(x, y, z, w) - 1.0) <= _UNIT_LENGTH or "rpy" in origin.attrib:
+        allowed = "four numbers of length 1, and no rpy beside it"
+        raise RobotError(f"{where}: an origin has quat_xyzw = {text!r:.60}; allowed: {allowed}")
+    rpy = pin.rpy.matrixToRpy(pin.Quaternion(np.array([x, y, z, w])).normalized().matrix())
+    origin.set("rpy", " ".join(map(repr, rpy.tolist())))
+
+
+def _check_inertial(link: ET.Element, where: str) -> None:
+    inertial = link.find("inertial")
+    if inertial is None or inertial.find("mass") is None or inertial.find("inertia") is not None:
+        return
+    raise RobotError(f"{where}: the <inertial> of link {link.get('name')} has a mass and no <inertia>; allowed: both")

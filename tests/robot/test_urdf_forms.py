@@ -1,0 +1,108 @@
+"""Forms of a URDF that readers take in different ways are brought to one, refused, or told."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.description import load_description, parse_urdf
+from q2r2_control.robot.pinocchio_models import joint_origin, read_models
+from q2r2_control.robot.urdf_forms import notes_on
+
+ARM = """<robot name="arm"><link name="base"/><link name="hand">{link}</link>
+<joint name="turn" type="revolute"><parent link="base"/><child link="hand"/><origin xyz="0 0 1" {origin}/>
+<limit lower="{lower}" upper="{upper}" velocity="{speed}" effort="9"/>{safety}</joint></robot>"""
+USUAL = {"link": "", "origin": "", "lower": "-1", "upper": "1", "speed": "2", "safety": ""}
+TRIANGLE = (
+    b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid"
+)
+COLLADA = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="millimeter" meter="0.001"/></asset></COLLADA>"""
+
+
+def arm(**parts: str) -> ET.Element:
+    return parse_urdf(ARM.format(**(USUAL | parts)), "arm.urdf")
+
+
+def test_an_origin_by_quaternion_is_the_pose_that_roll_pitch_and_yaw_say() -> None:
+    turned = pin.Quaternion(pin.rpy.rpyToMatrix(0.3, -0.7, 2.0)).coeffs()
+    joint = arm(origin=f'quat_xyzw="{" ".join(map(str, turned))}"').find("joint")
+    assert joint is not None
+    np.testing.assert_allclose(joint_origin(joint).rotation, pin.rpy.rpyToMatrix(0.3, -0.7, 2.0), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "origin", ['quat_xyzw="0 0 0 2"', 'quat_xyzw="0 0 1"', 'quat_xyzw="a b c d"', 'quat_xyzw="0 0 0 1" rpy="0 0 0"']
+)
+def test_a_quaternion_that_says_no_rotation_or_says_it_twice_is_refused(origin: str) -> None:
+    with pytest.raises(RobotError, match="quat_xyzw"):
+        arm(origin=origin)
+
+
+def test_elements_of_xacro_are_refused_by_name_since_readers_skip_them() -> None:
+    text = ARM.format(**USUAL).replace("</robot>", "<xacro:hand xmlns:xacro='http://ros.org/wiki/xacro'/></robot>")
+    with pytest.raises(RobotError, match=r"xacro:hand.*allowed.*\.xacro"):
+        parse_urdf(text, "arm.urdf")
+
+
+def test_a_mass_without_an_inertia_is_refused_with_the_link_that_has_it() -> None:
+    with pytest.raises(RobotError, match="link hand has a mass and no <inertia>"):
+        arm(link="<inertial><mass value='1'/></inertial>")
+
+
+@pytest.mark.parametrize(
+    ("parts", "said"),
+    [
+        ({"safety": "<safety_controller soft_lower_limit='-0.5' soft_upper_limit='0.5'/>"}, "soft limits"),
+        ({"lower": "-170", "upper": "170"}, "degrees"),
+        ({"speed": "180"}, "degrees"),
+    ],
+)
+def test_limits_that_a_user_should_look_at_are_told_with_their_joint(parts: dict[str, str], said: str) -> None:
+    (note,) = notes_on(ET.fromstring(ARM.format(**(USUAL | parts))))
+    assert note.startswith("turn ")
+    assert said in note
+
+
+@pytest.mark.parametrize("safety", ["", "<safety_controller k_velocity='1'/>"])
+def test_usual_limits_need_no_note(safety: str) -> None:
+    assert notes_on(ET.fromstring(ARM.format(**(USUAL | {"safety": safety})))) == []
+
+
+def test_a_file_is_read_by_the_encoding_that_its_first_line_names(tmp_path: Path) -> None:
+    text = '<?xml version="1.0" encoding="ISO-8859-1"?><!-- Gr\u00fc\u00dfe -->' + ARM.format(**USUAL)
+    (tmp_path / "arm.urdf").write_bytes(text.encode("latin-1"))
+    assert load_description(str(tmp_path / "arm.urdf")).name == "arm"
+
+
+def with_mesh(folder: Path, name: str, content: bytes) -> ET.Element:
+    (folder / name).write_bytes(content)
+    shape = f'<collision><geometry><mesh filename="{name}" scale="2 1 1"/></geometry></collision>'
+    (folder / "arm.urdf").write_text(ARM.format(**(USUAL | {"link": shape})), encoding="utf-8")
+    return load_description(str(folder / "arm.urdf")).urdf
+
+
+def test_collision_meshes_in_millimetres_are_scaled_to_metres(tmp_path: Path) -> None:
+    mesh = next(with_mesh(tmp_path, "hand.dae", COLLADA.encode()).iter("mesh"))
+    assert [float(part) for part in mesh.get("scale", "").split()] == pytest.approx([2e-3, 1e-3, 1e-3])
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"), (b"\0" * 84, "hand.stl")],
+    ids=["pointer of Git LFS", "no triangles"],
+)
+def test_a_mesh_that_cannot_be_read_is_named(tmp_path: Path, content: bytes, said: str) -> None:
+    with pytest.raises(RobotError, match=said):
+        read_models(with_mesh(tmp_path, "hand.stl", content), "arm.urdf")
+
+
+def test_a_mesh_of_one_triangle_is_a_body(tmp_path: Path) -> None:
+    _, geometry = read_models(with_mesh(tmp_path, "hand.stl", TRIANGLE), "arm.urdf")
+    assert isinstance(geometry.geometryObjects[0].geometry, coal.BVHModelBase)
