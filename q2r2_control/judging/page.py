@@ -87,7 +87,7 @@ def page_of(episodes: Sequence[Judged], title: str, progress: Callable[[int], No
         cells = "".join(f"<td>{column.text(judged.figures)}</td>" for column in COLUMNS)
         rows.append(f'<tr><th><a href="#episode-{number}">{name}</a></th><td>{badge}</td>{cells}</tr>')
         reasons = "".join(f"<li>{escape(reason.text)}</li>" for reason in judged.verdict.reasons)
-        about = f"<p>{escape(judged.figures.task)}</p><ul>{reasons}</ul>"
+        about = f"<p>{escape(judged.figures.task or '')}</p><ul>{reasons}</ul>"
         # Each picture is an image of its own, since names of elements are the same in all of them.
         data = b64encode(draw_episode(judged).encode()).decode()
         size = 'width="1248" height="806"'

@@ -115,11 +115,16 @@ class Recording:
 
     def pictures(self, camera: str) -> Iterator[Picture]:
         """All pictures of a camera, in the order of time."""
-        for messages in self.messages((self._topic_of(camera),)):
+        return (picture for _, picture in self.pictures_of((camera,)))
+
+    def pictures_of(self, cameras: Iterable[str]) -> Iterator[tuple[str, Picture]]:
+        """All pictures of some cameras, with the camera, those of each in the order of time."""
+        names = {self._topic_of(camera): camera for camera in cameras}
+        for messages in self.messages(names):
             for message in messages:
                 with self._faults():
                     picture = Picture(message.time, message.number, bytes(data_of(message.payload, PICTURE)))
-                yield picture
+                yield names[self.declared_topics[message.channel].name], picture
 
     def _topic_of(self, camera: str) -> str:
         return picture_topic(camera)
@@ -164,6 +169,15 @@ class Recording:
     def closed(self) -> bool:
         """Whether the file has an index, which is written last: not where its process was killed or the disk full."""
         return self._summary() is not None
+
+    @property
+    def counts(self) -> dict[str, int] | None:
+        """How many messages each topic has; None where the file has no index."""
+        summary = self._summary()
+        if summary is None or summary.statistics is None:
+            return None
+        counts, channels = summary.statistics.channel_message_counts, summary.channels.values()
+        return {channel.topic: counts.get(channel.id, 0) for channel in channels}
 
     @property
     def conclusion(self) -> Conclusion:
