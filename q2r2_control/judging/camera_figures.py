@@ -17,7 +17,9 @@ from q2r2_control.types import Array, Flags
 _DARK = 8.0  # mean brightness of a black picture, of 255
 _PLAIN = 1.0  # standard deviation of the brightness of a picture of one colour, of 255
 _TRAVEL = 0.01  # of an arm's joints between two pictures, from which on the picture has to change [rad]
-_ODD, _ODD_RATIO = 10.0, 3.0  # brightness by which a damaged picture is unlike both neighbours, and unlike as they are
+_ODD, _ODD_RATIO = 10.0, 3.0  # brightness by which a part of a damaged picture is unlike its neighbours, beyond theirs
+_PARTS = (4, 6, 4, 8)  # of a view: rows of parts, rows in each; columns of parts, columns in each
+_QUICK = 10.0  # rate from which on nothing passes a part of the picture between two pictures [Hz]
 LARGEST_LAG = 0.4  # that is looked for [s]
 _LAG_STEP = 0.02  # [s]
 _IN_TIME = 0.1  # a lag up to this one is believed where it explains the motion nearly as well as the best one [s]
@@ -25,7 +27,8 @@ _NEARLY = 0.05  # of the motion in the pictures
 _LEAST_FIT = 0.35  # of the motion in the pictures that the arms' explains
 _FEWEST = 20  # pictures of which a lag or an arm can be told
 _LEAST_TRAVEL = 0.5  # of an arm's joints in the whole episode, of which its camera can be told [rad]
-_OTHER_ARM = 0.2  # by which pictures of a swapped camera correlate more with the other arm
+_CORRELATES = 0.4  # the change of pictures with the arm that carries their camera, at least
+_OTHER_ARM = 0.2  # by which the pictures of two swapped cameras correlate more with the other's arm, together
 _STILL = 3.0  # change of brightness of what stands still, of 255
 _MOSTLY, _HARDLY = 0.5, 0.35  # of what a camera sees stands still: a fixed camera, one that an arm carries
 
@@ -97,11 +100,11 @@ class _CameraLook:
         return float(same[moved].mean()) if moved.any() else None
 
     def _odd(self, views: Array) -> Flags:
-        """Pictures unlike the ones before and after, which are like each other: what damaged pixels look like."""
+        """Pictures with a part unlike before and after, which are like each other: what damaged pixels look like."""
         odd = np.zeros(len(views), dtype=bool)
-        if len(views) > 2:
-            across = np.abs(views[2:] - views[:-2]).mean(axis=(1, 2))
-            odd[1:-1] = np.minimum(self._change[:-1], self._change[1:]) > _ODD + _ODD_RATIO * across
+        if len(views) > 2 and self._rate >= _QUICK:
+            change, across = _by_part(np.diff(views, axis=0)), _by_part(views[2:] - views[:-2])
+            odd[1:-1] = (np.minimum(change[:-1], change[1:]) > _ODD + _ODD_RATIO * across).any(axis=1)
         return odd
 
     def travel(self, arm: str, lag: float = 0.0) -> Array:
@@ -129,18 +132,12 @@ class _CameraLook:
         best = near if near.max() >= fits.max() - _NEARLY else fits
         return float(lags[np.argmax(best)]) if fits.max() >= _LEAST_FIT else None
 
-    def other_arm(self) -> str | None:
-        """The arm with whose motion the pictures clearly go, where another one carries the camera."""
-        others = [arm for arm in self._joints if arm != self.arm]
-        if self.arm is None or not others or len(self._change) < _FEWEST or not self._change.any():
-            return None
-        fits = {arm: self._correlation(arm) for arm in self._joints}
-        best = max(others, key=lambda arm: fits[arm])
-        return best if fits[best] > fits[self.arm] + _OTHER_ARM and fits[best] > 0.5 else None
-
-    def _correlation(self, arm: str) -> float:
+    def correlation(self, arm: str) -> float:
+        """Of the change of the pictures with the motion of an arm."""
         travel = self.travel(arm)
-        return float(np.corrcoef(travel, self._change)[0, 1]) if travel.std() > 0.0 else 0.0
+        if len(travel) < _FEWEST or not (travel.std() > 0.0 and self._change.std() > 0.0):
+            return 0.0
+        return float(np.corrcoef(travel, self._change)[0, 1])
 
     @property
     def moves(self) -> bool:
@@ -166,7 +163,9 @@ def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
     found: dict[str, str] = {}
     for (one, first), (two, second) in combinations(looks.items(), 2):
         if first.arm is not None and second.arm is not None and first.arm != second.arm:
-            swapped = first.other_arm() == second.arm and second.other_arm() == first.arm
+            own = first.correlation(first.arm), second.correlation(second.arm)
+            other = first.correlation(second.arm), second.correlation(first.arm)
+            swapped = min(other) > _CORRELATES and sum(other) > sum(own) + _OTHER_ARM
         elif first.fixed != second.fixed:
             fixed, carried = (first, second) if first.fixed else (second, first)
             swapped = carried.moves and fixed.still_share < _HARDLY and carried.still_share > _MOSTLY
@@ -175,6 +174,11 @@ def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
         if swapped:
             found |= {one: two, two: one}
     return found
+
+
+def _by_part(change: Array) -> Array:
+    """(k, parts) mean change of the parts of views (k, rows, columns)."""
+    return np.asarray(np.abs(change).reshape(-1, *_PARTS).mean(axis=(2, 4)).reshape(len(change), -1))
 
 
 def arm_of_link(robot: Robot, link: str) -> str | None:

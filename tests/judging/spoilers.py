@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -247,6 +247,11 @@ def retitled(contents: Contents, task: str) -> None:
     contents.about = replace(contents.about, notes={**contents.about.notes, "task": task})
 
 
+def without_ticks(contents: Contents) -> None:
+    contents.messages[names.TICK].clear()
+    contents.rows = contents.rows[:0]
+
+
 CAMERAS: dict[str, tuple[Spoiler, str]] = {
     "a picture that is frozen from half-way on": (frozen, "max_frozen_share"),
     "pictures that are 200 ms late": (late_pictures, "max_picture_lag"),
@@ -283,14 +288,9 @@ NUMBERS: dict[str, tuple[Spoiler, str]] = {
     "no commands": (empty(names.JOINT_COMMANDS), "empty_topics"),
     "no state": (empty(names.STATE), "empty_topics"),
     "no hand samples": (empty(names.SAMPLES), "min_pose_rate"),
-    "no ticks": (lambda contents: _without_ticks(contents), "no_ticks"),
+    "no ticks": (without_ticks, "no_ticks"),
     "an empty task": (lambda contents: retitled(contents, " "), "empty_task"),
 }
-
-
-def _without_ticks(contents: Contents) -> None:
-    contents.messages[names.TICK].clear()
-    contents.rows = contents.rows[:0]
 
 
 def spoiled(file: Path, target: Path, *spoilers: Spoiler) -> Path:
@@ -298,7 +298,3 @@ def spoiled(file: Path, target: Path, *spoilers: Spoiler) -> Path:
     for spoil in spoilers:
         spoil(contents)
     return contents.write(target)
-
-
-def files_of(folder: Path, clean: Path, table: Iterable[tuple[str, tuple[Spoiler, str]]]) -> dict[str, Path]:
-    return {what: spoiled(clean, folder / f"{index}.mcap", spoil) for index, (what, (spoil, _)) in enumerate(table)}
