@@ -116,8 +116,11 @@ class Episode:
         return self.recording.closed and bool(len(self.ticks.t)) and not self.ticks.following[-1]
 
 
-def read_episode(recording: Recording) -> Episode:
-    """Read a recording, up to where it is damaged. Raises :class:`RecordingError` where its cell cannot be built."""
+def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:
+    """Read a recording, up to where it is damaged, with or without its ``pictures``.
+
+    Raises :class:`RecordingError` where its cell cannot be built.
+    """
     config, robot = cell_and_robot_of(recording)
     read = _Read(recording, robot)
     damage = read.all_chunks()
@@ -131,7 +134,7 @@ def read_episode(recording: Recording) -> Episode:
     arms = {SIDES[1 - SIDES.index(arm)] if swapped else arm: arm for arm in recording.about.arms}
     hands = {hand: read.hand(hand, arm, ticks) for hand, arm in arms.items()}
     tools = tool_poses(frames.q, robot)
-    pictures, damage = _pictures(recording, config, damage)
+    looked_at, damage = _pictures(recording, config, damage) if pictures else ({}, damage)
     return Episode(
         recording=recording,
         config=config,
@@ -142,7 +145,7 @@ def read_episode(recording: Recording) -> Episode:
         hands=hands,
         events=read.events,
         damage=damage,
-        pictures=pictures,
+        pictures=looked_at,
         ended_by=said.ended_by,
         success=said.success,
     )

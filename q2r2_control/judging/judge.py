@@ -7,22 +7,25 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from q2r2_control.config.recording import JudgeSettings
-from q2r2_control.errors import RecordingError
+from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.judging.contradictions import contradictions
 from q2r2_control.judging.episode import Episode, Hand, read_episode
 from q2r2_control.judging.figures import EpisodeFigures, figures_of
 from q2r2_control.judging.thresholds import THRESHOLDS, Rejection
-from q2r2_control.recording.reader import EpisodeSpan, Recording, spans_of
+from q2r2_control.process.helper_process import reason_of
+from q2r2_control.recording.reader import BROKEN, EpisodeSpan, Recording, spans_of
 from q2r2_control.recording.ros_recording import open_recording
 
 VERDICT_FILE = "verdict.json"
 _FORMAT = 2
+_LONGEST_REASON = 300  # why a file cannot be read [characters]
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,9 +144,25 @@ class Judged:
         return dict(json.loads(json.dumps(data), parse_constant=lambda name: None))
 
 
-def judge(recording: Recording, settings: JudgeSettings | None = None) -> list[Judged]:
+@dataclass(frozen=True)
+class Unreadable:
+    """A file of which nothing can be said but that it is discarded."""
+
+    file: Path
+    why: str  # in one line, without the file's name
+
+    @property
+    def line(self) -> str:
+        return f"discard: unreadable, {self.why}"
+
+    def as_json(self) -> dict[str, Any]:
+        reason = asdict(Rejection("unreadable", f"unreadable, {self.why}"))
+        return {"verdict": "discard", "reasons": [reason], "file": str(self.file), "figures": None}
+
+
+def judge(recording: Recording, settings: JudgeSettings | None = None, *, pictures: bool = True) -> list[Judged]:
     """Judge a recording's episodes, by its cell's thresholds or these. Raises as :func:`read_episode` does."""
-    return [judge_episode(episode, settings) for episode in parts_of(read_episode(recording))]
+    return [judge_episode(episode, settings) for episode in parts_of(read_episode(recording, pictures=pictures))]
 
 
 def judge_episode(episode: Episode, settings: JudgeSettings | None = None) -> Judged:
@@ -153,10 +172,23 @@ def judge_episode(episode: Episode, settings: JudgeSettings | None = None) -> Ju
     return Judged(episode, figures, verdict_of(figures, settings), settings)
 
 
-def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> Iterator[Judged]:
-    """Judge recordings. Raises :class:`RecordingError` for a file that is none, before the first is judged."""
-    for recording in [open_recording(file) for file in files]:
-        yield from judge(recording, settings)
+def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> Iterator[Judged | Unreadable]:
+    """Judge recordings, one after the other; a file that cannot be read says why, and the next one follows."""
+    for file in files:
+        try:
+            yield from judge(open_recording(file), settings)
+        except (Q2R2Error, *BROKEN) as error:
+            yield Unreadable(file, reason_of(error).removeprefix(f"{file}: ")[:_LONGEST_REASON])
+
+
+@lru_cache(maxsize=1)  # the episodes of one file are asked for one after the other
+def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
+    """Why episodes of a recording are discarded, by their number; 0: the whole. With or without its ``pictures``.
+
+    Raises :class:`RecordingError`.
+    """
+    judged = judge(open_recording(file), pictures=pictures)
+    return {one.figures.part or 0: one.verdict.line for one in judged if not one.verdict.keep}
 
 
 def keep_verdicts(judged: Sequence[Judged]) -> Path:

@@ -44,7 +44,8 @@ from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.types import Array
 
 _LARGEST = 1 << 30  # of a record [bytes]
-_BROKEN = (
+# What readers raise of a file that is damaged, or another program's.
+BROKEN = (
     *(McapError, ZstdError, SerdeError, ValueError, KeyError, IndexError),
     *(struct.error, TypeError, OverflowError, MemoryError, AssertionError),
 )
@@ -162,7 +163,7 @@ class Recording:
             yield
         except EndOfFile:
             return  # cut off in the middle of a record, by a machine that lost its power
-        except _BROKEN as error:
+        except BROKEN as error:
             raise RecordingError(f"{self.file}: damaged: {reason_of(error):.200}") from error
 
     @property
@@ -196,7 +197,7 @@ class Recording:
                 return SeekingReader(stream, record_size_limit=_LARGEST).get_summary()
         except OSError as error:
             raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
-        except (EndOfFile, StopIteration, *_BROKEN):
+        except (EndOfFile, StopIteration, *BROKEN):
             return None
 
     def _records(self, start: int = 0) -> Iterator[McapRecord]:
@@ -230,7 +231,7 @@ class Recording:
                     break
         except EndOfFile:
             pass
-        except _BROKEN as error:
+        except BROKEN as error:
             raise RecordingError(f"{self.file}: not an MCAP file, or damaged: {reason_of(error):.200}") from error
         if not texts:
             raise RecordingError(f"{self.file}: not a recording of q2r2 run --record: no metadata {ABOUT}")

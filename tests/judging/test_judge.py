@@ -13,11 +13,10 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.recording import JudgeSettings
-from q2r2_control.errors import RecordingError
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.judging.camera_figures import CameraFigures
 from q2r2_control.judging.figures import EpisodeFigures, Fault, figures_of
-from q2r2_control.judging.judge import VERDICT_FILE, Judged, judge, judge_all, keep_verdicts, verdict_of
+from q2r2_control.judging.judge import VERDICT_FILE, Judged, Unreadable, judge, judge_all, keep_verdicts, verdict_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.types import SIDES, HandInputs
 from tests.judging.episodes import (
@@ -33,6 +32,7 @@ from tests.judging.episodes import (
     record_episode,
     without_ticks,
 )
+from tests.judging.spoilers import Contents, spoiled
 from tests.recording.runs import rewrite
 
 pytestmark = pytest.mark.slow
@@ -173,10 +173,24 @@ def test_a_verdict_is_kept_beside_the_file_with_all_that_it_was_made_of(clean: P
     assert episode["figures"]["arms"]["left"]["gripper_changes"] == 1
 
 
-def test_a_file_that_is_no_recording_is_told_before_any_is_judged(clean: Path, tmp_path: Path) -> None:
-    (tmp_path / "notes.mcap").write_text("no recording")
-    with pytest.raises(RecordingError, match=r"notes\.mcap: not an MCAP file"):
-        next(judge_all([clean, tmp_path / "notes.mcap"]))
+def test_files_that_cannot_be_read_are_named_and_the_others_are_judged(clean: Path, tmp_path: Path) -> None:
+    files = {"notes": b"no recording", "empty": b"", "magic": clean.read_bytes()[:8]}
+    for name, data in files.items():
+        (tmp_path / f"{name}.mcap").write_bytes(data)
+    degrees = spoiled(clean, tmp_path / "degrees.mcap", in_degrees)
+    bad = [*sorted(tmp_path.glob("[emn]*.mcap")), degrees]
+    *found, last = judge_all([*bad, clean])
+    assert isinstance(last, Judged)
+    assert [one.file for one in found if isinstance(one, Unreadable)] == bad
+    for one in found:
+        assert isinstance(one, Unreadable)
+        assert one.line.startswith("discard: unreadable, ")
+        assert str(one.file) not in one.line
+
+
+def in_degrees(contents: Contents) -> None:
+    for name in ("q", "reference_q"):
+        contents.rows[name] = np.degrees(contents.rows[name])
 
 
 FIGURES = replace(figures_of(episode(), 0.06), idle_share=0.0)
