@@ -32,7 +32,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant, WaitingPlant, WindowedPlant, make_plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plugins import PLANTS, load_class
-from q2r2_control.process.scheduling import real_time
+from q2r2_control.process.scheduling import check_folder, real_time
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
@@ -121,6 +121,11 @@ class CellRun:
     tasks: tuple[TaskResult, ...] = ()
     recording: RecordingSummary | None = None
 
+    @property
+    def was_recorded(self) -> bool:
+        """False if the recording ended before the run did."""
+        return self.recording is None or self.recording.fault is None
+
 
 def run_cell(config: Config, options: RunOptions) -> CellRun:
     """Run a cell and tell about it on stderr. Raises :class:`Q2R2Error` where that is not possible as asked."""
@@ -139,6 +144,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
 def _run_recorded(config: Config, options: RunOptions, page: PageView | None) -> CellRun:
     if options.record is None:
         return _run_cell(config, options, None, page)
+    check_folder(options.record, "--record")
     pictures = bool(config.simulated_cameras) and issubclass(load_class(PLANTS, options.plant), MujocoPlant)
     recorder = Recorder(options.record, options.name, waits=options.simulated_time, pictures=pictures)
     try:

@@ -130,6 +130,8 @@ def notes_of(task: str | None, operator: str | None, record: object) -> dict[str
     for name in notes:
         if record is None:
             raise ConfigError(f"--{name} needs --record")
+        if not notes[name].strip():
+            raise ConfigError(f"--{name} is empty; allowed: some words, or no --{name}")
     return notes
 
 

@@ -60,6 +60,7 @@ from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned,
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
+NOT_RECORDED = 3  # exit code of a run that ended well, and whose recording did not
 _FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
@@ -116,7 +117,8 @@ def run(
     One with real cabinets that is not commissioned is refused too, unless --i-know is given. Its joints go at a tenth
     of their speed until --full-speed is given.
     Exit 1 where a tool is more than 100 mm from its reference at the end, where an arm refused every press that
-    engages it, and where measured links met in torque mode.
+    engages it, and where measured links met in torque mode. Exit 3 where all that went well, and the recording ended
+    before the run did: a full disk, a writer that was killed.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
     cell = with_solver(load_config(config), solver)
@@ -162,6 +164,8 @@ def run(
     print_summary(done, json)
     if not done.summary.followed or (done.summary.torque is not None and done.summary.torque.met):
         raise Exit(1)
+    if not done.was_recorded:
+        raise Exit(NOT_RECORDED)
 
 
 def demo(
@@ -204,7 +208,8 @@ def demo(
     At a terminal the arms are shown in MuJoCo's window, or in a browser where there is no display. With --plant fri all
     processes have real-time priority where that is permitted, as with --rt: cabinets do not wait for a busy computer.
     Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
-    With --record, whether all succeeded is in the recording, of which q2r2 report makes plots.
+    With --record, whether all succeeded is in the recording, of which q2r2 report makes plots. Exit code 3 where the
+    recording ended before the run did.
     With --seeds, exit code 1 where a task succeeded in less than 19 of 20 trials.
     """
     _check_times(fast, rt)
@@ -257,6 +262,8 @@ def demo(
     print_summary(done, json)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)
+    if not done.was_recorded:
+        raise Exit(NOT_RECORDED)
 
 
 def _try_tasks(

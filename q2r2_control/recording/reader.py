@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import struct
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event, ReasonKind
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, LOOP, ROBOT, About, Conclusion
+from q2r2_control.recording.file_end import size_of_whole_records
 from q2r2_control.recording.messages import (
     PICTURE,
     SAMPLES,
@@ -203,11 +203,13 @@ class Recording:
     def _records(self, start: int = 0) -> Iterator[McapRecord]:
         """All from the beginning, or from a record that starts at ``start``.
 
-        Records that are written meanwhile are left out: a reader that is slower than the writer would never end.
+        Records that are written meanwhile are left out: a reader that is slower than the writer would never end. So is
+        the last one of a file that ends within it.
         """
         try:
             with self.file.open("rb") as stream:
-                size = os.fstat(stream.fileno()).st_size
+                if (size := size_of_whole_records(stream)) == 0:
+                    return
                 stream.seek(start)
                 # Not wrapped, so that a file that changes meanwhile is not read twice.
                 reader = StreamReader(stream, start > 0, emit_chunks=True, record_size_limit=_LARGEST)
@@ -238,7 +240,8 @@ class Recording:
         try:
             return About.from_texts(texts, attachments[CELL], attachments[ROBOT])
         except KeyError as error:
-            raise RecordingError(f"{self.file}: damaged: no {error.args[0]}") from error
+            what = "damaged: no" if self.closed else "its process was killed before it had written"
+            raise RecordingError(f"{self.file}: {what} {error.args[0]}") from error
         except ValueError as error:
             raise RecordingError(f"{self.file}: {reason_of(error):.200}") from error
 

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Condition, Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
 FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
+READ_AHEAD = 4 << 20  # of what was sent, for what waits to be written [bytes]
 _NICENESS = 10  # the loop goes first where there are not enough processors
 _LAST_TIME = (2**31 - 1) * NANOSECONDS  # that a stamp can have [ns]
 _HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (
@@ -180,8 +183,37 @@ class Written(NamedTuple):
     messages: int = 0  # that were sent as such
 
 
+def read_ahead(requests: Iterator[Any], room: int = READ_AHEAD) -> Iterator[Any]:
+    """The same requests, read by a thread as they come.
+
+    What is here already is written even if the run is killed. As much as ``room`` [bytes] may wait.
+    """
+    waiting: SimpleQueue[tuple[Any, int]] = SimpleQueue()
+    free = Condition()
+    held, end = 0, object()
+
+    def take() -> None:
+        nonlocal held
+        for request in requests:
+            size = sum(one.size for one in request) if isinstance(request, list) else 0
+            with free:
+                while held >= room:
+                    free.wait()
+                held += size
+            waiting.put((request, size))
+        waiting.put((end, 0))
+
+    Thread(target=take, daemon=True).start()
+    while (entry := waiting.get())[0] is not end:
+        yield entry[0]
+        with free:
+            held -= entry[1]
+            free.notify()
+
+
 def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
     """Write one recording, of lists of packed ticks or messages. Raises :class:`OSError`; what was written stays."""
+    requests = read_ahead(requests)
     setup = next((request for request in requests if request is not None), None)
     if not isinstance(setup, RecordingSetup):
         return  # there was no run

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,6 +50,31 @@ def test_an_arm_that_begins_in_the_table_ends_with_exit_code_1(tmp_path: Path, m
     result = q2r2("run", file, "--mode", mode, "--fast", "--headless", "--duration", "0.1", "--force")
     assert result.exit_code == 1
     assert said in " ".join(result.stdout.split())
+
+
+@pytest.mark.parametrize("command", [("run", CELL, *OPTIONS), ("demo", "--fast", "--headless")])
+def test_a_folder_that_cannot_be_written_is_refused_before_the_run(command: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    result = q2r2(*command, "--record", str(tmp_path / "file" / "recordings"))
+    assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
+    assert f"--record {tmp_path / 'file' / 'recordings'}: Not a directory; allowed: a folder" in result.stderr
+
+
+def test_a_recording_that_ends_before_its_run_is_exit_code_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("q2r2_control.recording.recorder.new_folder", full)
+    result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path))
+    assert result.exit_code == 3
+    assert one_object(result.stdout)["recording"]["fault"] == "No space left on device"
+
+
+def full(*given: object) -> Path:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_an_empty_task_is_refused(tmp_path: Path) -> None:
+    result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path), "--task", " ")
+    assert result.exit_code == 2
+    assert "--task is empty; allowed: some words, or no --task" in result.stderr
 
 
 def test_rt_says_in_one_line_what_the_system_refuses_and_runs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +128,8 @@ def test_an_episode_of_the_demo_has_the_pictures_of_which_an_export_makes_videos
     counts = [len(list(file.pictures(name))) for name in CAMERAS]
     assert counts == [counts[0]] * 3
     assert sum(counts) == recording["pictures"] >= 3 * 8
-    exported = q2r2("export", "lerobot-v2.1", str(tmp_path / "recordings"), "--output", str(tmp_path / "grasp"))
+    options = ("--output", str(tmp_path / "grasp"), "--keep-discarded")  # the task takes longer
+    exported = q2r2("export", "lerobot-v2.1", str(tmp_path / "recordings"), *options)
     assert exported.exit_code == 0, exported.stderr
     assert len(list((tmp_path / "grasp/videos").rglob("episode_000000.mp4"))) == 3
 

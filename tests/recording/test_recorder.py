@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
+import resource
+import signal
 import time
 import tracemalloc
 from dataclasses import replace as changed
@@ -24,6 +27,7 @@ from q2r2_control.recording.replay import replay
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.summary.tick import Tick
 from tests.recording.runs import ARMS, JOINTS, RATE, ended_line, file_of, pipeline, read_elsewhere, record, writer_of
+from tests.support.processes import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -105,6 +109,48 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
     assert summary.fault is not None
     assert (summary.file, summary.ticks) == (None, 0)
     assert summary.lost_ticks >= 0.2 * RATE
+
+
+def test_a_recorder_that_wrote_nothing_leaves_no_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def fill_the_disk(recorder: Recorder) -> None:
+        resource.prlimit(writer_of(recorder).pid, resource.RLIMIT_FSIZE, (1000, 1000))
+
+    loop = pipeline()
+    with Recorder(tmp_path / "full", "test", waits=True) as recorder:
+        fill_the_disk(recorder)
+        recorder.begin(About.of(loop, False, {}), loop.robot)
+        loop.listeners.append(recorder)
+        loop.run(0.3, realtime=False)
+    assert "File too large" in str(recorder.summary.fault)
+    assert recorder.summary.file is None
+    assert list((tmp_path / "full").iterdir()) == []
+
+
+def test_a_file_whose_writer_was_killed_before_it_wrote_is_removed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def kill(recorder: Recorder) -> None:
+        wait_until(lambda: bool(list(tmp_path.rglob("*.mcap"))))
+        os.kill(writer_of(recorder).pid, signal.SIGKILL)
+
+    summary = record(tmp_path, pipeline(), 0.3, during=kill)
+    assert summary.fault is not None
+    assert summary.file is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_falls_behind_the_run_is_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    loop = pipeline()
+    with caplog.at_level(logging.WARNING), Recorder(tmp_path, "slow") as recorder:
+        recorder.begin(About.of(loop, False, {}), loop.robot)
+        os.kill(writer_of(recorder).pid, signal.SIGSTOP)
+        loop.listeners.append(recorder)
+        loop.run(3.0, realtime=False)
+        os.kill(writer_of(recorder).pid, signal.SIGCONT)
+    (line,) = caplog.messages
+    assert re.match(r"the recording is 2\.0 s behind the run: its writer gets too little of the processors", line)
+    assert recorder.summary.longest_backlog_s > 2.5
+    assert recorder.summary.lost_ticks == 0
 
 
 def test_runs_that_begin_within_one_second_get_a_folder_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
