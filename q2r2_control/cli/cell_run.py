@@ -295,7 +295,8 @@ def _run(
             notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
             given = options.input_options.items()
             notes |= {name: str(value) for name, value in given if name != "fast"}  # which changes nothing of the run
-            recorder.begin(About.of(pipeline, not options.simulated_time, notes, cameras), pipeline.robot)
+            about = About.of(pipeline, not options.simulated_time, notes, cameras)
+            recorder.begin(about, pipeline.robot, pipeline.config.recording.topic_rate)
             pipeline.listeners.append(recorder)
             if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):
                 judge_now = EpisodeJudge(lambda: recorder.file, pipeline.record_outcome)

@@ -78,6 +78,18 @@ class JudgeSettings(StrictModel):
     needs_end: bool = Field(True, description="a file that was not ended, by a killed process say, is discarded")
 
 
+TOPIC_RATE = 100.0  # [Hz]
+
+
+class RecordingSettings(StrictModel):
+    """How much ``q2r2 run --record`` writes."""
+
+    topic_rate: Annotated[float, Field(gt=0, le=1000)] | None = Field(
+        TOPIC_RATE,
+        description="of the standard topics, which repeat numbers of the tick [Hz]; null: at every tick",
+    )
+
+
 # It becomes a part of a topic's name and of a feature's.
 CameraName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 _LEAST_DISTANCE = 1e-6  # [m]

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from q2r2_control.config.recording import CameraConfig
+from q2r2_control.config.recording import TOPIC_RATE, CameraConfig
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.process.helper_process import HelperProcess, reason_of
@@ -61,7 +61,9 @@ class BaseRecorder:
         except OSError as error:
             self._check(reason_of(error))
 
-    def _open(self, about: About, robot: RecordedRobot | None, topics: tuple[Topic, ...]) -> bool:
+    def _open(
+        self, about: About, robot: RecordedRobot | None, topics: tuple[Topic, ...], topic_rate: float | None = None
+    ) -> bool:
         """Have the file of a run begun that begins at ``about.epoch``; whether that was possible."""
         if self.writer is None:
             return False
@@ -73,7 +75,7 @@ class BaseRecorder:
             self._check(reason_of(error))
             return False
         self.file = folder / f"{folder.name}.mcap"
-        self.writer.send(RecordingSetup(self.file.absolute(), about, topics, robot))
+        self.writer.send(RecordingSetup(self.file.absolute(), about, topics, robot, topic_rate))
         return True
 
     def _send(self, batch: list[PackedTick] | list[Message], *, wait: bool = False) -> bool:
@@ -194,9 +196,10 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             self.cameras.prepare(plant, cameras, topics, waits=self._waits)
             self._check_cameras()
 
-    def begin(self, about: About, robot: Robot) -> None:
+    def begin(self, about: About, robot: Robot, topic_rate: float | None = TOPIC_RATE) -> None:
+        """Begin the file of a run of ``robot``, with standard topics at ``topic_rate`` [Hz]; None: at every tick."""
         topics = about.topics()
-        if self._open(about, RecordedRobot.of(robot), tuple(topics.values())):
+        if self._open(about, RecordedRobot.of(robot), tuple(topics.values()), topic_rate):
             self._packer, self._epoch = TickPacker(about.arms, about.joints), about.epoch
 
     def __call__(self, tick: Tick) -> None:
@@ -225,13 +228,15 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             self._packer.repeat_state()
 
     def _watch_backlog(self, now: float) -> None:
-        """Say it when the file is long behind the run, which a kill of the writer would cost."""
+        """Say it when the file is long behind the run, which a kill of the writer would cost; simulated time waits."""
+        if self._waits:
+            return
         self._sent.append((self._count - self.overflows, now))
         while len(self._sent) > 1 and self._sent[0][0] <= self.written.ticks:
             self._sent.popleft()
         behind = now - self._sent[0][1]
         self._longest_backlog = max(self._longest_backlog, behind)
-        if behind > _BEHIND and not (self._said_so or self._waits):
+        if behind > _BEHIND and not self._said_so:
             what = "its writer gets too little of the processors; killed, it would cost as much"
             _logger.warning("the recording is %.1f s behind the run: %s", behind, what)
         self._said_so = behind > (_CAUGHT_UP if self._said_so else _BEHIND)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import re
 import resource
@@ -19,6 +20,7 @@ import pytest
 import yaml
 
 from q2r2_control.config.cell import parse_config
+from q2r2_control.config.recording import TOPIC_RATE
 from q2r2_control.recording.about import About
 from q2r2_control.recording.messages import run_topics
 from q2r2_control.recording.reader import Recording
@@ -48,17 +50,20 @@ def test_every_topic_opens_with_rosbags_in_another_process_and_has_what_was_told
     assert {name: entry["type"] for name, entry in found.items()} == {
         name: topic.type for name, topic in run_topics(ARMS, JOINTS).items()
     }
-    every = len(ticks)
-    for name in ("/q2r2/tick", "/joint_states", "/q2r2/external_torque", "/joint_commands", "/q2r2/reference"):
-        assert found[name]["count"] == every
+    assert found["/q2r2/tick"]["count"] == len(ticks)
+    shown = first_of_each_period(ticks, TOPIC_RATE)
+    assert len(shown) == pytest.approx(len(ticks) * TOPIC_RATE / RATE, abs=1)
+    for name in ("/joint_states", "/q2r2/external_torque", "/joint_commands", "/q2r2/reference"):
+        assert found[name]["count"] == len(shown)
     samples = [sample for tick in ticks for sample in tick.samples]
     assert found["/q2r2/hand_samples"]["count"] == len(samples)
     assert found["/q2r_left_hand_pose"]["count"] == sum(sample.hand == "left" for sample in samples)
     led = [tick for tick in ticks if tick.targets["left"].pose is not None]
-    assert found["/q2r2/left/target_frame"]["count"] == len(led) > 50
+    with_target = sum(tick.targets["left"].pose is not None for tick in shown)
+    assert found["/q2r2/left/target_frame"]["count"] == with_target > 50
     commands = found["/joint_commands"]
-    assert commands["position"] == ticks[-1].command.q.tolist()
-    assert commands["last"] - commands["first"] == pytest.approx(1e9 * (ticks[-1].t - ticks[0].t), abs=1000)
+    assert commands["position"] == shown[-1].command.q.tolist()
+    assert commands["last"] - commands["first"] == pytest.approx(1e9 * (shown[-1].t - shown[0].t), abs=1000)
     states = [json.loads(text) for text in found["/q2r2/state"]["texts"]]
     assert [event["kind"] for state in states for event in state.get("events", ())] == ["pressed", "pressed"]
     arms = np.concatenate([chunk.rows["arms"] for chunk in Recording(file).chunks()])[:, 0]
@@ -69,6 +74,23 @@ def test_every_topic_opens_with_rosbags_in_another_process_and_has_what_was_told
     # Side by side and unscaled, a tool moves as its hand does: by the same from the first target on.
     assert np.ptp(poses, axis=0).max() > 0.005
     np.testing.assert_allclose(targets - targets[0], poses - poses[0], atol=1e-9)
+
+
+def first_of_each_period(ticks: list[Tick], rate: float) -> list[Tick]:
+    periods = [math.floor((tick.now - tick.start.now) * rate + 1e-6) for tick in ticks]
+    return [tick for tick, now, before in zip(ticks, periods, [-1, *periods], strict=False) if now > before]
+
+
+def test_standard_topics_may_come_with_every_tick(tmp_path: Path) -> None:
+    loop = pipeline()
+    with Recorder(tmp_path, "test", waits=True) as recorder:
+        recorder.begin(About.of(loop, False, {}), loop.robot, None)
+        loop.listeners.append(recorder)
+        loop.run(0.2, realtime=False)
+    assert recorder.summary.file is not None
+    counts = Recording(Path(recorder.summary.file)).counts
+    assert counts is not None
+    assert counts["/joint_states"] == counts["/q2r2/tick"] == recorder.summary.ticks
 
 
 def test_a_clock_that_is_set_back_during_a_run_changes_no_time_in_the_file(
