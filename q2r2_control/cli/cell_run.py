@@ -33,7 +33,7 @@ from q2r2_control.plants.base import Plant, WaitingPlant, WindowedPlant, make_pl
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.scheduling import check_folder, real_time
-from q2r2_control.recording.about import About
+from q2r2_control.recording.about import About, anonymous
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
 from q2r2_control.robot.robot import Robot
@@ -102,6 +102,7 @@ class RunOptions:
     steps: tuple[tuple[float, str], ...] = ()  # of scripted work, from when on [s], in words
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
+    anonymous: bool = False  # the recording says neither whose hands nor on which computer
     longest_wait: float = SCRIPTS_WAIT_S  # for a plant that waits for a person, such as one at a cabinet [s]
     page: tuple[str, int, Path | None] | None = None  # address of the page in the browser, and its certificate
 
@@ -296,6 +297,8 @@ def _run(
             given = options.input_options.items()
             notes |= {name: str(value) for name, value in given if name != "fast"}  # which changes nothing of the run
             about = About.of(pipeline, not options.simulated_time, notes, cameras)
+            if options.anonymous:
+                about = replace(about, notes=anonymous(about.notes))
             recorder.begin(about, pipeline.robot, pipeline.config.recording.topic_rate)
             pipeline.listeners.append(recorder)
             if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):

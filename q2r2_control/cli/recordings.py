@@ -14,6 +14,7 @@ from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_run import check_window, show_window
 from q2r2_control.cli.output import (
+    Anonymous,
     Json,
     WebHost,
     WebPort,
@@ -192,6 +193,7 @@ def export(
         bool, Option("--keep-discarded", help="Export episodes too that q2r2 judge discards.")
     ] = False,
     skip_bad: Annotated[bool, Option("--skip-bad", help="Exit code 0 although recordings cannot be read.")] = False,
+    anonymous: Anonymous = False,
     no_pictures: Annotated[bool, Option("--no-pictures", help="Leave out what cameras recorded.")] = False,
 ) -> None:
     """Make a dataset to train on of recordings of q2r2 run --record, an episode each.
@@ -204,7 +206,7 @@ def export(
     if (chosen := FORMATS.get(name)) is None:
         raise ConfigError(f"export {name}: allowed: {', '.join(FORMATS)}")
     chosen.require()
-    sampling = FrameSampling(fps, trim, pictures=not no_pictures)
+    sampling = FrameSampling(fps, trim, pictures=not no_pictures, anonymous=anonymous)
     target, files = Output(output), recordings_in(recordings)
     try:
         with counting("recordings") as progress:

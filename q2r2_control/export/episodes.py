@@ -19,6 +19,7 @@ from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.sampling import CameraFrames, Names, Vectors, features, sample
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.process.pools import pool_of
+from q2r2_control.recording.about import anonymous
 from q2r2_control.recording.reader import BROKEN, WHOLE, EpisodeSpan, read_spans
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
@@ -29,11 +30,12 @@ _FORMAT = 6  # of kept episodes; those of another one are made again
 
 @dataclass(frozen=True)
 class FrameSampling:
-    """Which ticks become frames, and how many."""
+    """Which ticks become frames, and how many, and what comes with them."""
 
     fps: int = 30
     trim: bool = False  # to the time in which arms are engaged or moving
     pictures: bool = False
+    anonymous: bool = False  # without notes that tell of a person or of a computer's name
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= FASTEST:
@@ -76,6 +78,7 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
     except RecordingError as error:
         raise RecordingError(f"{recording.file}: {error}") from error
     notes = dict(recording.about.notes)
+    notes = anonymous(notes) if sampling.anonymous else notes
     task = notes.pop("task", "")
     cameras, stamps = recording.about.cameras if sampling.pictures else (), frames["stamp"].tolist()
     return EpisodeVectors(
