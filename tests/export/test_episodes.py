@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 from multiprocessing import active_children
 from pathlib import Path
@@ -127,6 +128,12 @@ def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Ru
     assert keep_episodes(files, FrameSampling(), write_vectors, kept, workers=2).kept == [*others, last]
     assert [other.stat().st_mtime_ns for other in others] == made_at
     assert contents(kept) == by_one_process
+
+
+def test_an_anonymous_episode_names_no_operator_and_no_computer(run: Run) -> None:
+    named, anonymous = (make_episode(run.file, FrameSampling(anonymous=leaves)).notes for leaves in (False, True))
+    assert named["machine"] == f"{platform.node()}, {anonymous['machine']}"
+    assert anonymous.keys() == named.keys() - {"operator"}
 
 
 def by_name(file: Path, pictures: bool) -> dict[int, str]:
