@@ -1,4 +1,4 @@
-"""What cannot be true of an episode: parts of its file that contradict each other."""
+"""Contradictions between parts of an episode's file, of which one cannot be true."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the pictures of a recording's cameras show, small enough to keep those of a whole episode."""
+"""Looks at the pictures of a recording's cameras, and keeps of each so little that a whole episode has room."""
 
 from __future__ import annotations
 

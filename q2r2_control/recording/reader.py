@@ -44,7 +44,7 @@ from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.types import Array
 
 _LARGEST = 1 << 30  # of a record [bytes]
-# What readers raise of a file that is damaged, or another program's.
+# Errors that readers raise of a file that is damaged, or another program's.
 BROKEN = (
     *(McapError, ZstdError, SerdeError, ValueError, KeyError, IndexError),
     *(struct.error, TypeError, OverflowError, MemoryError, AssertionError),
@@ -203,8 +203,8 @@ class Recording:
     def _records(self, start: int = 0) -> Iterator[McapRecord]:
         """All from the beginning, or from a record that starts at ``start``.
 
-        Records that are written meanwhile are left out: a reader that is slower than the writer would never end. So is
-        the last one of a file that ends within it.
+        Records that are written meanwhile are left out: a reader that is slower than the writer would never end. The
+        last one of a file that ends within it is left out too.
         """
         try:
             with self.file.open("rb") as stream:

@@ -203,7 +203,7 @@ class Written(NamedTuple):
 def read_ahead(requests: Iterator[Any], room: int = READ_AHEAD) -> Iterator[Any]:
     """The same requests, read by a thread as they come.
 
-    What is here already is written even if the run is killed. As much as ``room`` [bytes] may wait.
+    Requests that are here already are written even if the run is killed. As much as ``room`` [bytes] may wait.
     """
     waiting: SimpleQueue[tuple[Any, int]] = SimpleQueue()
     free = Condition()

@@ -92,7 +92,7 @@ def frozen(contents: Contents) -> None:
 
 
 def late_pictures(contents: Contents) -> None:
-    """What the camera sees is 200 ms old; stamps are as they should be."""
+    """Each picture shows the cell of 200 ms ago; stamps are as they should be."""
     found = contents.pictures("left_wrist")
     seen = np.array([message.time for message in found])
     shown = [jpeg_in(found[max(int(np.searchsorted(seen, time - LATE * NANOSECONDS)) - 1, 0)]) for time in seen]
