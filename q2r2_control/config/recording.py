@@ -39,7 +39,7 @@ class JudgeSettings(StrictModel):
     max_rotation_error_rms: Radians | None = Field(0.15, description="target to measured tool [rad]")
     max_rotation_error_p99: Radians | None = Field(0.4, description="target to measured tool [rad]")
     max_unmeasured_ticks: Annotated[int, Field(ge=0, le=10**9)] | None = Field(
-        0, description="ticks whose measured positions, velocities or openings are no finite numbers"
+        0, description="ticks whose measured joints, openings or references are no finite numbers"
     )
     max_joint_speed: Annotated[float, Field(gt=0, le=100)] | None = Field(
         1.2, description="fastest measured joint, by its limit of speed"

@@ -45,7 +45,7 @@ class Ticks:
     slip_angle: Array  # (n, arms) [rad]
     gripper: Array  # (n, arms) opening that is wanted, 0 closed .. 1 open
     now: Array  # (n,) by the loop's own clock [s]
-    unmeasured: Flags  # (n, arms) a measured position, velocity or opening is no finite number
+    unmeasured: Flags  # (n, arms) a measured position, velocity or opening, or a reference, is no finite number
     joint_speed: Array  # (n, arms) of the measured joint that is nearest to its limit of speed, by that limit
 
 
@@ -234,7 +234,7 @@ class _Read:
 
     def _unmeasured(self, rows: Rows) -> Flags:
         """(n, arms) Torques do not count, of which NaN says that nothing measures them; an opening of -inf neither."""
-        finite = np.isfinite(rows["q"]) & np.isfinite(rows["v"])
+        finite = np.all([np.isfinite(rows[name]) for name in ("q", "v", "reference_q", "reference_v")], axis=0)
         openings = rows["arms"]["opening"]
         bad = [~finite[:, joints].all(axis=1) for joints in self._joints]
         return np.stack(bad, axis=1) | np.isnan(openings) | (openings == np.inf)

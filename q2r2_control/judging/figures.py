@@ -13,11 +13,12 @@ from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.measured import MeasuredFigures, measured_figures
 from q2r2_control.judging.motion import ArmFigures, arm_figures, idle_share
 from q2r2_control.recording.about import LOOP
-from q2r2_control.recording.messages import loop_topics
+from q2r2_control.recording.messages import hand_pose, loop_topics, target
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
 from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 
+_SURELY = 100  # frames, a second, with a target, so that its topic has one whatever its rate
 _SHORTEST = 1e-3  # of a time in which an arm counts as engaged [s]
 
 
@@ -182,7 +183,11 @@ def _empty_topics(episode: Episode) -> list[str]:
     about, counts = episode.recording.about, episode.recording.counts
     if about.source != LOOP or counts is None or not len(episode.ticks.t):
         return []
-    return [topic for topic in loop_topics(about.arms) if not counts.get(topic)]
+    asked = (episode.frames.target != episode.frames.reference).any(axis=2).sum(axis=0)  # frames with a target
+    expected = list(loop_topics(about.arms))
+    expected += [target(arm) for arm, count in zip(about.arms, asked.tolist(), strict=True) if count > _SURELY]
+    expected += [hand_pose(name) for name, hand in episode.hands.items() if len(hand.received)]
+    return [topic for topic in expected if not counts.get(topic)]
 
 
 def _least_mm(distances: Array) -> float | None:

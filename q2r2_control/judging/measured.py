@@ -21,7 +21,7 @@ _STEP = 0.005  # of lags, and of the times that are compared [s]
 class MeasuredFigures:
     """One arm, until the run begins to end; None: there is nothing to tell it by."""
 
-    unmeasured_ticks: int  # with a position, velocity or opening that is no finite number
+    unmeasured_ticks: int  # with a position, velocity, opening or reference that is no finite number
     joint_speed_share: float  # fastest joint over 20 ms, by its limit
     velocity_mismatch: float | None  # of the joint whose measured velocity is least the slope of its positions
     reference_lag_ms: float | None  # of the measured joints behind the reference

@@ -64,7 +64,7 @@ THRESHOLDS = (
     Threshold("max_rotation_error_rms", "arm", "rotation_error_deg_rms", "tracking error RMS", _DEGREES, True),
     Threshold("max_rotation_error_p99", "arm", "rotation_error_deg_p99", "tracking error p99", _DEGREES, True),
     Threshold("min_ldlj", "arm", "ldlj", "not smooth, LDLJ", _Unit()),
-    Threshold("max_unmeasured_ticks", "measured", "unmeasured_ticks", "measured joints are no numbers in", _TICKS),
+    Threshold("max_unmeasured_ticks", "measured", "unmeasured_ticks", "joints or openings are no numbers in", _TICKS),
     Threshold("max_joint_speed", "measured", "joint_speed_share", "a measured joint moves at", _OF_ITS_LIMIT),
     Threshold("max_velocity_mismatch", "measured", "velocity_mismatch", _NOT_THE_SLOPE, _PERCENT),
     Threshold(

@@ -177,6 +177,10 @@ def not_measured_velocity(contents: Contents) -> None:
     contents.rows["v"][contents.middle, 3] = np.inf
 
 
+def no_reference(contents: Contents) -> None:
+    contents.rows["reference_v"][contents.middle, 3] = np.nan
+
+
 def spikes(contents: Contents) -> None:
     for tick in range(contents.middle.start, contents.middle.stop, 20):
         contents.rows["q"][tick, 3] += 0.3
@@ -271,6 +275,7 @@ CAMERAS: dict[str, tuple[Spoiler, str]] = {
 
 NUMBERS: dict[str, tuple[Spoiler, str]] = {
     "positions that are NaN": (not_measured, "max_unmeasured_ticks"),
+    "a reference that is NaN": (no_reference, "max_unmeasured_ticks"),
     "velocities that are infinite": (not_measured_velocity, "max_unmeasured_ticks"),
     "spikes of 0.3 rad": (spikes, "max_joint_speed"),
     "one spike of 0.1 rad": (one_spike, "max_joint_speed"),
@@ -287,6 +292,8 @@ NUMBERS: dict[str, tuple[Spoiler, str]] = {
     "no joint states": (empty(names.JOINT_STATES), "empty_topics"),
     "no commands": (empty(names.JOINT_COMMANDS), "empty_topics"),
     "no state": (empty(names.STATE), "empty_topics"),
+    "no targets": (empty(names.target("left")), "empty_topics"),
+    "no hand poses": (empty(names.hand_pose("right")), "empty_topics"),
     "no hand samples": (empty(names.SAMPLES), "min_pose_rate"),
     "no ticks": (without_ticks, "no_ticks"),
     "an empty task": (lambda contents: retitled(contents, " "), "empty_task"),
