@@ -22,7 +22,8 @@ import yaml
 from q2r2_control.config.cell import parse_config
 from q2r2_control.config.recording import TOPIC_RATE
 from q2r2_control.recording.about import About
-from q2r2_control.recording.messages import run_topics
+from q2r2_control.recording.bag import BagWriter
+from q2r2_control.recording.messages import STATE, TEXT, Message, Topic, run_topics, text
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
@@ -146,6 +147,22 @@ def test_a_recorder_that_wrote_nothing_leaves_no_file(tmp_path: Path, caplog: py
     assert "File too large" in str(recorder.summary.fault)
     assert recorder.summary.file is None
     assert list((tmp_path / "full").iterdir()) == []
+
+
+def test_a_file_that_fails_before_its_first_message_is_whole_is_removed_with_its_folder(tmp_path: Path) -> None:
+    loop = pipeline()
+    about, topic = About.of(loop, False, {}), Topic(1, STATE, TEXT)
+    folder = tmp_path / "run"
+    folder.mkdir()
+
+    def write_and_fail() -> None:
+        with BagWriter(folder / "run.mcap", [topic], about) as bag:
+            bag.write([Message(1, 0, about.epoch, 0, text("not flushed"))])
+            raise OSError("full")
+
+    with pytest.raises(OSError, match="full"):
+        write_and_fail()
+    assert not folder.exists()
 
 
 def test_a_file_whose_writer_was_killed_before_it_wrote_is_removed(
