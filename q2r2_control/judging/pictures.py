@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.recording.messages import NANOSECONDS
-from q2r2_control.recording.reader import Picture, Recording
+from q2r2_control.recording.reader import BROKEN, Picture, Recording
 from q2r2_control.types import Array, Flags
 
 VIEW = (24, 32)  # rows and columns of a picture as it is kept
@@ -77,7 +77,7 @@ def _look_at(picture: Picture, t: float, camera: CameraConfig) -> _Look:
         other_size = image.size != (camera.width, camera.height)
         image.draft("L", (2 * VIEW[1], 2 * VIEW[0]))  # a decoder that has to make few pixels is several times as fast
         view = image.convert("L").resize(VIEW[::-1], Image.Resampling.BOX)
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except (OSError, SyntaxError, Image.DecompressionBombError, *BROKEN):
         return _Look(t, np.zeros(VIEW, np.uint8), damaged=True)
     return _Look(t, np.asarray(view), damaged=_has_foreign_marker(picture.jpeg), other_size=other_size)
 

@@ -178,7 +178,8 @@ def test_files_that_cannot_be_read_are_named_and_the_others_are_judged(clean: Pa
     for name, data in files.items():
         (tmp_path / f"{name}.mcap").write_bytes(data)
     degrees = spoiled(clean, tmp_path / "degrees.mcap", in_degrees)
-    bad = [*sorted(tmp_path.glob("[emn]*.mcap")), degrees]
+    swapped = spoiled(clean, tmp_path / "swapped.mcap", swapped_arms)
+    bad = [*sorted(tmp_path.glob("[emn]*.mcap")), degrees, swapped]
     *found, last = judge_all([*bad, clean])
     assert isinstance(last, Judged)
     assert [one.file for one in found if isinstance(one, Unreadable)] == bad
@@ -186,6 +187,11 @@ def test_files_that_cannot_be_read_are_named_and_the_others_are_judged(clean: Pa
         assert isinstance(one, Unreadable)
         assert one.line.startswith("discard: unreadable, ")
         assert str(one.file) not in one.line
+
+
+def swapped_arms(contents: Contents) -> None:
+    for name in ("q", "v", "reference_q", "reference_v"):
+        contents.rows[name] = np.roll(contents.rows[name], contents.rows[name].shape[1] // 2, axis=1)
 
 
 def in_degrees(contents: Contents) -> None:
