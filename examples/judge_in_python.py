@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 from q2r2_control.config.recording import JudgeSettings
-from q2r2_control.judging.judge import judge_all
+from q2r2_control.judging.judge import Unreadable, judge_all
 from q2r2_control.recording.reader import recordings_in
 
 
@@ -22,6 +22,9 @@ with tempfile.TemporaryDirectory() as folder:
     # Thresholds of your own; without them those of the recorded cell count.
     settings = JudgeSettings(max_position_error_rms=0.02, max_idle_share=0.95)
     for judged in judge_all(recordings_in(given), settings):
+        if isinstance(judged, Unreadable):
+            print(f"{judged.file}: {judged.line}")
+            continue
         print(f"{judged.figures.name}: {judged.verdict.line}")
         for name, arm in judged.figures.arms.items():
             error = arm.position_error_mm_rms

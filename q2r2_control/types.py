@@ -22,6 +22,7 @@ from q2r2_control.events import Reason
 
 POSE_FIELDS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 SIDES = ("left", "right")
 Interval = tuple[float, float]  # least and greatest

@@ -32,8 +32,8 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant, WaitingPlant, WindowedPlant, make_plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plugins import PLANTS, load_class
-from q2r2_control.process.scheduling import real_time
-from q2r2_control.recording.about import About
+from q2r2_control.process.scheduling import check_folder, real_time
+from q2r2_control.recording.about import About, anonymous
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
 from q2r2_control.robot.robot import Robot
@@ -102,6 +102,7 @@ class RunOptions:
     steps: tuple[tuple[float, str], ...] = ()  # of scripted work, from when on [s], in words
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
+    anonymous: bool = False  # the recording says neither whose hands nor on which computer
     longest_wait: float = SCRIPTS_WAIT_S  # for a plant that waits for a person, such as one at a cabinet [s]
     page: tuple[str, int, Path | None] | None = None  # address of the page in the browser, and its certificate
 
@@ -121,6 +122,11 @@ class CellRun:
     tasks: tuple[TaskResult, ...] = ()
     recording: RecordingSummary | None = None
 
+    @property
+    def was_recorded(self) -> bool:
+        """False if the recording ended before the run did."""
+        return self.recording is None or self.recording.fault is None
+
 
 def run_cell(config: Config, options: RunOptions) -> CellRun:
     """Run a cell and tell about it on stderr. Raises :class:`Q2R2Error` where that is not possible as asked."""
@@ -139,6 +145,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
 def _run_recorded(config: Config, options: RunOptions, page: PageView | None) -> CellRun:
     if options.record is None:
         return _run_cell(config, options, None, page)
+    check_folder(options.record, "--record")
     pictures = bool(config.simulated_cameras) and issubclass(load_class(PLANTS, options.plant), MujocoPlant)
     recorder = Recorder(options.record, options.name, waits=options.simulated_time, pictures=pictures)
     try:
@@ -289,7 +296,10 @@ def _run(
             notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
             given = options.input_options.items()
             notes |= {name: str(value) for name, value in given if name != "fast"}  # which changes nothing of the run
-            recorder.begin(About.of(pipeline, not options.simulated_time, notes, cameras), pipeline.robot)
+            about = About.of(pipeline, not options.simulated_time, notes, cameras)
+            if options.anonymous:
+                about = replace(about, notes=anonymous(about.notes))
+            recorder.begin(about, pipeline.robot, pipeline.config.recording.topic_rate)
             pipeline.listeners.append(recorder)
             if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):
                 judge_now = EpisodeJudge(lambda: recorder.file, pipeline.record_outcome)

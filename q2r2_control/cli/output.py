@@ -52,6 +52,9 @@ Task = Annotated[str | None, Option(help="With --record: what is done, noted in 
 Solver = Annotated[
     str | None, Option(metavar="NAME", help="Of the QP, not control.solver: daqp, osqp, or another that is installed.")
 ]
+Anonymous = Annotated[
+    bool, Option("--anonymous", help="Leave out the operator and the name of the computer that recorded.")
+]
 Operator = Annotated[str | None, Option(help="With --record: whose hands, noted as well.")]
 
 
@@ -130,6 +133,8 @@ def notes_of(task: str | None, operator: str | None, record: object) -> dict[str
     for name in notes:
         if record is None:
             raise ConfigError(f"--{name} needs --record")
+        if not notes[name].strip():
+            raise ConfigError(f"--{name} is empty; allowed: some words, or no --{name}")
     return notes
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +14,7 @@ from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_run import check_window, show_window
 from q2r2_control.cli.output import (
+    Anonymous,
     Json,
     WebHost,
     WebPort,
@@ -27,7 +29,7 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import FASTEST, FrameSampling, Output, keep_episodes
 from q2r2_control.export.formats import FORMATS
-from q2r2_control.judging.judge import Judged, judge_all
+from q2r2_control.judging.judge import Judged, Unreadable, discarded_episodes, judge_all
 from q2r2_control.judging.page import COLUMNS, page_of
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.reader import recordings_in
@@ -103,24 +105,31 @@ def replay(
 def judge(recordings: Recordings, config: Thresholds = None, json: Json = False) -> None:
     """Say of each recorded episode whether to keep or to discard it, why, and by which numbers.
 
-    Thresholds are those of the recorded cell, its block `judge`. Exit code 2 for a file that is no recording.
+    Thresholds are those of the recorded cell, its block `judge`. Exit code 2 if there was a file that cannot be read.
     """
-    judged = _judged(recordings, config)
+    found = _judged(recordings, config)
     if json:
-        print(as_json_text({"episodes": [one.as_json() for one in judged]}))
-        return
+        print(as_json_text({"episodes": [one.as_json() for one in found.all]}))
+    else:
+        _print_verdicts(found)
+    if found.unreadable:
+        raise Exit(2)
+
+
+def _print_verdicts(found: _Judgements) -> None:
     columns = [column for column in COLUMNS if column.name in _SHOWN]  # of several hands or arms the worst number
-    kept, console = sum(one.verdict.keep for one in judged), Console()
-    table = figure_table(
-        f"episodes: {kept} kept, {len(judged) - kept} discarded",
-        ("episode", "verdict", *(column.heading for column in columns)),
-        ((one.figures.name, one.verdict.word, *(column.text(one.figures) for column in columns)) for one in judged),
-    )
-    console.print(table)
+    judged, console = found.judged, Console()
+    kept = sum(one.verdict.keep for one in judged)
+    rows = [(one.figures.name, one.verdict.word, *(column.text(one.figures) for column in columns)) for one in judged]
+    rows += [(one.file.stem, "discard", *("-" for _ in columns)) for one in found.unreadable]
+    title = f"episodes: {kept} kept, {len(rows) - kept} discarded"
+    console.print(figure_table(title, ("episode", "verdict", *(column.heading for column in columns)), rows))
     for one in judged:
         if not one.verdict.keep:
             name = one.figures.file + ("" if one.figures.part is None else f" #{one.figures.part}")
             console.print(f"{escape(name)}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
+    for bad in found.unreadable:
+        console.print(f"{escape(str(bad.file))}: [red]{escape(bad.line)}[/]", soft_wrap=True, highlight=False)
 
 
 def report(
@@ -128,28 +137,49 @@ def report(
     output: Annotated[Path, Option(metavar="HTML", help="The page to write; one that exists is replaced.")],
     config: Thresholds = None,
 ) -> None:
-    """Write one HTML page of recorded episodes: verdicts, numbers and plots. It needs no network to be looked at."""
+    """Write one HTML page of recorded episodes: verdicts, numbers and plots. It needs no network to be looked at.
+
+    Exit code 2 if there was a file that cannot be read; it is named on the page.
+    """
     if output.is_dir() or not output.parent.is_dir():
         raise ConfigError(f"--output {output}: allowed: a file in a folder that exists")
-    judged, names = _judged(recordings, config), ", ".join(map(str, recordings))
+    found, names = _judged(recordings, config), ", ".join(map(str, recordings))
+    judged, unreadable = found.judged, found.unreadable
     with counting("plots") as progress:
-        page = page_of(judged, f"Recordings: {names}", lambda done: progress("", done, len(judged)))
+        page = page_of(judged, f"Recordings: {names}", lambda done: progress("", done, len(judged)), unreadable)
     try:
         output.write_text(page, encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--output {output}: {error.strerror}") from error
-    kept = sum(one.verdict.keep for one in judged)
-    print(f"{output}: {len(judged)} episodes, {kept} kept, {len(judged) - kept} discarded")
+    kept, count = sum(one.verdict.keep for one in judged), len(found.all)
+    print(f"{output}: {count} episodes, {kept} kept, {count - kept} discarded")
+    for bad in unreadable:
+        say(f"{bad.file}: {bad.line}", style="yellow")
+    if unreadable:
+        raise Exit(2)
 
 
-def _judged(recordings: Sequence[Path], config: str | None) -> list[Judged]:
+@dataclass(frozen=True)
+class _Judgements:
+    all: list[Judged | Unreadable]  # in the order of the files
+
+    @property
+    def judged(self) -> list[Judged]:
+        return [one for one in self.all if isinstance(one, Judged)]
+
+    @property
+    def unreadable(self) -> list[Unreadable]:
+        return [one for one in self.all if isinstance(one, Unreadable)]
+
+
+def _judged(recordings: Sequence[Path], config: str | None) -> _Judgements:
     settings = None if config is None else load_config(config).judge
-    files, judged = recordings_in(recordings), list[Judged]()
+    files, judged = recordings_in(recordings), list[Judged | Unreadable]()
     with counting("recordings") as progress:
         for one in judge_all(files, settings):
             judged.append(one)
             progress("", len(judged), max(len(judged), len(files)))
-    return judged
+    return _Judgements(judged)
 
 
 def export(
@@ -159,19 +189,24 @@ def export(
     fps: Annotated[int, Option(help=f"Frames per second: 1 .. {FASTEST}.")] = 30,
     trim: Annotated[bool, Option("--trim", help="Leave out times before and after motion.")] = False,
     workers: Annotated[int, Option(min=1, help="Processes; the result is the same for any number.")] = 1,
-    skip_bad: Annotated[bool, Option("--skip-bad", help="Go on without bad recordings, and name them.")] = False,
+    keep_discarded: Annotated[
+        bool, Option("--keep-discarded", help="Export episodes too that q2r2 judge discards.")
+    ] = False,
+    skip_bad: Annotated[bool, Option("--skip-bad", help="Exit code 0 although recordings cannot be read.")] = False,
+    anonymous: Anonymous = False,
     no_pictures: Annotated[bool, Option("--no-pictures", help="Leave out what cameras recorded.")] = False,
 ) -> None:
     """Make a dataset to train on of recordings of q2r2 run --record, an episode each.
 
     lerobot: a LeRobotDataset, with a video of each camera; needs the extra `lerobot`. lerobot-v2.1: the same for openpi
     and Isaac GR00T. hdf5: a file each, for ACT and robomimic. Both need the extra `export`. csv: tables of the same
-    numbers.
+    numbers. Episodes that q2r2 judge discards are left out and named. Exit code 2 if there was a recording that cannot
+    be read.
     """
     if (chosen := FORMATS.get(name)) is None:
         raise ConfigError(f"export {name}: allowed: {', '.join(FORMATS)}")
     chosen.require()
-    sampling = FrameSampling(fps, trim, pictures=not no_pictures)
+    sampling = FrameSampling(fps, trim, pictures=not no_pictures, anonymous=anonymous)
     target, files = Output(output), recordings_in(recordings)
     try:
         with counting("recordings") as progress:
@@ -181,18 +216,23 @@ def export(
                 chosen.write,
                 target.episodes(),
                 workers=workers,
-                skip_bad=skip_bad,
+                verdicts=None if keep_discarded else discarded_episodes,
                 progress=lambda done: progress("", done, max(done, len(files))),
             )
     finally:
         target.tidy()
-    for fault in made.skipped:
-        say(f"skipped: {fault}", style="yellow")
+    for line in (*made.left_out, *made.unreadable):
+        say(line, style="yellow")
     if not made.kept:
-        raise RecordingError("none of the recordings can be exported")
+        discarded = "; --keep-discarded exports those that q2r2 judge discards" if made.left_out else ""
+        raise RecordingError(f"none of the recordings can be exported{discarded}")
     target.write(lambda path: chosen.join(made.kept, path))
-    whole = len(made.kept) + len(made.skipped) == len(files)
+    whole = len(made.kept) + len(made.left_out) + len(made.unreadable) == len(files)
     count = f"{len(made.kept)} of" if whole else f"{len(made.kept)} episodes of"
     print(f"{output}: {count} {len(files)} recordings at {fps} frames per second")
+    if made.left_out:
+        say(f"left out, since q2r2 judge discards them: {len(made.left_out)}; --keep-discarded exports them too")
     if chosen.advice is not None:
         print(chosen.advice(output))
+    if made.unreadable and not skip_bad:
+        raise Exit(2)

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -29,7 +30,7 @@ from q2r2_control.cli.output import (
     say,
 )
 from q2r2_control.config.cell import Config, load_config
-from q2r2_control.process.scheduling import StopRequest, stop_on_signals
+from q2r2_control.process.scheduling import StopRequest, check_folder, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
 from q2r2_control.ros.launch.processes import check_rclpy, in_ros, nodes_of, run_together
 from q2r2_control.ros.watching.findings import Finding, examine_environment, examine_set
@@ -250,6 +251,8 @@ def up(
     stopped: exit 1. Words after --ros-args are for all nodes: remappings, and parameters as NODE:NAME:=VALUE.
     """
     notes = notes_of(task, operator, record)
+    if record is not None:
+        check_folder(Path(record), "--record")
     recording = None if record is None else {"folder": record, **notes}
     page = (web_host, web_port) if web else None
     if web:

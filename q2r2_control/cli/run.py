@@ -19,6 +19,7 @@ from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
 from q2r2_control.cli.fri import rehearsal
 from q2r2_control.cli.output import (
     DEMO_CONFIG,
+    Anonymous,
     ConfigFile,
     Json,
     Operator,
@@ -47,12 +48,13 @@ from q2r2_control.demo.assembly_tasks import (
     held_to_promises,
     tasks_named,
     with_controls,
+    with_parts_at,
 )
 from q2r2_control.demo.trials import try_tasks
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
-from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, trajectory_named
+from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, place_of, trajectory_named
 from q2r2_control.plants.mujoco_cameras import window_fault
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
@@ -60,6 +62,8 @@ from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned,
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
+LARGEST_SPREAD = 0.03  # [m], within which all tasks reach their parts
+NOT_RECORDED = 3  # exit code of a run that ended well, and whose recording did not
 _FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
@@ -104,6 +108,7 @@ def run(
     record: Record = None,
     task: Task = None,
     operator: Operator = None,
+    anonymous: Anonymous = False,
     force: Annotated[bool, Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
     i_know: Annotated[bool, Option("--i-know", help="Run real cabinets without q2r2 commission.")] = False,
     full_speed: Annotated[bool, Option("--full-speed", help="Run real cabinets faster than a tenth.")] = False,
@@ -116,7 +121,8 @@ def run(
     One with real cabinets that is not commissioned is refused too, unless --i-know is given. Its joints go at a tenth
     of their speed until --full-speed is given.
     Exit 1 where a tool is more than 100 mm from its reference at the end, where an arm refused every press that
-    engages it, and where measured links met in torque mode.
+    engages it, and where measured links met in torque mode. Exit 3 where all that went well, and the recording ended
+    before the run did: a full disk, a writer that was killed.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
     cell = with_solver(load_config(config), solver)
@@ -155,6 +161,7 @@ def run(
         force=force,
         real_time=rt,
         record=record,
+        anonymous=anonymous,
         notes=notes_of(task, operator, record),
         longest_wait=longest_wait(wait),
     )
@@ -162,6 +169,8 @@ def run(
     print_summary(done, json)
     if not done.summary.followed or (done.summary.torque is not None and done.summary.torque.met):
         raise Exit(1)
+    if not done.was_recorded:
+        raise Exit(NOT_RECORDED)
 
 
 def demo(
@@ -194,7 +203,11 @@ def demo(
     seeds: Annotated[
         int | None, Option(min=1, help="Try each task so often with --human, in simulated time; count successes.")
     ] = None,
+    spread: Annotated[
+        float, Option(min=0, max=LARGEST_SPREAD, help="Parts lie elsewhere, as --seed has it, by up to so much [m].")
+    ] = 0.0,
     record: Record = None,
+    anonymous: Anonymous = False,
     rt: RealTime = False,
     solver: Solver = None,
     json: Json = False,
@@ -204,7 +217,8 @@ def demo(
     At a terminal the arms are shown in MuJoCo's window, or in a browser where there is no display. With --plant fri all
     processes have real-time priority where that is permitted, as with --rt: cabinets do not wait for a busy computer.
     Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
-    With --record, whether all succeeded is in the recording, of which q2r2 report makes plots.
+    With --record, whether all succeeded is in the recording, of which q2r2 report makes plots. Exit code 3 where the
+    recording ended before the run did.
     With --seeds, exit code 1 where a task succeeded in less than 19 of 20 trials.
     """
     _check_times(fast, rt)
@@ -217,13 +231,15 @@ def demo(
     chosen = tasks_named(tasks or ("handover", "stack"))
     if seeds is not None:
         unfit = {"--plant fri": plant == "fri", "--viewer": viewer, "--record": record is not None, "--rt": rt}
-        unfit |= {"--duration": duration is not None, "--seed": seed != 0}
+        unfit |= {"--duration": duration is not None, "--seed": seed != 0, "--spread": spread != 0.0}
         if refused := [option for option, given in unfit.items() if given]:
             raise ConfigError(f"{refused[0]} cannot be used with --seeds")
         _try_tasks(chosen, mode, seeds, shaky, solver, json)
         return
-    trajectory = "+".join(task.name for task in chosen)
-    work = trajectory_named(trajectory)
+    if spread and plant == "fri":
+        raise ConfigError("--spread cannot be used with --plant fri, whose parts lie where its cell has them")
+    trajectory, place = "+".join(task.name for task in chosen), place_of(seed, spread)
+    work = trajectory_named(trajectory, place)
     work = hurried(work, seed) if shaky else work
     table = _shows_table(headless, viewer)
     if table and plant == "mujoco" and not (viewer or web or fast):
@@ -231,6 +247,8 @@ def demo(
         web, web_port = not viewer and find_spec("viser") is not None, 0
         if not (viewer or web):
             say("--viewer shows the arms in MuJoCo's window, and --web in a browser: pip install 'q2r2_control[web]'")
+    given: dict[str, object] = {"trajectory": trajectory, "human": human or hands is not None, "seed": seed}
+    given |= {"shaky": shaky, "spread": spread}
     options = RunOptions(
         name="demo",
         input="scripted",
@@ -238,7 +256,7 @@ def demo(
         mode=mode.value,
         duration=positive("--duration", duration) or work.duration,
         fast=fast,
-        input_options={"trajectory": trajectory, "human": human or hands is not None, "seed": seed, "shaky": shaky},
+        input_options=given,
         table=table,
         window=viewer,
         page=(web_host, web_port, None) if web else None,
@@ -246,6 +264,7 @@ def demo(
         tasks=chosen,
         steps=work.steps,
         record=record,
+        anonymous=anonymous,
         notes={"task": "; ".join(task.about for task in chosen)},
     )
     if plant == "fri":
@@ -253,10 +272,13 @@ def demo(
             done = run_cell(with_solver(with_controls(load_config(_FRI_CONFIG)), solver), options)
         done = replace(done, tasks=held_to_promises(results, done.summary))
     else:
-        done = run_cell(with_solver(with_controls(load_config(DEMO_CONFIG)), solver), options)
+        cell = with_parts_at(with_controls(load_config(DEMO_CONFIG)), chosen, place)
+        done = run_cell(with_solver(cell, solver), options)
     print_summary(done, json)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)
+    if not done.was_recorded:
+        raise Exit(NOT_RECORDED)
 
 
 def _try_tasks(

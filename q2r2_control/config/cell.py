@@ -36,7 +36,7 @@ from q2r2_control.config.control import (
 )
 from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
 from q2r2_control.config.fri import MODBUS_DELAY, CabinetConfig, ModbusGripperConfig
-from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSettings
+from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSettings, RecordingSettings
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.strict import Network, StrictModel, network_of, validated
 from q2r2_control.config.teleop import TeleopSettings
@@ -183,6 +183,7 @@ class Config(StrictModel):
     cameras: dict[CameraName, CameraConfig] = Field(
         default_factory=dict, max_length=16, description="of the simulated cell, or on ROS topics, by name"
     )
+    recording: RecordingSettings = RecordingSettings()
     judge: JudgeSettings = JudgeSettings()
 
     @model_validator(mode="after")

@@ -38,6 +38,28 @@ class JudgeSettings(StrictModel):
     max_position_error_p99: Metres | None = Field(0.07, description="target to measured tool [m]")
     max_rotation_error_rms: Radians | None = Field(0.15, description="target to measured tool [rad]")
     max_rotation_error_p99: Radians | None = Field(0.4, description="target to measured tool [rad]")
+    max_unmeasured_ticks: Annotated[int, Field(ge=0, le=10**9)] | None = Field(
+        0, description="ticks whose measured joints, openings or references are no finite numbers"
+    )
+    max_joint_speed: Annotated[float, Field(gt=0, le=100)] | None = Field(
+        1.2, description="fastest measured joint, by its limit of speed"
+    )
+    max_velocity_mismatch: Annotated[float, Field(ge=0, le=100)] | None = Field(
+        0.5, description="measured velocities less the slope of the positions, by that slope"
+    )
+    max_reference_lag: Seconds | None = Field(
+        0.12, description="measured joints behind the reference, or before it [s]"
+    )
+    min_picture_rate_share: Share | None = Field(0.8, description="of a camera: pictures by those that were due")
+    max_picture_gap: Annotated[float, Field(ge=1, le=1000)] | None = Field(
+        2.5, description="of a camera: longest time without a picture, in its periods"
+    )
+    max_frozen_share: Share | None = Field(0.2, description="of a camera: the picture stays while the arms move")
+    max_black_share: Share | None = Field(0.05, description="of the pictures: black, or of one colour")
+    max_bad_pictures: Annotated[int, Field(ge=0, le=10**6)] | None = Field(
+        0, description="pictures of a camera that are damaged, or not of its size"
+    )
+    max_picture_lag: Seconds | None = Field(0.12, description="motion in the pictures behind that of the joints [s]")
     max_idle_share: Share | None = Field(0.5, description="of the whole run: no arm engaged, or none of those moves")
     min_ldlj: Annotated[float, Field(ge=-100, le=0)] | None = Field(
         -11.0, description="smoothness of the tool: log dimensionless jerk, the nearer to 0 the smoother"
@@ -52,7 +74,20 @@ class JudgeSettings(StrictModel):
     max_missed_share: Share | None = Field(0.5, description="of the ticks that were due: the loop was late")
     max_tick_gap: Seconds | None = Field(0.1, description="longest time between two ticks of the loop [s]")
     keep_failed: bool = Field(False, description="one that failed, as its operator or task says, is kept")
+    needs_task: bool = Field(False, description="one that has no task in words is discarded")
     needs_end: bool = Field(True, description="a file that was not ended, by a killed process say, is discarded")
+
+
+TOPIC_RATE = 100.0  # [Hz]
+
+
+class RecordingSettings(StrictModel):
+    """How much ``q2r2 run --record`` writes."""
+
+    topic_rate: Annotated[float, Field(gt=0, le=1000)] | None = Field(
+        TOPIC_RATE,
+        description="of the standard topics, which repeat numbers of the tick [Hz]; null: at every tick",
+    )
 
 
 # It becomes a part of a topic's name and of a feature's.

@@ -112,6 +112,20 @@ def with_controls(config: Config) -> Config:
     return config.model_copy(update={"teleop": teleop})
 
 
+def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[float, float]) -> Config:
+    """The cell with the parts of ``tasks`` farther along x and y, all by the same ``place`` [m]."""
+    parts = {part for task in tasks for part in task.parts}
+    objects = {
+        name: item.model_copy(
+            update={"position": (item.position[0] + place[0], item.position[1] + place[1], item.position[2])}
+        )
+        if name in parts
+        else item
+        for name, item in config.mujoco.objects.items()
+    }
+    return config.model_copy(update={"mujoco": config.mujoco.model_copy(update={"objects": objects})})
+
+
 def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
     """The same ``results``, all failed where links met, a stop was not certified or a tool did not follow."""
     faults, torque = [], summary.torque

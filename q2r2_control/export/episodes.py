@@ -17,8 +17,10 @@ import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.sampling import CameraFrames, Names, Vectors, features, sample
+from q2r2_control.process.helper_process import reason_of
 from q2r2_control.process.pools import pool_of
-from q2r2_control.recording.reader import WHOLE, EpisodeSpan, read_spans
+from q2r2_control.recording.about import anonymous
+from q2r2_control.recording.reader import BROKEN, WHOLE, EpisodeSpan, read_spans
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
 
@@ -28,11 +30,12 @@ _FORMAT = 6  # of kept episodes; those of another one are made again
 
 @dataclass(frozen=True)
 class FrameSampling:
-    """Which ticks become frames, and how many."""
+    """Which ticks become frames, and how many, and what comes with them."""
 
     fps: int = 30
     trim: bool = False  # to the time in which arms are engaged or moving
     pictures: bool = False
+    anonymous: bool = False  # without notes that tell of a person or of a computer's name
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= FASTEST:
@@ -75,6 +78,7 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
     except RecordingError as error:
         raise RecordingError(f"{recording.file}: {error}") from error
     notes = dict(recording.about.notes)
+    notes = anonymous(notes) if sampling.anonymous else notes
     task = notes.pop("task", "")
     cameras, stamps = recording.about.cameras if sampling.pictures else (), frames["stamp"].tolist()
     return EpisodeVectors(
@@ -100,13 +104,31 @@ def spans_to_export(file: Path) -> list[EpisodeSpan]:
 
 
 Write = Callable[[EpisodeVectors, Path], None]  # an episode as a new file or folder; importable, for other processes
-_Job = tuple[Path, FrameSampling, EpisodeSpan, Write, Path]
+# Of a file, with or without its pictures: why episodes are discarded, by their number; importable as well.
+Verdicts = Callable[[Path, bool], Mapping[int, str]]
+_LONGEST_REASON = 300  # [characters]
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    file: Path
+    sampling: FrameSampling
+    span: EpisodeSpan
+    write: Write
+    target: Path
+    verdicts: Verdicts | None
+
+    @property
+    def name(self) -> str:
+        """Of the recording, and of an episode in it."""
+        return str(self.file) + (f" #{self.span.number}" if self.span.number else "")
 
 
 @dataclass(frozen=True)
 class Exported:
     kept: list[Path]  # episodes, in the order of their recordings
-    skipped: list[str]  # what was wrong with the others, a line each
+    left_out: list[str]  # that are discarded, with the reasons, a line each
+    unreadable: list[str]  # recordings that cannot be exported, and why, a line each
 
 
 def keep_episodes(
@@ -116,34 +138,34 @@ def keep_episodes(
     folder: Path,
     *,
     workers: int = 1,
-    skip_bad: bool = False,
+    verdicts: Verdicts | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
     """``write`` the episodes of recordings into ``folder``; those that are there already are not made again.
 
-    The same comes out for any number of ``workers``. ``progress`` is called with how many are through. Raises the
-    :class:`RecordingError` of the first bad recording unless ``skip_bad``, and :class:`ConfigError` where nothing can
-    be written or a worker was killed.
+    Episodes that ``verdicts`` discards are left out, and so are recordings that cannot be read. The same comes out for
+    any number of ``workers``. ``progress`` is called with how many are through. Raises :class:`ConfigError` where
+    nothing can be written or a worker was killed.
     """
-    jobs: list[_Job] = [
-        (file, sampling, span, write, folder / _name(file, sampling, span, write))
+    jobs = [
+        _Job(file, sampling, span, write, folder / _name(file, sampling, span, write, verdicts), verdicts)
         for file in files
         for span in spans_to_export(file)
     ]
-    exported = Exported([], [])
+    exported = Exported([], [], [])
     with closing(_results(jobs, min(workers, len(jobs)))) as results:
-        for done, (job, fault) in enumerate(zip(jobs, results, strict=True), start=1):
-            if fault is not None and not skip_bad:
-                raise RecordingError(fault)
-            if fault is None:
-                exported.kept.append(job[-1])
+        for done, (job, (verdict, fault)) in enumerate(zip(jobs, results, strict=True), start=1):
+            if fault is not None:
+                exported.unreadable.append(f"{job.name}: discard: unreadable, {fault}")
+            elif verdict is not None:
+                exported.left_out.append(f"{job.name}: {verdict}")
             else:
-                exported.skipped.append(fault)
+                exported.kept.append(job.target)
             progress(done)
     return exported
 
 
-def _results(jobs: Sequence[_Job], workers: int) -> Generator[str | None]:
+def _results(jobs: Sequence[_Job], workers: int) -> Generator[tuple[str | None, str | None]]:
     """The results that :func:`_keep` returns of each job, in their order."""
     if workers <= 1:
         yield from map(_keep, jobs)
@@ -159,33 +181,47 @@ def _results(jobs: Sequence[_Job], workers: int) -> Generator[str | None]:
         pool.shutdown(cancel_futures=True)
 
 
-def _keep(job: _Job) -> str | None:
-    """Write one episode unless it is there, where a whole one only ever is; returns what was wrong."""
-    file, sampling, span, write, target = job
+def _keep(job: _Job) -> tuple[str | None, str | None]:
+    """Write one episode unless it is there, where a whole one only ever is.
+
+    Returns the verdict that leaves it out, or else None, and what is wrong with the recording, or else None.
+    """
+    target = job.target
     if target.exists():
-        return None
+        return None, None
+    try:
+        discarded = {} if job.verdicts is None else job.verdicts(job.file, job.sampling.pictures)
+        if (verdict := discarded.get(job.span.number)) is not None:
+            return verdict, None
+        episode = make_episode(job.file, job.sampling, job.span)
+    except (RecordingError, *BROKEN) as error:
+        return None, _reason(error, job)
     unfinished = target.with_name(f"{target.name}.unfinished")
     try:
-        write(make_episode(file, sampling, span), unfinished)
+        job.write(episode, unfinished)
         for path in (unfinished, *unfinished.rglob("*")):
             if path.is_file():
                 with path.open("rb") as stream:
                     os.fsync(stream.fileno())  # no half of it is kept where power fails
         unfinished.replace(target)
-    except RecordingError as error:
-        return str(error)
+    except RecordingError as error:  # pictures are read while they are written
+        return None, _reason(error, job)
     except OSError as error:
         raise ConfigError(f"--output {target.parent}: {error.strerror or error}") from error
-    return None
+    return None, None
 
 
-def _name(file: Path, sampling: FrameSampling, span: EpisodeSpan, write: Write) -> str:
+def _reason(error: Exception, job: _Job) -> str:
+    return reason_of(error).removeprefix(f"{job.file}: ")[:_LONGEST_REASON]
+
+
+def _name(file: Path, sampling: FrameSampling, span: EpisodeSpan, write: Write, verdicts: Verdicts | None) -> str:
     """Of a kept episode; another one after any change of the recording or of what is asked for."""
     try:
         status = file.stat()
     except OSError as error:
         raise RecordingError(f"{file}: cannot be read: {error.strerror}") from error
-    made_of = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), span.number]
+    made_of = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), span.number, verdicts is None]
     identity = json.dumps([*made_of, write.__module__, write.__name__, _FORMAT])
     key = hashlib.sha256(identity.encode()).hexdigest()[:24]
     return f"{file.stem}-{span.number}.{key}" if span.number else f"{file.stem}.{key}"

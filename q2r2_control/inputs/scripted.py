@@ -151,17 +151,31 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
 }
 
 
-def trajectory_named(name: str) -> HandTrajectory:
-    """One of :data:`TRAJECTORIES`, or works such as ``handover+stack``. Raises :class:`ConfigError` for others."""
+def place_of(seed: int, spread: float) -> tuple[float, float]:
+    """How much farther along x and y than in the cell the parts of all tasks lie, up to ``spread`` [m] to any side."""
+    x, y = np.random.default_rng([seed, _PLACES]).uniform(-spread, spread, 2).tolist()
+    return x, y
+
+
+def trajectory_named(name: str, place: tuple[float, float] | None = None) -> HandTrajectory:
+    """One of :data:`TRAJECTORIES`, or works such as ``handover+stack``, on parts that lie at another ``place`` [m].
+
+    Raises :class:`ConfigError` for others, and for a place of what has no parts.
+    """
+    works = name.split("+")
+    if place is not None and all(work in WORKS for work in works):
+        return in_sequence([(work, WORKS[work].moved(*place)) for work in works])
+    if place is not None:
+        raise ConfigError(f"scripted trajectory {name!r:.60}: has no parts to spread; allowed: {', '.join(WORKS)}")
     if name in TRAJECTORIES:
         return TRAJECTORIES[name]
-    works = name.split("+")
     if not all(work in WORKS for work in works):
         allowed = f"{', '.join(TRAJECTORIES)}, and {', '.join(WORKS)} joined by +"
         raise ConfigError(f"scripted trajectory {name!r:.60}: allowed are {allowed}")
     return in_sequence([(work, WORKS[work]) for work in works])
 
 
+_PLACES = 7  # beside the seed, so that places do not depend on what else is drawn with it
 _PACE = 1.25  # of hasty hands
 _HESITATIONS, _HESITATES = 3, 0.4  # [s]
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1  # since a headset lost the hands [s]
@@ -234,11 +248,12 @@ class ScriptedInput(PlayedInput):
     ``human`` hands are those of :class:`HeadsetSampling`, with tremor and dropouts; ``shaky`` ones tremble more, and do
     their work as :func:`hurried` says. Others are sampled at an even rate,
     and received each later by up to ``jitter`` [s]. Circle, line and rotate repeat ``frequency_hz`` times a second.
-    Hands go ``scale`` times as far as the trajectory is written, and turn as far as it is.
+    Hands go ``scale`` times as far as the trajectory is written, and turn as far as it is. Of tasks, they reach for
+    parts at :func:`place_of` the ``seed`` and ``spread`` [m].
     Raises :class:`ConfigError` for an unknown trajectory or hand, and for a number that is not allowed.
     """
 
-    options = ("trajectory", "human", "seed", "fast", "shaky")
+    options = ("trajectory", "human", "seed", "fast", "shaky", "spread")
     simulated = True
     executable = "SimulationInput"
 
@@ -253,6 +268,7 @@ class ScriptedInput(PlayedInput):
         jitter: float = 0.0,
         scale: float = 1.0,
         shaky: bool = False,
+        spread: float = 0.0,
     ) -> None:
         for hand in hands:
             if hand not in SIDES:
@@ -265,7 +281,8 @@ class ScriptedInput(PlayedInput):
             raise ConfigError(
                 f"scripted input: jitter = {jitter!r}: allowed is 0 .. {0.5 / rate_hz:.3g}, half a sample"
             )
-        self._trajectory = trajectory_named(trajectory) if isinstance(trajectory, str) else trajectory
+        place = place_of(seed, spread) if spread else None
+        self._trajectory = trajectory_named(trajectory, place) if isinstance(trajectory, str) else trajectory
         if shaky and self._trajectory.duration is not None:
             self._trajectory = hurried(self._trajectory, seed)
         self._frequency, self._scale, lost = frequency_hz, scale, self._trajectory.lost
@@ -287,13 +304,15 @@ class ScriptedInput(PlayedInput):
         seed: int = 0,
         fast: bool = False,
         shaky: bool = False,
+        spread: float = 0.0,
     ) -> ScriptedInput:
         """Motions as large as the shortest arm of the cell is long, if that is shorter than an iiwa 7.
 
         ``fast`` changes nothing: samples come by the time that passes, simulated or not.
         """
         shortest = min(compose(config).arm_lengths().values())
-        return cls(trajectory, human=human, seed=seed, shaky=shaky, scale=min(shortest / _FULL_LENGTH, 1.0))
+        scale = min(shortest / _FULL_LENGTH, 1.0)
+        return cls(trajectory, human=human, seed=seed, shaky=shaky, scale=scale, spread=spread)
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """How ``hand`` ideally moves at ``t`` [s], in the axes that its poses have [m/s, rad/s]."""

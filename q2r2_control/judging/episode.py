@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
@@ -12,16 +12,17 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event
+from q2r2_control.judging.pictures import Pictures, read_pictures
 from q2r2_control.recording.about import Conclusion
-from q2r2_control.recording.messages import NANOSECONDS
+from q2r2_control.recording.messages import NANOSECONDS, is_compressed
 from q2r2_control.recording.reader import Recording, TickChunk
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, check_tools, tool_poses
-from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, targets_or_tools, tick_type
-from q2r2_control.types import SIDES, Array
+from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, targets_or_tools, tick_type
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import SIDES, Array, Flags
 
 FRAME = 0.01  # the time between two frames, at least [s]
-
-Flags = npt.NDArray[np.bool_]
+SPEED_OVER = 0.02  # a measured speed is taken over so long at least, since ticks come unevenly [s]
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,9 @@ class Ticks:
     slip: Array  # (n, arms) how far the leash has dragged the target since engaging [m]
     slip_angle: Array  # (n, arms) [rad]
     gripper: Array  # (n, arms) opening that is wanted, 0 closed .. 1 open
+    now: Array  # (n,) by the loop's own clock [s]
+    unmeasured: Flags  # (n, arms) a measured position, velocity or opening, or a reference, is no finite number
+    joint_speed: Array  # (n, arms) of the measured joint that is nearest to its limit of speed, by that limit
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,10 @@ class Frames:
     q: Array  # (m, joints) measured [rad]
     target: Array  # (m, arms, 7) of the operator; where there is none, the tool at the reference
     reference: Array  # (m, arms, 7) tools at the controller's reference
+    v: Array  # (m, joints) measured [rad/s]
+    reference_q: Array  # (m, joints) the controller's reference [rad]
+    opening: Array  # (m, arms) measured of grippers, 0 closed .. 1 open; -inf: not measured
+    commanded: Array  # (m, arms) the same as commanded
 
 
 @dataclass(frozen=True)
@@ -71,12 +79,14 @@ class Episode:
 
     recording: Recording
     config: Config
+    robot: Robot
     ticks: Ticks
     frames: Frames
     tools: Array  # (m, arms, 7) measured, at the frames
     hands: dict[str, Hand]  # those that lead an arm
     events: list[Event]
     damage: str | None  # why the file could be read no farther
+    pictures: dict[str, Pictures] = field(default_factory=dict)  # of cameras whose pictures can be looked at
     ended_by: str | None = None  # the fault that ended the run
     success: bool | None = None  # by the task's own check or the operator; None: nobody said
     part: int | None = None  # of the recording's episodes, from 1 on; None: the whole
@@ -106,10 +116,13 @@ class Episode:
         return self.recording.closed and bool(len(self.ticks.t)) and not self.ticks.following[-1]
 
 
-def read_episode(recording: Recording) -> Episode:
-    """Read a recording, up to where it is damaged. Raises :class:`RecordingError` where its cell cannot be built."""
+def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:
+    """Read a recording, up to where it is damaged, with or without its ``pictures``.
+
+    Raises :class:`RecordingError` where its cell cannot be built.
+    """
     config, robot = cell_and_robot_of(recording)
-    read = _Read(recording)
+    read = _Read(recording, robot)
     damage = read.all_chunks()
     ticks, frames, said = _joined(Ticks, read.ticks), _joined(Frames, read.frames), read.said
     if damage is None and len(frames.at):
@@ -121,12 +134,42 @@ def read_episode(recording: Recording) -> Episode:
     arms = {SIDES[1 - SIDES.index(arm)] if swapped else arm: arm for arm in recording.about.arms}
     hands = {hand: read.hand(hand, arm, ticks) for hand, arm in arms.items()}
     tools = tool_poses(frames.q, robot)
-    return Episode(recording, config, ticks, frames, tools, hands, read.events, damage, said.ended_by, said.success)
+    looked_at, damage = _pictures(recording, config, damage) if pictures else ({}, damage)
+    return Episode(
+        recording=recording,
+        config=config,
+        robot=robot,
+        ticks=ticks,
+        frames=frames,
+        tools=tools,
+        hands=hands,
+        events=read.events,
+        damage=damage,
+        pictures=looked_at,
+        ended_by=said.ended_by,
+        success=said.success,
+    )
+
+
+def _pictures(recording: Recording, config: Config, damage: str | None) -> tuple[dict[str, Pictures], str | None]:
+    """Pictures of all cameras, and what is damaged; of a damaged file none, whose end nobody knows."""
+    chosen = {name: config.cameras[name] for name in recording.about.cameras if name in config.cameras}
+    chosen = {name: camera for name, camera in chosen.items() if camera.topic is None or is_compressed(camera.topic)}
+    if damage is not None or not chosen:
+        return {}, damage
+    try:
+        return read_pictures(recording, chosen), None
+    except RecordingError as error:
+        return {}, str(error).removeprefix(f"{recording.file}: ")
 
 
 class _Read:
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, robot: Robot) -> None:
         self._recording = recording
+        self._limits = robot.velocity_limit
+        self._joints = [arm.joints for arm in robot.arms.values()]
+        self._wraps = robot.position_upper - robot.position_lower >= 2.0 * np.pi  # of a joint that turns on for ever
+        self._last: tuple[float, Array] | None = None  # time [s] and measured joints of the newest tick
         self.ticks: list[Ticks] = []
         self.frames: list[Frames] = []
         self.events: list[Event] = []
@@ -175,13 +218,38 @@ class _Read:
             slip=arms["slip"],
             slip_angle=arms["slip_angle"],
             gripper=arms["wanted"],
+            now=rows["now"],
+            unmeasured=self._unmeasured(rows),
+            joint_speed=self._joint_speed(t, rows["q"]),
         )
         slots = np.floor(t / FRAME).astype(np.int64)
         at = np.flatnonzero(np.diff(slots, prepend=self._slot) > 0)
         shown = rows[at]
         self.ticks.append(ticks)
-        self.frames.append(Frames(self._count + at, shown["q"], targets_or_tools(shown), shown["arms"]["tool"]))
+        poses = targets_or_tools(shown), shown["arms"]["tool"]
+        joints = shown["v"], shown["reference_q"]
+        openings = shown["arms"]["opening"], shown["arms"]["commanded"]
+        self.frames.append(Frames(self._count + at, shown["q"], *poses, *joints, *openings))
         self._count, self._slot = self._count + len(t), int(slots.max(initial=self._slot))
+
+    def _unmeasured(self, rows: Rows) -> Flags:
+        """(n, arms) Torques do not count, of which NaN says that nothing measures them; an opening of -inf neither."""
+        finite = np.all([np.isfinite(rows[name]) for name in ("q", "v", "reference_q", "reference_v")], axis=0)
+        openings = rows["arms"]["opening"]
+        bad = [~finite[:, joints].all(axis=1) for joints in self._joints]
+        return np.stack(bad, axis=1) | np.isnan(openings) | (openings == np.inf)
+
+    def _joint_speed(self, t: Array, q: Array) -> Array:
+        """(n, arms) where a number is missing, 0."""
+        if not len(t):
+            return np.empty((0, len(self._joints)))
+        before_t, before_q = self._last if self._last is not None else (t[0], q[0])
+        self._last = float(t[-1]), q[-1].copy()
+        steps = np.diff(q, axis=0, prepend=before_q[None])
+        steps -= np.where(self._wraps, 2.0 * np.pi * np.rint(steps / (2.0 * np.pi)), 0.0)
+        passed = np.maximum(np.diff(t, prepend=before_t), SPEED_OVER)
+        shares = np.nan_to_num(np.abs(steps) / passed[:, None] / self._limits, posinf=0.0)
+        return np.stack([shares[:, joints].max(axis=1) for joints in self._joints], axis=1)
 
     def hand(self, hand: str, arm: str, ticks: Ticks) -> Hand:
         rows = np.concatenate(self._samples)

@@ -75,13 +75,13 @@ def _verdict(question: Question, run: int) -> tuple[bool | None, str]:
 
 
 def written_episode(question: Question) -> Episode | None:
-    """The episode; None where it is not in the file as a whole yet."""
+    """The episode, without its pictures, which may come seconds later; None where it is not in the file as a whole."""
     recording, span = open_recording(Path(question.file)), question.span
     if not question.timed:
-        found = parts_of(read_episode(recording))[span.number - 1 : span.number]
+        found = parts_of(read_episode(recording, pictures=False))[span.number - 1 : span.number]
         return found[0] if found and found[0].ended_by_operator else None
     recording.since = recording.about.epoch + round(span.start * 1e9) - _BEFORE  # no more has to be read
-    whole = read_episode(recording)
+    whole = read_episode(recording, pictures=False)
     return part_of(whole, span) if len(whole.ticks.t) and whole.ticks.t[-1] > span.end else None
 
 

@@ -8,12 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from q2r2_control.events import ReasonKind
-from q2r2_control.judging.episode import Episode, Flags
+from q2r2_control.judging.camera_figures import CameraFigures, camera_figures
+from q2r2_control.judging.episode import Episode
+from q2r2_control.judging.measured import MeasuredFigures, measured_figures
 from q2r2_control.judging.motion import ArmFigures, arm_figures, idle_share
+from q2r2_control.recording.about import LOOP
+from q2r2_control.recording.messages import hand_pose, loop_topics, target
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
-from q2r2_control.types import Array
+from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 
+_SURELY = 100  # frames, a second, with a target, so that its topic has one whatever its rate
 _SHORTEST = 1e-3  # of a time in which an arm counts as engaged [s]
 
 
@@ -100,6 +105,8 @@ class TimingFigures:
     longest_tick_s: float | None  # between two ticks of the loop
     compute_time_us_p99: float | None
     ended: bool  # the arms came to rest and the file was closed
+    repeated_stamps: int | None  # ticks with a time that the one before had; None of nodes, whose receipts may coincide
+    begins_again: bool  # the run goes on after it has begun to end: there are two in one file
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +115,15 @@ class EpisodeFigures:
 
     file: str
     part: int | None  # which episode of the file, from 1 on; None: the whole
-    task: str
+    task: str | None  # in words; None: nobody said
     duration_s: float  # until the run begins to end
     engaged_s: float  # of any arm
     idle_share: float | None
     hands: dict[str, HandFigures]
     arms: dict[str, ArmFigures]
+    measured: dict[str, MeasuredFigures]  # by arm
+    cameras: dict[str, CameraFigures]
+    empty_topics: list[str]  # without a message, of those that every run has
     faults: list[Fault]
     fallback_ticks: int
     fallback_share: float | None
@@ -139,12 +149,15 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
     return EpisodeFigures(
         file=str(episode.recording.file),
         part=episode.part,
-        task=episode.recording.about.notes.get("task", ""),
+        task=episode.recording.about.notes.get("task"),
         duration_s=float(ticks.t[following][-1]) if following.any() else 0.0,
         engaged_s=float(ticks.dt[engaged].sum()),
         idle_share=idle_share(episode),
         hands={hand: hand_figures(episode, hand, dropout) for hand in episode.hands},
         arms={arm: arm_figures(episode, arm) for arm in episode.arms},
+        measured={arm: measured_figures(episode, arm) for arm in episode.arms},
+        cameras=camera_figures(episode),
+        empty_topics=_empty_topics(episode),
         # Refused presses are none, since nothing moved; nor is the other arm's pause that follows from a fault.
         faults=[
             Fault(event.t, event.arm, str(event.reason.root.kind), sentence(event.reason))
@@ -165,6 +178,18 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
     )
 
 
+def _empty_topics(episode: Episode) -> list[str]:
+    """Topics without a message; of a file without an index nobody knows, and nodes may have published nothing."""
+    about, counts = episode.recording.about, episode.recording.counts
+    if about.source != LOOP or counts is None or not len(episode.ticks.t):
+        return []
+    asked = (episode.frames.target != episode.frames.reference).any(axis=2).sum(axis=0)  # frames with a target
+    expected = list(loop_topics(about.arms))
+    expected += [target(arm) for arm, count in zip(about.arms, asked.tolist(), strict=True) if count > _SURELY]
+    expected += [hand_pose(name) for name, hand in episode.hands.items() if len(hand.received)]
+    return [topic for topic in expected if not counts.get(topic)]
+
+
 def _least_mm(distances: Array) -> float | None:
     known = distances[np.isfinite(distances)]
     return 1e3 * float(known.min()) if len(known) else None
@@ -174,7 +199,7 @@ def timing_figures(episode: Episode) -> TimingFigures:
     """Figures of ticks; missed are those between which more time passed, by what each tick says, than a period."""
     ticks, count = episode.ticks, len(episode.ticks.t)
     if not count:
-        return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended)
+        return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended, 0, False)
     period = 1.0 / episode.config.nominal_rate_hz
     lost = np.diff(ticks.number, prepend=-1) - 1  # the first tick of a run is number 0
     gaps = np.diff(ticks.t, prepend=0.0) - ticks.dt
@@ -190,4 +215,13 @@ def timing_figures(episode: Episode) -> TimingFigures:
         longest_tick_s=float(ticks.dt.max()),
         compute_time_us_p99=1e6 * float(np.percentile(ticks.compute_time, 99)),
         ended=episode.ended,
+        repeated_stamps=_repeated_stamps(episode),
+        begins_again=bool((np.diff(ticks.following.astype(int)) > 0).any()),
     )
+
+
+def _repeated_stamps(episode: Episode) -> int | None:
+    if episode.recording.about.source != LOOP:
+        return None
+    ticks = episode.ticks
+    return int(((np.diff(ticks.t) <= 0.0) | (np.diff(ticks.now) <= 0.0)).sum())

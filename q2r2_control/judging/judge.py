@@ -7,28 +7,25 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from q2r2_control.config.recording import JudgeSettings
-from q2r2_control.errors import RecordingError
+from q2r2_control.errors import Q2R2Error, RecordingError
+from q2r2_control.judging.contradictions import contradictions
 from q2r2_control.judging.episode import Episode, Hand, read_episode
 from q2r2_control.judging.figures import EpisodeFigures, figures_of
-from q2r2_control.recording.reader import EpisodeSpan, Recording, spans_of
+from q2r2_control.judging.thresholds import THRESHOLDS, Rejection
+from q2r2_control.process.helper_process import reason_of
+from q2r2_control.recording.reader import BROKEN, EpisodeSpan, Recording, spans_of
 from q2r2_control.recording.ros_recording import open_recording
 
 VERDICT_FILE = "verdict.json"
 _FORMAT = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Rejection:
-    """Why an episode is discarded."""
-
-    name: str  # of the threshold, or of what no threshold says: never_engaged, no_ticks, damaged ...
-    text: str
+_LONGEST_REASON = 300  # why a file cannot be read [characters]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,60 +48,6 @@ class Verdict:
         return f"{self.word}: {reasons}" if reasons else self.word
 
 
-class _Unit(NamedTuple):
-    name: str = ""
-    scale: float = 1.0  # from the threshold's own unit, of the SI
-
-
-@dataclass(frozen=True, slots=True)
-class _Threshold:
-    """A limit of a number of an episode, or of each of its hands or arms."""
-
-    name: str  # min_...: at least; max_...: at most
-    of: Literal["episode", "hand", "arm", "timing"]
-    figure: str
-    words: str
-    unit: _Unit
-    figure_in_unit: bool = False  # and not in the threshold's
-
-    def reason(self, value: float | None, limit: float | None, whose: str) -> Rejection | None:
-        """Why a value is beyond the limit; what is None is not judged."""
-        if value is None or limit is None:
-            return None
-        scale, at_least = self.unit.scale, self.name.startswith("min_")
-        found = value / scale if self.figure_in_unit else value
-        if found >= limit if at_least else found <= limit:
-            return None
-        shown = f"{whose}{self.words} {scale * found:.1f} {self.unit.name}".strip()
-        return Rejection(self.name, f"{shown} ({'at least' if at_least else 'at most'} {scale * limit:.4g})")
-
-
-_MM, _MS, _DEGREES = _Unit("mm", 1e3), _Unit("ms", 1e3), _Unit("deg", math.degrees(1.0))
-_PERCENT, _OF_TIME, _OF_TICKS = (_Unit(f"%{of}", 1e2) for of in ("", " of the time", " of the ticks"))
-_THRESHOLDS = (
-    _Threshold("min_pose_rate", "hand", "pose_rate_hz", "poses at", _Unit("Hz")),
-    _Threshold("max_dropout_share", "hand", "dropout_share", "dropouts", _OF_TIME),
-    _Threshold("max_pose_gap", "hand", "longest_gap_s", "no pose for", _MS),
-    _Threshold("max_sample_age", "hand", "sample_age_ms_p99", "poses are old when they are used, p99", _MS, True),
-    _Threshold("max_delay", "arm", "hand_to_tool_ms", "moves later than its hand by", _MS, True),
-    _Threshold("max_rejected_share", "arm", "rejected_share", "unusable targets", _PERCENT),
-    _Threshold("max_leashed_share", "arm", "leashed_share", "leash dragged", _OF_TIME),
-    _Threshold("max_position_error_rms", "arm", "position_error_mm_rms", "tracking error RMS", _MM, True),
-    _Threshold("max_position_error_p99", "arm", "position_error_mm_p99", "tracking error p99", _MM, True),
-    _Threshold("max_rotation_error_rms", "arm", "rotation_error_deg_rms", "tracking error RMS", _DEGREES, True),
-    _Threshold("max_rotation_error_p99", "arm", "rotation_error_deg_p99", "tracking error p99", _DEGREES, True),
-    _Threshold("min_ldlj", "arm", "ldlj", "not smooth, LDLJ", _Unit()),
-    _Threshold("max_idle_share", "episode", "idle_share", "idle: no engaged arm moves", _PERCENT),
-    _Threshold("max_fallback_share", "episode", "fallback_share", "certified stops executed", _OF_TICKS),
-    _Threshold("max_uncertified_share", "episode", "uncertified_share", "without a certified stop", _OF_TICKS),
-    _Threshold("min_margin", "episode", "min_margin_mm", "nearer than a pair may be: margin", _MM, True),
-    _Threshold("max_lost_share", "timing", "lost_share", "ticks lost in the recording", _OF_TICKS),
-    _Threshold("max_lost_gap", "timing", "longest_lost_s", "ticks lost in the recording, at once", _MS),
-    _Threshold("max_missed_share", "timing", "missed_share", "loop was late: missed", _OF_TICKS),
-    _Threshold("max_tick_gap", "timing", "longest_tick_s", "loop stood still for", _MS),
-)
-
-
 def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
     """Hold an episode's numbers to thresholds; a number that is None is not judged."""
     reasons = list(_unreadable(figures, settings))
@@ -113,10 +56,12 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
     groups: dict[str, dict[str, Any]] = {
         "hand": {f"{name} hand: ": hand for name, hand in figures.hands.items()},
         "arm": {f"{name} arm: ": arm for name, arm in figures.arms.items()},
+        "measured": {f"{name} arm: ": arm for name, arm in figures.measured.items()},
+        "camera": {f"camera {name}: ": camera for name, camera in figures.cameras.items()},
         "episode": {"": figures},
         "timing": {"": figures.timing},
     }
-    for threshold in _THRESHOLDS:
+    for threshold in THRESHOLDS:
         limit = getattr(settings, threshold.name)
         for whose, found in groups[threshold.of].items():
             if (reason := threshold.reason(getattr(found, threshold.figure), limit, whose)) is not None:
@@ -126,7 +71,7 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
         also = f", and {len(figures.faults) - 1} more" if len(figures.faults) > 1 else ""
         what = f"fault: {first.arm} arm at {first.t:.2f} s: {first.reason}{also} (at most {settings.max_faults})"
         reasons.append(Rejection("max_faults", what))
-    return Verdict(tuple(reasons))
+    return Verdict((*reasons, *contradictions(figures, settings)))
 
 
 def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
@@ -164,6 +109,7 @@ def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
         inside = (span.start <= hand.polled) & (hand.polled <= span.end)
         received, polled = hand.received[inside] - began, hand.polled[inside] - began
         hands[name] = Hand(hand.arm, received, polled, hand.position[inside])
+    pictures = {name: found.between(span.start, span.end, began) for name, found in episode.pictures.items()}
     told = span.end < math.inf
     return replace(
         episode,
@@ -173,6 +119,7 @@ def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
         ),
         tools=episode.tools[shown],
         hands=hands,
+        pictures=pictures,
         events=[replace(event, t=event.t - began) for event in episode.events if span.start <= event.t <= span.end],
         damage=None if told else episode.damage,
         ended_by=None if told else episode.ended_by,
@@ -197,9 +144,25 @@ class Judged:
         return dict(json.loads(json.dumps(data), parse_constant=lambda name: None))
 
 
-def judge(recording: Recording, settings: JudgeSettings | None = None) -> list[Judged]:
+@dataclass(frozen=True)
+class Unreadable:
+    """A file of which nothing can be said but that it is discarded."""
+
+    file: Path
+    why: str  # in one line, without the file's name
+
+    @property
+    def line(self) -> str:
+        return f"discard: unreadable, {self.why}"
+
+    def as_json(self) -> dict[str, Any]:
+        reason = asdict(Rejection("unreadable", f"unreadable, {self.why}"))
+        return {"verdict": "discard", "reasons": [reason], "file": str(self.file), "figures": None}
+
+
+def judge(recording: Recording, settings: JudgeSettings | None = None, *, pictures: bool = True) -> list[Judged]:
     """Judge a recording's episodes, by its cell's thresholds or these. Raises as :func:`read_episode` does."""
-    return [judge_episode(episode, settings) for episode in parts_of(read_episode(recording))]
+    return [judge_episode(episode, settings) for episode in parts_of(read_episode(recording, pictures=pictures))]
 
 
 def judge_episode(episode: Episode, settings: JudgeSettings | None = None) -> Judged:
@@ -209,10 +172,23 @@ def judge_episode(episode: Episode, settings: JudgeSettings | None = None) -> Ju
     return Judged(episode, figures, verdict_of(figures, settings), settings)
 
 
-def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> Iterator[Judged]:
-    """Judge recordings. Raises :class:`RecordingError` for a file that is none, before the first is judged."""
-    for recording in [open_recording(file) for file in files]:
-        yield from judge(recording, settings)
+def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> Iterator[Judged | Unreadable]:
+    """Judge recordings, one after the other; a file that cannot be read says why, and the next one follows."""
+    for file in files:
+        try:
+            yield from judge(open_recording(file), settings)
+        except (Q2R2Error, *BROKEN) as error:
+            yield Unreadable(file, reason_of(error).removeprefix(f"{file}: ")[:_LONGEST_REASON])
+
+
+@lru_cache(maxsize=1)  # the episodes of one file are asked for one after the other
+def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
+    """Why episodes of a recording are discarded, by their number; 0: the whole. With or without its ``pictures``.
+
+    Raises :class:`RecordingError`.
+    """
+    judged = judge(open_recording(file), pictures=pictures)
+    return {one.figures.part or 0: one.verdict.line for one in judged if not one.verdict.keep}
 
 
 def keep_verdicts(judged: Sequence[Judged]) -> Path:

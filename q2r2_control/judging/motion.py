@@ -11,9 +11,9 @@ import pinocchio as pin
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from q2r2_control.judging.episode import FRAME, Episode, Flags, stretches
+from q2r2_control.judging.episode import FRAME, Episode, stretches
 from q2r2_control.teleop.relative import RelativeMotion
-from q2r2_control.types import Array
+from q2r2_control.types import Array, Flags
 
 PIECE = 1.0  # of a motion, for its smoothness [s]
 _HOP = 0.25  # from one piece to the next [s]
@@ -26,6 +26,7 @@ _STEP = 0.005  # of delays, and of the times that are compared [s]
 _DIFFERENCE = 0.025  # to either side, over which a motion is a difference [s]
 _LEAST_MOTION = 0.01  # a hand that moves less has no delay [m/s], RMS
 _LEAST_FIT = 0.5  # of the tool's motion that the hand's explains
+_ALIKE = 0.01  # fit by which a delay that is a second longer has to be better: a motion may repeat itself
 _LOOK = 0.5  # what moves is elsewhere so much earlier or later [s]
 _MOVED, _TURNED = 2e-3, 0.02  # at least [m, rad]
 
@@ -83,10 +84,13 @@ def ldlj(position: Array, dt: float) -> float:
 
 class Track(NamedTuple):
     t: Array  # (n,) [s], rising
-    position: Array  # (n, 3) [m]
+    position: Array  # (n, 3) [m], or (n, joints) [rad]
 
     def velocity(self, when: Array) -> Array:
-        """(m, 3) [m/s] at times ``when`` (m,) [s], as a difference over 50 ms; before and after the track it rests."""
+        """(m, 3) [m/s], or (m, joints) [rad/s], at times ``when`` (m,) [s], as a difference over 50 ms.
+
+        Before and after the track it rests.
+        """
         ahead, behind = (
             np.stack([np.interp(when + shift, self.t, column) for column in self.position.T], axis=1)
             for shift in (_DIFFERENCE, -_DIFFERENCE)
@@ -131,15 +135,20 @@ def delays_behind(hand: Track, followers: Sequence[Track], when: Array) -> list[
     return [_best(lags, by_hand, follower.velocity(when)) for follower in followers]
 
 
+def best_delay(leader: Track, follower: Track, when: Array, lags: Array) -> float | None:
+    """The one of ``lags`` [s], 5 ms apart, by which a motion follows another; None as of :func:`delays`."""
+    return _best(lags, [leader.velocity(when - lag) for lag in lags], follower.velocity(when))
+
+
 def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:
-    """The delay of the highest correlation, between two steps too."""
+    """The delay of the highest correlation, between two steps too; of those that fit alike the one nearest to zero."""
     energy = float(np.sum(moved * moved))
     fits = np.zeros(len(lags))
     for index, hand in enumerate(by_hand):
         power, product = float(np.sum(hand * hand)), float(np.sum(hand * moved))
         if product > 0.0 and power > _LEAST_MOTION**2 * len(hand):
             fits[index] = product * product / (power * energy)
-    best = int(np.argmax(fits))
+    best = int(np.argmax(fits - _ALIKE * np.abs(lags)))
     if fits[best] < _LEAST_FIT or not 0 < best < len(lags) - 1:
         return None
     before, peak, after = fits[best - 1 : best + 2]

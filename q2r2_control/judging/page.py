@@ -13,7 +13,7 @@ import numpy as np
 
 from q2r2_control.judging.episode import stretches
 from q2r2_control.judging.figures import EpisodeFigures
-from q2r2_control.judging.judge import Judged
+from q2r2_control.judging.judge import Judged, Unreadable
 from q2r2_control.judging.motion import tracking_errors
 from q2r2_control.types import Array
 
@@ -77,8 +77,13 @@ COLUMNS = (
 )
 
 
-def page_of(episodes: Sequence[Judged], title: str, progress: Callable[[int], None] = lambda done: None) -> str:
-    """The page; ``progress`` is told how many episodes are drawn."""
+def page_of(
+    episodes: Sequence[Judged],
+    title: str,
+    progress: Callable[[int], None] = lambda done: None,
+    unreadable: Sequence[Unreadable] = (),
+) -> str:
+    """The page, with ``unreadable`` files below; ``progress`` is told how many episodes are drawn."""
     rows, sections = [], []
     for number, judged in enumerate(episodes, 1):
         plain, word = escape(judged.figures.name), judged.verdict.word
@@ -87,17 +92,19 @@ def page_of(episodes: Sequence[Judged], title: str, progress: Callable[[int], No
         cells = "".join(f"<td>{column.text(judged.figures)}</td>" for column in COLUMNS)
         rows.append(f'<tr><th><a href="#episode-{number}">{name}</a></th><td>{badge}</td>{cells}</tr>')
         reasons = "".join(f"<li>{escape(reason.text)}</li>" for reason in judged.verdict.reasons)
-        about = f"<p>{escape(judged.figures.task)}</p><ul>{reasons}</ul>"
+        about = f"<p>{escape(judged.figures.task or '')}</p><ul>{reasons}</ul>"
         # Each picture is an image of its own, since names of elements are the same in all of them.
         data = b64encode(draw_episode(judged).encode()).decode()
         size = 'width="1248" height="806"'
         picture = f'<img alt="plots of {plain}" {size} src="data:image/svg+xml;base64,{data}">'
         sections.append(f'<section id="episode-{number}"><h2>{name} {badge}</h2>{about}{picture}</section>')
         progress(number)
+    sections += [f'<p>{escape(str(one.file))}: <b class="discard">{escape(one.line)}</b></p>' for one in unreadable]
     kept = sum(judged.verdict.keep for judged in episodes)
     return _PAGE.format(
         title=escape(title),
-        count=f"episodes: {len(episodes)}, of which {kept} kept and {len(episodes) - kept} discarded",
+        count=f"episodes: {len(episodes)}, of which {kept} kept and {len(episodes) - kept} discarded"
+        + (f"; unreadable files: {len(unreadable)}" if unreadable else ""),
         style=_STYLE,
         headings="".join(f"<th>{escape(column.heading)}</th>" for column in COLUMNS),
         rows="\n".join(rows),

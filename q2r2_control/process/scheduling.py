@@ -16,12 +16,14 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from q2r2_control.errors import ConfigError
 
 # Below 50, at which Linux with PREEMPT_RT runs the interrupts that the loop itself waits for.
 _PRIORITY = 40
 LONGEST_END = 5  # of a process after all that it did is closed; SIGALRM ends it then [s]
+_LEAST_ROOM = 1 << 16  # that a folder for recordings has to have [bytes]
 _CURRENT, _FUTURE = 1, 2  # of mlockall on Linux
 # Of sched_setattr on Linux: its number by machine; size, policy, flags, nice, priority, runtime, deadline, period [ns].
 _SET_ATTRIBUTES, _ATTRIBUTES = {"x86_64": 314, "aarch64": 274}, struct.Struct("=IIQiIQQQ")
@@ -134,6 +136,21 @@ def new_folder(parent: Path, name: str, what: str) -> Path:
             if not (isinstance(error, FileExistsError) and folder.exists()):  # a parent may be a file
                 raise ConfigError(f"{what} {folder}: {error.strerror}") from error
     raise ConfigError(f"{what} {parent / name}: exists, and so do 98 numbered ones")
+
+
+def check_folder(folder: Path, what: str) -> None:
+    """Make ``folder`` where it is missing.
+
+    Raises :class:`ConfigError` that begins with ``what`` if nothing can be written in it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder) as file:
+            file.write(bytes(_LEAST_ROOM))
+            file.flush()
+    except OSError as error:
+        allowed = "allowed: a folder that can be written"
+        raise ConfigError(f"{what} {folder}: {error.strerror or error}; {allowed}") from error
 
 
 class StopRequest:

@@ -26,6 +26,7 @@ FORMAT = "4"  # of topics and fields; another one cannot be replayed
 LOOP, ROS = "loop", "ros"  # sources: one loop's ticks, or what nodes published
 ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # metadata records
 CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"
+_PERSONAL = ("operator", "host", "certificate")  # notes; of the last one, the path
 _GIT_TIME = 2.0  # [s]
 
 
@@ -119,6 +120,14 @@ def program() -> dict[str, str]:
             done = subprocess.run(command, capture_output=True, text=True, timeout=_GIT_TIME, check=True)
             notes["revision"] = done.stdout.strip()
     return notes
+
+
+def anonymous(notes: Mapping[str, str]) -> dict[str, str]:
+    """The notes without those that tell of a person or of a computer's name and address."""
+    kept = {name: text for name, text in notes.items() if name not in _PERSONAL}
+    if "machine" in kept:
+        kept["machine"] = kept["machine"].partition(", ")[2]  # the system, without the name before it
+    return kept
 
 
 def changes(about: About, config: Config, robot: Robot) -> list[str]:

@@ -45,6 +45,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     Without that it has all that was flushed, and no index; after a kill it just ends, which ``mcap recover`` mends.
     An error, of a full disk say, leaves the end of a file: rosbags then reads all 2,000 of 2,000 messages, else none.
+    A file in which no message was written by then is removed.
     """
 
     def __init__(self, path: Path, topics: Iterable[Topic], about: About) -> None:
@@ -54,8 +55,18 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._first = self._last = about.epoch  # times of messages [ns]
         self._stream = path.open("xb")
         self._whole = 0  # bytes that were flushed
+        self._empty = True  # no message was flushed
         # The writer would end a chunk between two messages of one tick, which replay needs in one.
         self._writer, self._unflushed = Writer(self._stream, chunk_size=sys.maxsize), 0
+        try:
+            self._channels = self._begin()
+        except OSError:
+            self._remove()
+            raise
+
+    def _begin(self) -> dict[int, int]:
+        """Write all that comes before the first message; returns the number of each topic's channel in the file."""
+        about = self._about
         self._writer.start("ros2", "q2r2_control")
         self._writer.add_metadata(ABOUT, about.texts())
         labels = {topic.name: topic.labels for topic in self._topics if topic.labels}
@@ -65,8 +76,16 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             (FIELDS, "application/json", json.dumps(labels)),
         ):
             self._writer.add_attachment(about.epoch, about.epoch, name, kind, text.encode())
-        self._channels = self._register()
+        channels = self._register()
         self.flush()
+        return channels
+
+    def _remove(self) -> None:
+        with suppress(OSError):  # the same again
+            self._stream.close()
+        with suppress(OSError):
+            self._path.unlink()
+            self._path.parent.rmdir()  # which was made for it
 
     def write(self, messages: Iterable[Message]) -> None:
         """Write messages of whole ticks, in the order of time; the file has them after :meth:`flush`."""
@@ -82,8 +101,9 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def flush(self) -> None:
         """Write what was added, as one chunk."""
         self._writer.flush()
+        self._stream.flush()
         self._unflushed = 0
-        self._whole = self._stream.tell()
+        self._whole, self._empty = self._stream.tell(), not self._counts
 
     def close(self, conclusion: Conclusion) -> None:
         """Write what is left, the ``conclusion``, the index and ``metadata.yaml``."""
@@ -99,6 +119,9 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         with suppress(OSError):  # the same again
             self._stream.close()
         if error is None:
+            return
+        if self._empty:
+            self._remove()
             return
         end = RecordBuilder()
         DataEnd(0).write(end)

@@ -65,6 +65,12 @@ def run_topics(arms: Sequence[str], joints: Sequence[str], cameras: Sequence[str
     return _numbered(types, {TICK: tick_labels(arms, joints), SAMPLES: SAMPLE_FIELDS})
 
 
+def loop_topics(arms: Sequence[str]) -> tuple[str, ...]:
+    """Topics on which every run has messages, whatever happens in it."""
+    safe_targets = (safe_target(arm) for arm in arms)
+    return (DESCRIPTION, TICK, JOINT_STATES, *safe_targets, REFERENCE, JOINT_COMMANDS, STATE)
+
+
 def ros_topics(arms: Sequence[str], cameras: Mapping[str, str]) -> tuple[Topic, ...]:
     """Topics of a recording of the nodes; ``cameras``: name -> topic of its pictures."""
     types: dict[str, str] = {DESCRIPTION: TEXT, JOINT_STATES: JOINTS, "/mujoco_robot/external_torque": JOINTS}

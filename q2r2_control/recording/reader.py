@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import struct
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event, ReasonKind
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, LOOP, ROBOT, About, Conclusion
+from q2r2_control.recording.file_end import size_of_whole_records
 from q2r2_control.recording.messages import (
     PICTURE,
     SAMPLES,
@@ -44,7 +44,8 @@ from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.types import Array
 
 _LARGEST = 1 << 30  # of a record [bytes]
-_BROKEN = (
+# Errors that readers raise of a file that is damaged, or another program's.
+BROKEN = (
     *(McapError, ZstdError, SerdeError, ValueError, KeyError, IndexError),
     *(struct.error, TypeError, OverflowError, MemoryError, AssertionError),
 )
@@ -115,11 +116,16 @@ class Recording:
 
     def pictures(self, camera: str) -> Iterator[Picture]:
         """All pictures of a camera, in the order of time."""
-        for messages in self.messages((self._topic_of(camera),)):
+        return (picture for _, picture in self.pictures_of((camera,)))
+
+    def pictures_of(self, cameras: Iterable[str]) -> Iterator[tuple[str, Picture]]:
+        """All pictures of some cameras, with the camera, those of each in the order of time."""
+        names = {self._topic_of(camera): camera for camera in cameras}
+        for messages in self.messages(names):
             for message in messages:
                 with self._faults():
                     picture = Picture(message.time, message.number, bytes(data_of(message.payload, PICTURE)))
-                yield picture
+                yield names[self.declared_topics[message.channel].name], picture
 
     def _topic_of(self, camera: str) -> str:
         return picture_topic(camera)
@@ -157,13 +163,22 @@ class Recording:
             yield
         except EndOfFile:
             return  # cut off in the middle of a record, by a machine that lost its power
-        except _BROKEN as error:
+        except BROKEN as error:
             raise RecordingError(f"{self.file}: damaged: {reason_of(error):.200}") from error
 
     @property
     def closed(self) -> bool:
         """Whether the file has an index, which is written last: not where its process was killed or the disk full."""
         return self._summary() is not None
+
+    @property
+    def counts(self) -> dict[str, int] | None:
+        """How many messages each topic has; None where the file has no index."""
+        summary = self._summary()
+        if summary is None or summary.statistics is None:
+            return None
+        counts, channels = summary.statistics.channel_message_counts, summary.channels.values()
+        return {channel.topic: counts.get(channel.id, 0) for channel in channels}
 
     @property
     def conclusion(self) -> Conclusion:
@@ -182,17 +197,19 @@ class Recording:
                 return SeekingReader(stream, record_size_limit=_LARGEST).get_summary()
         except OSError as error:
             raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
-        except (EndOfFile, StopIteration, *_BROKEN):
+        except (EndOfFile, StopIteration, *BROKEN):
             return None
 
     def _records(self, start: int = 0) -> Iterator[McapRecord]:
         """All from the beginning, or from a record that starts at ``start``.
 
-        Records that are written meanwhile are left out: a reader that is slower than the writer would never end.
+        Records that are written meanwhile are left out: a reader that is slower than the writer would never end. The
+        last one of a file that ends within it is left out too.
         """
         try:
             with self.file.open("rb") as stream:
-                size = os.fstat(stream.fileno()).st_size
+                if (size := size_of_whole_records(stream)) == 0:
+                    return
                 stream.seek(start)
                 # Not wrapped, so that a file that changes meanwhile is not read twice.
                 reader = StreamReader(stream, start > 0, emit_chunks=True, record_size_limit=_LARGEST)
@@ -216,14 +233,15 @@ class Recording:
                     break
         except EndOfFile:
             pass
-        except _BROKEN as error:
+        except BROKEN as error:
             raise RecordingError(f"{self.file}: not an MCAP file, or damaged: {reason_of(error):.200}") from error
         if not texts:
             raise RecordingError(f"{self.file}: not a recording of q2r2 run --record: no metadata {ABOUT}")
         try:
             return About.from_texts(texts, attachments[CELL], attachments[ROBOT])
         except KeyError as error:
-            raise RecordingError(f"{self.file}: damaged: no {error.args[0]}") from error
+            what = "damaged: no" if self.closed else "its process was killed before it had written"
+            raise RecordingError(f"{self.file}: {what} {error.args[0]}") from error
         except ValueError as error:
             raise RecordingError(f"{self.file}: {reason_of(error):.200}") from error
 

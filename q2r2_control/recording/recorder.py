@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from q2r2_control.config.recording import CameraConfig
-from q2r2_control.errors import ConfigError
+from q2r2_control.config.recording import TOPIC_RATE, CameraConfig
+from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.camera_recorder import CameraRecorder
 from q2r2_control.recording.messages import Message, Topic, run_topics
+from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, RecordingSetup, Written
 from q2r2_control.robot.robot import Robot
@@ -28,11 +30,14 @@ if TYPE_CHECKING:  # the ROS node does without MuJoCo
     from q2r2_control.plants.mujoco import MujocoPlant
 
 PATIENCE = 10.0  # with a disk that hangs, at the end of a run [s]
-# For what waits to be written [bytes]: a tick of two arms takes 1.6 kB, both arms' nodes send some 0.6 MB a second.
-ROOM = 8 << 20
+# For what waits to be sent [bytes], and the writer has as much: a tick of two arms takes 1.6 kB, both arms' nodes send
+# some 0.6 MB a second.
+ROOM = 4 << 20
+_BEHIND, _CAUGHT_UP = 2.0, 1.0  # time by which the file is behind the run, to be said, and to be said anew later [s]
 ROOM_WITH_PICTURES = 64 << 20  # of cameras of nodes, which have a megabyte each where they are not compressed
 _LAST_NUMBER = 2**32 - 1
 _BATCH = 16  # ticks that are sent at once
+_HEADER = 256  # of a file that tells nothing [bytes]
 _LONGEST_FAULT = 500  # that ended a run [characters]
 
 _logger = logging.getLogger(__name__)
@@ -56,7 +61,9 @@ class BaseRecorder:
         except OSError as error:
             self._check(reason_of(error))
 
-    def _open(self, about: About, robot: RecordedRobot | None, topics: tuple[Topic, ...]) -> bool:
+    def _open(
+        self, about: About, robot: RecordedRobot | None, topics: tuple[Topic, ...], topic_rate: float | None = None
+    ) -> bool:
         """Have the file of a run begun that begins at ``about.epoch``; whether that was possible."""
         if self.writer is None:
             return False
@@ -68,7 +75,7 @@ class BaseRecorder:
             self._check(reason_of(error))
             return False
         self.file = folder / f"{folder.name}.mcap"
-        self.writer.send(RecordingSetup(self.file.absolute(), about, topics, robot))
+        self.writer.send(RecordingSetup(self.file.absolute(), about, topics, robot, topic_rate))
         return True
 
     def _send(self, batch: list[PackedTick] | list[Message], *, wait: bool = False) -> bool:
@@ -86,6 +93,11 @@ class BaseRecorder:
                 self.writer.send(conclusion or Conclusion())
             self.writer.finish(PATIENCE)
             self._check()
+        if self.fault is not None and self.file is not None and _is_empty(self.file):
+            with suppress(OSError):
+                self.file.unlink(missing_ok=True)
+                self.file.parent.rmdir()
+            self.file = None
 
     def _check(self, fault: str | None = None) -> None:
         """Log the first ``fault``, or one of the writer, in one line; nothing more is recorded."""
@@ -95,6 +107,14 @@ class BaseRecorder:
             self.fault = f"{self.file}: {fault}" if self.file is not None else fault
             _logger.warning("recording ended, the run goes on: %s", self.fault)
             self.record_outcome(Reason.of(ReasonKind.RECORDING_ENDED, text=self.fault))
+
+
+def _is_empty(file: Path) -> bool:
+    """True if a file, as a writer that was killed leaves it, has no message."""
+    try:
+        return not any(Recording(file).messages())
+    except RecordingError:
+        return not file.exists() or file.stat().st_size < _HEADER
 
 
 class MessageRecorder(BaseRecorder):
@@ -133,6 +153,7 @@ class RecordingSummary:
     pictures: int = 0  # written
     lost_pictures: int = 0  # that were due and are not there
     pictures_fault: str | None = None  # why they ended before the run did
+    longest_backlog_s: float = 0.0  # that waited to be written, at most; what a killed writer may cost
 
 
 class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
@@ -155,6 +176,8 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         self.overflows = 0  # ticks for which there was no room
         self._packer: TickPacker | None = None  # None: not begun
         self._batch: list[PackedTick] = []
+        self._sent: deque[tuple[int, float]] = deque()  # ticks by then, and the loop's time [s], of what is not written
+        self._longest_backlog, self._said_so = 0.0, False
         self._epoch = 0
         self.success: bool | None = None  # of the run, where its task has a check of its own, set before the end
         self.cameras: CameraRecorder | None = None
@@ -173,9 +196,10 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             self.cameras.prepare(plant, cameras, topics, waits=self._waits)
             self._check_cameras()
 
-    def begin(self, about: About, robot: Robot) -> None:
+    def begin(self, about: About, robot: Robot, topic_rate: float | None = TOPIC_RATE) -> None:
+        """Begin the file of a run of ``robot``, with standard topics at ``topic_rate`` [Hz]; None: at every tick."""
         topics = about.topics()
-        if self._open(about, RecordedRobot.of(robot), tuple(topics.values())):
+        if self._open(about, RecordedRobot.of(robot), tuple(topics.values()), topic_rate):
             self._packer, self._epoch = TickPacker(about.arms, about.joints), about.epoch
 
     def __call__(self, tick: Tick) -> None:
@@ -186,6 +210,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             self._batch.append(self._packer.pack(number, tick))
             if len(self._batch) >= _BATCH:
                 self._send_batch()
+                self._watch_backlog(tick.now)
         except Exception as error:  # the arms move on, whatever it is
             self._check(reason_of(error))
         if self.cameras is not None:
@@ -201,6 +226,20 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         if batch and not self._send(batch, wait=self._waits) and self._packer is not None:
             self.overflows += len(batch)
             self._packer.repeat_state()
+
+    def _watch_backlog(self, now: float) -> None:
+        """Say it when the file is long behind the run, which a kill of the writer would cost; simulated time waits."""
+        if self._waits:
+            return
+        self._sent.append((self._count - self.overflows, now))
+        while len(self._sent) > 1 and self._sent[0][0] <= self.written.ticks:
+            self._sent.popleft()
+        behind = now - self._sent[0][1]
+        self._longest_backlog = max(self._longest_backlog, behind)
+        if behind > _BEHIND and not self._said_so:
+            what = "its writer gets too little of the processors; killed, it would cost as much"
+            _logger.warning("the recording is %.1f s behind the run: %s", behind, what)
+        self._said_so = behind > (_CAUGHT_UP if self._said_so else _BEHIND)
 
     def _write_picture(self, picture: Message) -> None:
         """Called in the thread that hears of the cameras, which may wait for room."""
@@ -225,6 +264,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             pictures=pictures,
             lost_pictures=0 if self.cameras is None else self.cameras.due - pictures,
             pictures_fault=self._pictures_fault,
+            longest_backlog_s=self._longest_backlog,
         )
 
     def _check_cameras(self, fault: str | None = None) -> None:

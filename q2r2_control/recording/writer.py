@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Condition, Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -26,7 +28,9 @@ if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
 FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
+READ_AHEAD = 4 << 20  # of what was sent, for what waits to be written [bytes]
 _NICENESS = 10  # the loop goes first where there are not enough processors
+_ROUNDING = 1e-6  # of a period: a message that is due but for the rounding of times is due
 _LAST_TIME = (2**31 - 1) * NANOSECONDS  # that a stamp can have [ns]
 _HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (
     SAMPLE_FIELDS.index(name) for name in ("hand", "pose_stamp", "inputs_stamp", "x", "button_upper")
@@ -62,8 +66,12 @@ class RecordedRobot:
 class TickEncoder:
     """Makes messages of ticks, in their order. ``epoch`` [ns] is the time of day at which the run began."""
 
-    def __init__(self, robot: RecordedRobot, topics: dict[str, Topic], epoch: int) -> None:
-        self._robot, self._topics, self._epoch = robot, topics, epoch
+    def __init__(
+        self, robot: RecordedRobot, topics: dict[str, Topic], epoch: int, topic_rate: float | None = None
+    ) -> None:
+        """``topic_rate`` [Hz] of the standard topics, which repeat numbers of the tick; None: with every tick."""
+        self._robot, self._topics, self._epoch, self._topic_rate = robot, topics, epoch, topic_rate
+        self._slot = -1.0  # of the newest tick with standard topics
         self._type = tick_type(len(robot.arms), len(robot.joints))
         self._start: float | None = None  # of the loop's clock [s]
         self._stamps: dict[tuple[float, int], float] = {}  # the last of each hand's poses and inputs
@@ -84,10 +92,11 @@ class TickEncoder:
             first.append(Message(channel, 0, self._epoch, self._epoch, messages.text(self._robot.urdf)))
         made = _Batch(self._topics, rows["index"].astype(np.int64), self._times(rows["now"]))
         every, arms = np.arange(len(rows)), rows["arms"]
+        some = self._due(rows["now"])
         made.add(messages.TICK, every, [messages.array(numbers) for numbers in numbers_in(rows)])
         for at, tick in enumerate(batch):
             self._add_samples(made, at, np.frombuffer(tick.samples).reshape(-1, len(SAMPLE_FIELDS)))
-        felt = np.flatnonzero(rows["external"])
+        felt = some[rows["external"][some] > 0.0]
         external = self._templates[messages.EXTERNAL_TORQUE].filled(rows["tau_external"][felt], made.times[felt])
         made.add(messages.EXTERNAL_TORQUE, felt, external)
         for index, arm in enumerate(self._robot.arms):
@@ -97,18 +106,28 @@ class TickEncoder:
                 (messages.safe_target(arm), "tool", messages.WORLD),
             ):
                 poses = arms[field][:, index]
-                there = np.flatnonzero(poses.any(axis=1))
+                there = some[poses[some].any(axis=1)]
                 made.add(topic, there, self._poses[frame].filled(poses[there], made.times[there]))
         for topic, columns in (
             (messages.JOINT_STATES, ("q", "v", "tau")),
             (messages.REFERENCE, ("reference_q", "reference_v", "reference_a")),
             (messages.JOINT_COMMANDS, ("command_q", "command_v", "command_tau")),
         ):
-            numbers = np.hstack([rows[name] for name in columns])
-            made.add(topic, every, self._templates[topic].filled(numbers, made.times))
+            numbers = np.hstack([rows[name][some] for name in columns])
+            made.add(topic, some, self._templates[topic].filled(numbers, made.times[some]))
         told = [at for at, tick in enumerate(batch) if tick.state]
         made.add(messages.STATE, told, [messages.text(batch[at].state) for at in told])
         return first + [message for of_tick in made.messages for message in of_tick]
+
+    def _due(self, now: Array) -> npt.NDArray[np.int64]:
+        """Which of the ticks at ``now`` (n,) [s] have standard topics: the first from each multiple of a period on."""
+        if self._topic_rate is None:
+            return np.arange(len(now))
+        assert self._start is not None
+        slots = np.floor(np.nan_to_num(now - self._start) * self._topic_rate + _ROUNDING)
+        newest = np.maximum.accumulate(np.concatenate(([self._slot], slots)))
+        self._slot = float(newest[-1])
+        return np.flatnonzero(np.diff(newest) > 0.0)
 
     def _times(self, seconds: Array) -> npt.NDArray[np.int64]:
         """Times of the loop's clock [s] as times of day [ns]; any number of a sender gives some time."""
@@ -171,6 +190,7 @@ class RecordingSetup:
     about: About
     topics: tuple[Topic, ...]  # of the file
     robot: RecordedRobot | None = None  # of packed ticks
+    topic_rate: float | None = None  # of the standard topics that are made of ticks [Hz]; None: with every tick
 
 
 class Written(NamedTuple):
@@ -180,8 +200,37 @@ class Written(NamedTuple):
     messages: int = 0  # that were sent as such
 
 
+def read_ahead(requests: Iterator[Any], room: int = READ_AHEAD) -> Iterator[Any]:
+    """The same requests, read by a thread as they come.
+
+    Requests that are here already are written even if the run is killed. As much as ``room`` [bytes] may wait.
+    """
+    waiting: SimpleQueue[tuple[Any, int]] = SimpleQueue()
+    free = Condition()
+    held, end = 0, object()
+
+    def take() -> None:
+        nonlocal held
+        for request in requests:
+            size = sum(one.size for one in request) if isinstance(request, list) else 0
+            with free:
+                while held >= room:
+                    free.wait()
+                held += size
+            waiting.put((request, size))
+        waiting.put((end, 0))
+
+    Thread(target=take, daemon=True).start()
+    while (entry := waiting.get())[0] is not end:
+        yield entry[0]
+        with free:
+            held -= entry[1]
+            free.notify()
+
+
 def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
     """Write one recording, of lists of packed ticks or messages. Raises :class:`OSError`; what was written stays."""
+    requests = read_ahead(requests)
     setup = next((request for request in requests if request is not None), None)
     if not isinstance(setup, RecordingSetup):
         return  # there was no run
@@ -189,7 +238,9 @@ def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
     if about.realtime:  # another loop may wait for this process
         with suppress(OSError):
             os.nice(_NICENESS)
-    encoder = TickEncoder(setup.robot, about.topics(), about.epoch) if setup.robot is not None else None
+    encoder = None
+    if setup.robot is not None:
+        encoder = TickEncoder(setup.robot, about.topics(), about.epoch, setup.topic_rate)
     received, conclusion = Written(), Conclusion()
     due = time.monotonic() + FLUSH_PERIOD
     with BagWriter(setup.path, setup.topics, about) as bag:

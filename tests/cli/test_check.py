@@ -47,7 +47,11 @@ def other_arms(folder: Path, pattern: str, new: str) -> str:
     ("pattern", "new", "fault"),
     [
         (r'ixx="[^"]*"', 'ixx="9"', "inertia must satisfy"),
-        (r"<collision>.*?</collision>", "", "left arm: no link between its base and its tool has a collision shape"),
+        (
+            r"<collision name=.*?</collision>",
+            "",
+            "left arm: no link between its base and its tool has a collision shape",
+        ),
     ],
     ids=["an inertia that no body has", "no collision shapes"],
 )

@@ -12,6 +12,7 @@ import pytest
 from q2r2_control.export.formats import FORMATS, Format, write_table
 from tests.cli.command import q2r2
 from tests.export.files import DURATION, contents, record_two
+from tests.recording.runs import rewrite
 
 
 @pytest.fixture(scope="module")
@@ -48,22 +49,31 @@ def test_the_config_that_trains_openpi_is_printed_behind_its_dataset(
     assert (tmp_path / "circle/data/chunk-000/episode_000001.parquet").exists()
 
 
-def test_a_bad_recording_ends_the_export_with_one_line_or_is_skipped(
+def test_a_bad_recording_is_left_out_and_the_exit_code_tells_of_it_unless_it_is_skipped(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:
     (tmp_path / "notes.mcap").write_text("no recording\n")
-    arguments = ("export", "csv", str(tmp_path / "notes.mcap"), str(recordings[1]), "--output", str(tmp_path / "out"))
-    result = q2r2(*arguments)
-    assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
-    assert "notes.mcap: not an MCAP file" in result.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.mcap"]
-    result = q2r2(*arguments, "--skip-bad")
-    assert result.stderr.startswith("skipped: ")
-    assert "notes.mcap: not an MCAP file" in result.stderr
-    assert result.stdout == f"{tmp_path / 'out'}: 1 of 2 recordings at 30 frames per second\n"
+    arguments = ("export", "csv", str(tmp_path / "notes.mcap"), str(recordings[1]), "--output")
+    for name, options, code in (("out", (), 2), ("skipped", ("--skip-bad",), 0)):
+        result = q2r2(*arguments, str(tmp_path / name), *options)
+        assert result.exit_code == code
+        assert f"{tmp_path / 'notes.mcap'}: discard: unreadable, not an MCAP file" in result.stderr
+        assert result.stdout == f"{tmp_path / name}: 1 of 2 recordings at 30 frames per second\n"
+        assert set(contents(tmp_path / name)) == {f"{recordings[1].stem}.csv"}
     result = q2r2("export", "csv", str(tmp_path / "notes.mcap"), "--output", str(tmp_path / "none"), "--skip-bad")
     assert result.exit_code == 2
     assert "none of the recordings can be exported" in result.stderr
+
+
+def test_what_the_judge_discards_is_left_out_unless_it_is_asked_for(recordings: Sequence[Path], tmp_path: Path) -> None:
+    file = rewrite(recordings[0], tmp_path / "lost.mcap", lambda _, one: None if 100 <= one.number < 120 else one)
+    arguments = ("export", "csv", str(file), str(recordings[1]), "--output")
+    result = q2r2(*arguments, str(tmp_path / "out"), "--fps", "10")
+    assert (result.exit_code, set(contents(tmp_path / "out"))) == (0, {f"{recordings[1].stem}.csv"})
+    assert f"{file}: discard: ticks lost in the recording" in result.stderr
+    assert "left out, since q2r2 judge discards them: 1; --keep-discarded exports them too" in result.stderr
+    result = q2r2(*arguments, str(tmp_path / "both"), "--fps", "10", "--keep-discarded")
+    assert set(contents(tmp_path / "both")) == {f"{recordings[1].stem}.csv", "lost.csv"}
 
 
 def test_an_interrupted_export_leaves_nothing_half_and_the_next_one_ends_it(

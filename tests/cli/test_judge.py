@@ -65,6 +65,24 @@ def test_a_report_is_one_page_of_all_of_them(recordings: Path, tmp_path: Path) -
         assert f"--output {output}: allowed: a file in a folder that exists" in refused.stderr
 
 
+def test_a_file_that_cannot_be_read_is_discarded_and_the_others_are_judged(recordings: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty.mcap").touch()
+    why = f"{tmp_path / 'empty.mcap'}: discard: unreadable, "
+    result = q2r2("judge", str(tmp_path), str(recordings))
+    assert result.exit_code == 2
+    assert "episodes: 1 kept, 2 discarded" in result.stdout
+    assert result.stdout.splitlines()[-1].startswith(why)
+    episodes = one_object(q2r2("judge", str(tmp_path), str(recordings), "--json").stdout)["episodes"]
+    assert [episode["verdict"] for episode in episodes] == ["discard", "keep", "discard"]
+    assert [reason["name"] for reason in episodes[0]["reasons"]] == ["unreadable"]
+    page = tmp_path / "report.html"
+    result = q2r2("report", str(tmp_path), str(recordings), "--output", str(page))
+    assert (result.exit_code, result.stdout) == (2, f"{page}: 3 episodes, 1 kept, 2 discarded\n")
+    assert why in result.stderr
+    assert page.read_text().count("<section ") == 2
+    assert "discard: unreadable, " in page.read_text()
+
+
 @pytest.mark.slow
 class TestARunThatIsRecorded:
     OPTIONS = ("--trajectory", "line", "--human", "--seed", "5", "--duration", "3")

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer import Exit
 
 from q2r2_control.cli.cell_run import RunOptions
-from q2r2_control.config.cell import Config
+from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from tests.cli.command import CELL, FAST, changed_cell, one_object, q2r2
 from tests.support.pictures import needs_opengl
@@ -49,6 +54,31 @@ def test_an_arm_that_begins_in_the_table_ends_with_exit_code_1(tmp_path: Path, m
     result = q2r2("run", file, "--mode", mode, "--fast", "--headless", "--duration", "0.1", "--force")
     assert result.exit_code == 1
     assert said in " ".join(result.stdout.split())
+
+
+@pytest.mark.parametrize("command", [("run", CELL, *OPTIONS), ("demo", "--fast", "--headless")])
+def test_a_folder_that_cannot_be_written_is_refused_before_the_run(command: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    result = q2r2(*command, "--record", str(tmp_path / "file" / "recordings"))
+    assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
+    assert f"--record {tmp_path / 'file' / 'recordings'}: Not a directory; allowed: a folder" in result.stderr
+
+
+def test_a_recording_that_ends_before_its_run_is_exit_code_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("q2r2_control.recording.recorder.new_folder", full)
+    result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path))
+    assert result.exit_code == 3
+    assert one_object(result.stdout)["recording"]["fault"] == "No space left on device"
+
+
+def full(*given: object) -> Path:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_an_empty_task_is_refused(tmp_path: Path) -> None:
+    result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path), "--task", " ")
+    assert result.exit_code == 2
+    assert "--task is empty; allowed: some words, or no --task" in result.stderr
 
 
 def test_rt_says_in_one_line_what_the_system_refuses_and_runs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,6 +121,42 @@ def test_a_demo_at_a_terminal_shows_the_arms_where_there_is_a_way_to(
     assert ("q2r2_control[web]" in result.stderr) is (not (display or viser))
 
 
+def about_of(folder: Path) -> About:
+    (file,) = folder.rglob("*.mcap")
+    return Recording(file).about
+
+
+def test_a_demo_lays_the_parts_of_its_task_where_the_seed_has_them(tmp_path: Path) -> None:
+    shipped, places = load_config(CELL).mujoco.objects, []
+    for seed in ("3", "4"):
+        options = ("--spread", "0.03", "--seed", seed, "--fast", "--headless", "--duration", "0.05")
+        q2r2("demo", "grasp", *options, "--record", str(tmp_path / seed))
+        laid = parse_config(about_of(tmp_path / seed).cell, "recorded").mujoco.objects
+        moved = {name: np.subtract(item.position, shipped[name].position) for name, item in laid.items()}
+        assert [name for name, by in moved.items() if by.any()] == ["flat_block"]
+        places.append(moved["flat_block"])
+    assert np.abs(places).max() <= 0.03
+    assert np.abs(np.subtract(*places)).max() > 0.01
+    assert places[0][2] == places[1][2] == 0.0
+
+
+@pytest.mark.parametrize("other", [("--plant", "fri"), ("--seeds", "1")])
+def test_a_spread_is_refused_where_nothing_would_move(other: tuple[str, str]) -> None:
+    result = q2r2("demo", "grasp", "--spread", "0.01", *other)
+    assert result.exit_code == 2
+    assert "--spread cannot be used with --" in result.stderr
+
+
+def test_an_anonymous_recording_tells_neither_whose_hands_nor_on_which_computer(tmp_path: Path) -> None:
+    options = (*OPTIONS, "--operator", "Ada Lovelace", "--record")
+    for name, more in (("named", ()), ("anonymous", ("--anonymous",))):
+        assert q2r2("run", CELL, *options, str(tmp_path / name), *more).exit_code == 0
+        told = b"".join(file.read_bytes() for file in (tmp_path / name).rglob("*") if file.suffix in (".mcap", ".yaml"))
+        assert (b"Ada Lovelace" in told) is (name == "named")
+        machine = about_of(tmp_path / name).notes["machine"]
+        assert machine == platform.platform() if more else f"{platform.node()}, {platform.platform()}"
+
+
 @pytest.mark.slow
 def test_an_episode_of_the_demo_has_the_pictures_of_which_an_export_makes_videos(tmp_path: Path) -> None:
     needs_opengl()
@@ -102,7 +168,8 @@ def test_an_episode_of_the_demo_has_the_pictures_of_which_an_export_makes_videos
     counts = [len(list(file.pictures(name))) for name in CAMERAS]
     assert counts == [counts[0]] * 3
     assert sum(counts) == recording["pictures"] >= 3 * 8
-    exported = q2r2("export", "lerobot-v2.1", str(tmp_path / "recordings"), "--output", str(tmp_path / "grasp"))
+    output = ("--output", str(tmp_path / "grasp"), "--keep-discarded")  # the task takes longer
+    exported = q2r2("export", "lerobot-v2.1", str(tmp_path / "recordings"), *output)
     assert exported.exit_code == 0, exported.stderr
     assert len(list((tmp_path / "grasp/videos").rglob("episode_000000.mp4"))) == 3
 

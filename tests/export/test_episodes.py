@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 from multiprocessing import active_children
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from q2r2_control.config.recording import CameraConfig
-from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.errors import ConfigError
 from q2r2_control.export.episodes import FrameSampling, Output, keep_episodes, make_episode
 from tests.export.files import CAMERA, HEIGHT, WIDTH, Run, contents, load_vectors, record_step, write_vectors
 from tests.recording.runs import RATE, file_of, pipeline, record
@@ -129,17 +130,32 @@ def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Ru
     assert contents(kept) == by_one_process
 
 
-def test_a_bad_recording_is_named_or_skipped(run: Run, tmp_path: Path) -> None:
-    damaged = tmp_path / "damaged.mcap"
+def test_an_anonymous_episode_names_no_operator_and_no_computer(run: Run) -> None:
+    named, anonymous = (make_episode(run.file, FrameSampling(anonymous=leaves)).notes for leaves in (False, True))
+    assert named["machine"] == f"{platform.node()}, {anonymous['machine']}"
+    assert anonymous.keys() == named.keys() - {"operator"}
+
+
+def by_name(file: Path, pictures: bool) -> dict[int, str]:
+    return {0: "discard: by its name"} if "copy" in file.stem else {}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_bad_recording_and_a_discarded_one_are_named_and_the_others_are_kept(
+    workers: int, run: Run, tmp_path: Path
+) -> None:
+    damaged, copy = tmp_path / "damaged.mcap", Path(shutil.copy(run.file, tmp_path / "copy.mcap"))
     data = bytearray(run.file.read_bytes())
     data[data.index(ZSTD_MAGIC) + 200] ^= 0xFF
     damaged.write_bytes(data)
-    with pytest.raises(RecordingError, match=r"damaged\.mcap: damaged"):
-        keep_episodes([damaged, run.file], FrameSampling(), write_vectors, tmp_path, workers=2)
-    made = keep_episodes([damaged, run.file], FrameSampling(), write_vectors, tmp_path, skip_bad=True)
-    assert len(made.kept) == 1
-    (fault,) = made.skipped
-    assert "damaged.mcap: damaged" in fault
+    (tmp_path / "empty.mcap").touch()
+    files = [damaged, copy, tmp_path / "empty.mcap", run.file]
+    made = keep_episodes(files, FrameSampling(), write_vectors, tmp_path, workers=workers, verdicts=by_name)
+    assert [kept.stem for kept in made.kept] == [run.file.stem]
+    assert made.left_out == [f"{copy}: discard: by its name"]
+    assert [line.partition(": ")[0] for line in made.unreadable] == [str(damaged), str(tmp_path / "empty.mcap")]
+    assert made.unreadable[0].startswith(f"{damaged}: discard: unreadable, damaged: ")
+    assert len(keep_episodes(files, FrameSampling(), write_vectors, tmp_path).kept) == 2
 
 
 def test_an_output_that_exists_or_cannot_be_written_is_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from q2r2_control import Robot, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.assembly import WORKS
 from q2r2_control.inputs.played import HeadsetSampling
-from q2r2_control.inputs.scripted import START, TRAJECTORIES, ScriptedInput, hurried, trajectory_named
+from q2r2_control.inputs.scripted import START, TRAJECTORIES, ScriptedInput, hurried, place_of, trajectory_named
 from q2r2_control.inputs.way_points import HOME, HandWork, WayPoints, minimum_jerk
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
@@ -249,3 +249,23 @@ def test_shaky_hands_tremble_twice_as_far_and_slower() -> None:
     assert most == pytest.approx(2e-3, rel=0.1)
     assert 5.5 <= frequency <= 6.5
     assert most == pytest.approx(2.0 * least, rel=0.2)
+
+
+def test_hands_reach_for_parts_where_the_seed_lays_them() -> None:
+    places = {seed: place_of(seed, 0.02) for seed in range(20)}
+    assert len(set(places.values())) == 20
+    assert 0.015 < np.abs(list(places.values())).max() <= 0.02
+    x, y = places[3]
+    moved = trajectory_named("grasp", places[3])
+    assert moved.duration == TRAJECTORIES["grasp"].duration
+    hand, way = max(WORKS["grasp"].tools.items(), key=lambda item: len(item[1]))
+    lowest = min(way, key=lambda point: point[3])
+    plain, elsewhere = (
+        script.displacement(hand, START + lowest[0], 0.25)[0] for script in (TRAJECTORIES["grasp"], moved)
+    )
+    np.testing.assert_allclose(elsewhere - plain, (x, y, 0.0), atol=1e-9)
+
+
+def test_what_has_no_parts_cannot_be_spread() -> None:
+    with pytest.raises(ConfigError, match="'circle': has no parts to spread; allowed: "):
+        ScriptedInput("circle", spread=0.01)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,10 +17,12 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Event
 from q2r2_control.inputs.played import HeadsetSampling, PlayedInput
 from q2r2_control.inputs.scripted import HANDS_AT_REST
-from q2r2_control.judging.episode import Episode, Flags, Frames, Hand, Ticks
+from q2r2_control.judging.episode import Episode, Frames, Hand, Ticks
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.recording.about import LOOP
 from q2r2_control.recording.reader import Recording
-from q2r2_control.types import SIDES, Array, HandInputs, HandSample
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import SIDES, Array, Flags, HandInputs, HandSample
 from tests.recording.runs import file_of, record, rewrite
 from tests.support.processes import cell
 
@@ -65,6 +68,9 @@ def episode(
         slip=np.zeros((count, 2)),
         slip_angle=np.zeros((count, 2)),
         gripper=np.ones((count, 2)),
+        now=t,
+        unmeasured=flags,
+        joint_speed=np.zeros((count, 2)),
     )
     frames = np.arange(0, count, EVERY)
     poses = np.tile((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (len(frames), 2, 1))
@@ -75,18 +81,25 @@ def episode(
     stamps = np.arange(0.0, seconds, 0.01) if received is None else np.asarray(received)
     places = np.zeros((len(stamps), 3)) if hand_path is None else hand_path
     hands = {arm: Hand(arm, stamps, stamps + delay, places) for arm in ARMS}
-    about = SimpleNamespace(arms=ARMS, realtime=True, notes={"task": "to <stack>"})
-    recording = SimpleNamespace(about=about, closed=True, file=Path("some/where/run.mcap"))
+    about = SimpleNamespace(arms=ARMS, realtime=True, notes={"task": "to <move>"}, source=LOOP)
+    recording = SimpleNamespace(about=about, closed=True, file=Path("some/where/run.mcap"), counts=None)
+    joints, openings = np.zeros((len(frames), 14)), np.ones((len(frames), 2))
     return Episode(
         recording=cast(Recording, recording),
         config=(config or cell()).model_copy(update={"loop_rate_hz": 1.0 / DT}),
         ticks=replace(rows, **ticks),
-        frames=Frames(frames, np.zeros((len(frames), 14)), targets, tools.copy()),
+        robot=_robot(),
+        frames=Frames(frames, joints, targets, tools.copy(), joints, joints, openings, openings),
         tools=tools,
         hands=hands,
         events=list(events),
         damage=None,
     )
+
+
+@cache
+def _robot() -> Robot:
+    return Robot.from_config(cell())
 
 
 def frame_times(seconds: float = 4.0) -> Array:

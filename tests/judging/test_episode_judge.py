@@ -183,7 +183,7 @@ def test_its_events_are_by_its_own_time_and_its_name_on_the_page_is_its_own(file
 
 def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_own(file: Path, tmp_path: Path) -> None:
     made = keep_episodes([file], FrameSampling(fps=50), write_vectors, tmp_path)
-    assert made.skipped == []
+    assert made.left_out == made.unreadable == []
     episodes = [load_vectors(kept) for kept in made.kept]
     assert [kept.stem for kept in made.kept] == [f"{file.stem}-1", f"{file.stem}-3"]
     assert [episode.success for episode in episodes] == [True, None]

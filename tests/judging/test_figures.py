@@ -12,10 +12,10 @@ import pytest
 from q2r2_control.config.teleop import Stance
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.inputs.way_points import minimum_jerk
-from q2r2_control.judging.episode import FRAME, Flags
+from q2r2_control.judging.episode import FRAME
 from q2r2_control.judging.figures import HandFigures, figures_of, hand_figures, timing_figures
 from q2r2_control.judging.motion import arm_figures, delays, idle_share, ldlj, smoothness
-from q2r2_control.types import Array
+from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 from tests.judging.episodes import DT, episode, frame_times
 from tests.support.processes import cell

@@ -13,10 +13,10 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.recording import JudgeSettings
-from q2r2_control.errors import RecordingError
 from q2r2_control.inputs.played import PlayedInput
+from q2r2_control.judging.camera_figures import CameraFigures
 from q2r2_control.judging.figures import EpisodeFigures, Fault, figures_of
-from q2r2_control.judging.judge import VERDICT_FILE, Judged, judge, judge_all, keep_verdicts, verdict_of
+from q2r2_control.judging.judge import VERDICT_FILE, Judged, Unreadable, judge, judge_all, keep_verdicts, verdict_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.types import SIDES, HandInputs
 from tests.judging.episodes import (
@@ -32,6 +32,7 @@ from tests.judging.episodes import (
     record_episode,
     without_ticks,
 )
+from tests.judging.spoilers import Contents, spoiled
 from tests.recording.runs import rewrite
 
 pytestmark = pytest.mark.slow
@@ -172,13 +173,34 @@ def test_a_verdict_is_kept_beside_the_file_with_all_that_it_was_made_of(clean: P
     assert episode["figures"]["arms"]["left"]["gripper_changes"] == 1
 
 
-def test_a_file_that_is_no_recording_is_told_before_any_is_judged(clean: Path, tmp_path: Path) -> None:
-    (tmp_path / "notes.mcap").write_text("no recording")
-    with pytest.raises(RecordingError, match=r"notes\.mcap: not an MCAP file"):
-        next(judge_all([clean, tmp_path / "notes.mcap"]))
+def test_files_that_cannot_be_read_are_named_and_the_others_are_judged(clean: Path, tmp_path: Path) -> None:
+    files = {"notes": b"no recording", "empty": b"", "magic": clean.read_bytes()[:8]}
+    for name, data in files.items():
+        (tmp_path / f"{name}.mcap").write_bytes(data)
+    degrees = spoiled(clean, tmp_path / "degrees.mcap", in_degrees)
+    swapped = spoiled(clean, tmp_path / "swapped.mcap", swapped_arms)
+    bad = [*sorted(tmp_path.glob("[emn]*.mcap")), degrees, swapped]
+    *found, last = judge_all([*bad, clean])
+    assert isinstance(last, Judged)
+    assert [one.file for one in found if isinstance(one, Unreadable)] == bad
+    for one in found:
+        assert isinstance(one, Unreadable)
+        assert one.line.startswith("discard: unreadable, ")
+        assert str(one.file) not in one.line
+
+
+def swapped_arms(contents: Contents) -> None:
+    for name in ("q", "v", "reference_q", "reference_v"):
+        contents.rows[name] = np.roll(contents.rows[name], contents.rows[name].shape[1] // 2, axis=1)
+
+
+def in_degrees(contents: Contents) -> None:
+    for name in ("q", "reference_q"):
+        contents.rows[name] = np.degrees(contents.rows[name])
 
 
 FIGURES = replace(figures_of(episode(), 0.06), idle_share=0.0)
+CAMERA = CameraFigures(None, 60, 1.0, 1.0, 0.0, 0.0, 0, 0.0, None)
 JUMP = Fault(1.0, "left", "hand_jumped", "a jump")
 
 
@@ -187,6 +209,10 @@ def changed(of: str = "episode", **changes: Any) -> EpisodeFigures:
         return replace(FIGURES, arms={"left": replace(FIGURES.arms["left"], **changes)})
     if of == "hand":
         return replace(FIGURES, hands={"right": replace(FIGURES.hands["right"], **changes)})
+    if of == "measured":
+        return replace(FIGURES, measured={"right": replace(FIGURES.measured["right"], **changes)})
+    if of == "camera":
+        return replace(FIGURES, cameras={"above": replace(CAMERA, **changes)})
     if of == "timing":
         return replace(FIGURES, timing=replace(FIGURES.timing, **changes))
     return replace(FIGURES, **changes)
@@ -214,6 +240,32 @@ CASES: list[tuple[str, float, str, str, Any, Any, str]] = [
     ("max_lost_gap", 0.1, "timing", "longest_lost_s", 0.1, 0.2, "at once 200.0 ms (at most 100)"),
     ("max_missed_share", 0.1, "timing", "missed_share", 0.1, 0.2, "missed 20.0 % of the ticks (at most 10)"),
     ("max_tick_gap", 0.1, "timing", "longest_tick_s", 0.1, 0.2, "stood still for 200.0 ms (at most 100)"),
+    ("max_unmeasured_ticks", 2, "measured", "unmeasured_ticks", 2, 3, "are no numbers in 3.0 ticks (at most 2)"),
+    ("max_joint_speed", 1.2, "measured", "joint_speed_share", 1.2, 9.0, "moves at 9.0 of its limit (at most 1.2)"),
+    ("max_velocity_mismatch", 0.5, "measured", "velocity_mismatch", 0.5, 2.0, "off by 200.0 % (at most 50)"),
+    ("max_reference_lag", 0.1, "measured", "reference_lag_ms", -100.0, -200.0, "by -200.0 ms (at most 100)"),
+    (
+        "min_picture_rate_share",
+        0.8,
+        "camera",
+        "rate_share",
+        0.8,
+        0.5,
+        "50.0 % of the pictures that were due (at least 80)",
+    ),
+    ("max_picture_gap", 3.0, "camera", "longest_gap_periods", 3.0, 4.0, "for 4.0 of its periods (at most 3)"),
+    ("max_frozen_share", 0.2, "camera", "frozen_share", 0.2, 0.5, "while arms move 50.0 % of the time (at most 20)"),
+    ("max_black_share", 0.1, "camera", "black_share", 0.1, 0.2, "one colour 20.0 % of the pictures (at most 10)"),
+    ("max_bad_pictures", 1, "camera", "bad_pictures", 1, 2, "than the cell's: 2.0 pictures (at most 1)"),
+    (
+        "max_picture_lag",
+        0.1,
+        "camera",
+        "lag_ms",
+        100.0,
+        200.0,
+        "camera above: pictures are later than the arms by 200.0 ms (at most 100)",
+    ),
     ("max_faults", 1, "episode", "faults", [JUMP], 2 * [JUMP], "left arm at 1.00 s: a jump, and 1 more (at most 1)"),
 ]
 
@@ -234,7 +286,7 @@ def test_a_number_beyond_its_threshold_is_the_one_reason(
 
 def test_every_threshold_is_tried_here() -> None:
     tried = {case[0] for case in CASES}
-    assert set(JudgeSettings.model_fields) - tried == {"dropout", "keep_failed", "needs_end"}
+    assert set(JudgeSettings.model_fields) - tried == {"dropout", "keep_failed", "needs_end", "needs_task"}
 
 
 def test_a_failure_is_discarded_unless_failures_are_kept_and_a_run_that_a_fault_ended_always() -> None:

@@ -56,7 +56,7 @@ def test_nothing_is_fetched_from_elsewhere_and_each_episode_has_a_row_with_its_v
     assert not page.all("link")
     assert not page.all("script")
     assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; {braces}" in text
-    assert "to &lt;stack&gt;" in text
+    assert "to &lt;move&gt;" in text
     for picture in page.pictures:
         assert set(re.findall(r'href="([^"]*)"', picture)) <= set(re.findall(r'href="(#[^"]*)"', picture))
         assert "url(http" not in picture

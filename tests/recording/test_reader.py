@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event, Reason
 from q2r2_control.events import ReasonKind as K
 from q2r2_control.recording import messages
-from q2r2_control.recording.about import About
+from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.bag import BagWriter
 from q2r2_control.recording.reader import Recording, recordings_in, spans_of
 from q2r2_control.recording.tick_rows import numbers_in, tick_labels, tick_type
@@ -97,6 +100,56 @@ def test_a_reader_that_is_slower_than_the_writer_ends(tmp_path: Path) -> None:
             assert len(found) <= 3
             write(len(found) + 2)
         assert found == [0, 1, 2]
+
+
+def test_a_file_that_ends_anywhere_is_read_as_far_as_it_goes_and_is_not_damaged(tmp_path: Path) -> None:
+    """A killed writer leaves the beginning of a file, which may end in the middle of any record."""
+    about = About.of(pipeline(), realtime=True, notes={}, cameras=())
+    topic = messages.Topic(1, messages.STATE, messages.TEXT)
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
+    ends: list[int] = []
+    with BagWriter(whole, [topic], about) as bag:
+        for number in range(3):
+            bag.write([messages.Message(1, number, about.epoch + number, 0, messages.text("state"))])
+            bag.flush()
+            ends.append(whole.stat().st_size)
+        bag.close(Conclusion())
+    data = whole.read_bytes()
+    begin = data.index(b"\x28\xb5\x2f\xfd")  # of the first chunk's content
+    for size in (*range(0, begin, 97), *range(1, 40)):
+        cut.write_bytes(data[:size])
+        assert messages_or_fault(cut) in ([], "no metadata q2r2_control", "killed before it had written")
+    for size in range(begin, len(data)):
+        cut.write_bytes(data[:size])
+        recording = Recording(cut)
+        found = [message.number for several in recording.messages() for message in several]
+        assert not recording.closed
+        # A chunk is followed by an index of its messages, which a reader does without.
+        assert found == [0, 1, 2][: len(found)]
+        assert len(found) >= sum(end <= size for end in ends)
+
+
+def messages_or_fault(file: Path) -> list[messages.Message] | str | None:
+    try:
+        return [message for several in Recording(file).messages() for message in several]
+    except RecordingError as error:
+        found = re.search("no metadata q2r2_control|killed before it had written", str(error))
+        return None if found is None else found.group(0)
+
+
+def test_a_length_that_leads_out_of_a_file_that_was_ended_is_damage(tmp_path: Path) -> None:
+    about = About.of(pipeline(), realtime=True, notes={}, cameras=())
+    file = tmp_path / "file.mcap"
+    with BagWriter(file, [messages.Topic(1, messages.STATE, messages.TEXT)], about) as bag:
+        bag.write([messages.Message(1, 0, about.epoch, 0, messages.text("state"))])
+        bag.close(Conclusion())
+    data, place = bytearray(file.read_bytes()), len(MCAP0_MAGIC)
+    while data[place] != Opcode.CHUNK:
+        place += 9 + int.from_bytes(data[place + 1 : place + 9], "little")
+    data[place + 4] = 0x7F  # of its length
+    file.write_bytes(data)
+    with pytest.raises(RecordingError, match="damaged"):
+        list(Recording(file).messages())
 
 
 ARMS, NAMES = ("left", "right"), ("left_A1", "left_A2", "right_A1_with_a_longer_name")

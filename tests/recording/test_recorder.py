@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import math
+import os
 import re
+import resource
+import signal
 import time
 import tracemalloc
 from dataclasses import replace as changed
@@ -16,14 +20,17 @@ import pytest
 import yaml
 
 from q2r2_control.config.cell import parse_config
+from q2r2_control.config.recording import TOPIC_RATE
 from q2r2_control.recording.about import About
-from q2r2_control.recording.messages import run_topics
+from q2r2_control.recording.bag import BagWriter
+from q2r2_control.recording.messages import STATE, TEXT, Message, Topic, run_topics, text
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.summary.tick import Tick
 from tests.recording.runs import ARMS, JOINTS, RATE, ended_line, file_of, pipeline, read_elsewhere, record, writer_of
+from tests.support.processes import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -44,17 +51,20 @@ def test_every_topic_opens_with_rosbags_in_another_process_and_has_what_was_told
     assert {name: entry["type"] for name, entry in found.items()} == {
         name: topic.type for name, topic in run_topics(ARMS, JOINTS).items()
     }
-    every = len(ticks)
-    for name in ("/q2r2/tick", "/joint_states", "/q2r2/external_torque", "/joint_commands", "/q2r2/reference"):
-        assert found[name]["count"] == every
+    assert found["/q2r2/tick"]["count"] == len(ticks)
+    shown = first_of_each_period(ticks, TOPIC_RATE)
+    assert len(shown) == pytest.approx(len(ticks) * TOPIC_RATE / RATE, abs=1)
+    for name in ("/joint_states", "/q2r2/external_torque", "/joint_commands", "/q2r2/reference"):
+        assert found[name]["count"] == len(shown)
     samples = [sample for tick in ticks for sample in tick.samples]
     assert found["/q2r2/hand_samples"]["count"] == len(samples)
     assert found["/q2r_left_hand_pose"]["count"] == sum(sample.hand == "left" for sample in samples)
     led = [tick for tick in ticks if tick.targets["left"].pose is not None]
-    assert found["/q2r2/left/target_frame"]["count"] == len(led) > 50
+    with_target = sum(tick.targets["left"].pose is not None for tick in shown)
+    assert found["/q2r2/left/target_frame"]["count"] == with_target > 50
     commands = found["/joint_commands"]
-    assert commands["position"] == ticks[-1].command.q.tolist()
-    assert commands["last"] - commands["first"] == pytest.approx(1e9 * (ticks[-1].t - ticks[0].t), abs=1000)
+    assert commands["position"] == shown[-1].command.q.tolist()
+    assert commands["last"] - commands["first"] == pytest.approx(1e9 * (shown[-1].t - shown[0].t), abs=1000)
     states = [json.loads(text) for text in found["/q2r2/state"]["texts"]]
     assert [event["kind"] for state in states for event in state.get("events", ())] == ["pressed", "pressed"]
     arms = np.concatenate([chunk.rows["arms"] for chunk in Recording(file).chunks()])[:, 0]
@@ -65,6 +75,23 @@ def test_every_topic_opens_with_rosbags_in_another_process_and_has_what_was_told
     # Side by side and unscaled, a tool moves as its hand does: by the same from the first target on.
     assert np.ptp(poses, axis=0).max() > 0.005
     np.testing.assert_allclose(targets - targets[0], poses - poses[0], atol=1e-9)
+
+
+def first_of_each_period(ticks: list[Tick], rate: float) -> list[Tick]:
+    periods = [math.floor((tick.now - tick.start.now) * rate + 1e-6) for tick in ticks]
+    return [tick for tick, now, before in zip(ticks, periods, [-1, *periods], strict=False) if now > before]
+
+
+def test_standard_topics_may_come_with_every_tick(tmp_path: Path) -> None:
+    loop = pipeline()
+    with Recorder(tmp_path, "test", waits=True) as recorder:
+        recorder.begin(About.of(loop, False, {}), loop.robot, None)
+        loop.listeners.append(recorder)
+        loop.run(0.2, realtime=False)
+    assert recorder.summary.file is not None
+    counts = Recording(Path(recorder.summary.file)).counts
+    assert counts is not None
+    assert counts["/joint_states"] == counts["/q2r2/tick"] == recorder.summary.ticks
 
 
 def test_a_clock_that_is_set_back_during_a_run_changes_no_time_in_the_file(
@@ -105,6 +132,64 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
     assert summary.fault is not None
     assert (summary.file, summary.ticks) == (None, 0)
     assert summary.lost_ticks >= 0.2 * RATE
+
+
+def test_a_recorder_that_wrote_nothing_leaves_no_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def fill_the_disk(recorder: Recorder) -> None:
+        resource.prlimit(writer_of(recorder).pid, resource.RLIMIT_FSIZE, (1000, 1000))
+
+    loop = pipeline()
+    with Recorder(tmp_path / "full", "test", waits=True) as recorder:
+        fill_the_disk(recorder)
+        recorder.begin(About.of(loop, False, {}), loop.robot)
+        loop.listeners.append(recorder)
+        loop.run(0.3, realtime=False)
+    assert "File too large" in str(recorder.summary.fault)
+    assert recorder.summary.file is None
+    assert list((tmp_path / "full").iterdir()) == []
+
+
+def test_a_file_that_fails_before_its_first_message_is_whole_is_removed_with_its_folder(tmp_path: Path) -> None:
+    loop = pipeline()
+    about, topic = About.of(loop, False, {}), Topic(1, STATE, TEXT)
+    folder = tmp_path / "run"
+    folder.mkdir()
+
+    def write_and_fail() -> None:
+        with BagWriter(folder / "run.mcap", [topic], about) as bag:
+            bag.write([Message(1, 0, about.epoch, 0, text("not flushed"))])
+            raise OSError("full")
+
+    with pytest.raises(OSError, match="full"):
+        write_and_fail()
+    assert not folder.exists()
+
+
+def test_a_file_whose_writer_was_killed_before_it_wrote_is_removed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def kill(recorder: Recorder) -> None:
+        wait_until(lambda: bool(list(tmp_path.rglob("*.mcap"))))
+        os.kill(writer_of(recorder).pid, signal.SIGKILL)
+
+    summary = record(tmp_path, pipeline(), 0.3, during=kill)
+    assert summary.fault is not None
+    assert summary.file is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_falls_behind_the_run_is_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    loop = pipeline()
+    with caplog.at_level(logging.WARNING), Recorder(tmp_path, "slow") as recorder:
+        recorder.begin(About.of(loop, False, {}), loop.robot)
+        os.kill(writer_of(recorder).pid, signal.SIGSTOP)
+        loop.listeners.append(recorder)
+        loop.run(3.0, realtime=False)
+        os.kill(writer_of(recorder).pid, signal.SIGCONT)
+    (line,) = caplog.messages
+    assert re.match(r"the recording is 2\.0 s behind the run: its writer gets too little of the processors", line)
+    assert recorder.summary.longest_backlog_s > 2.5
+    assert recorder.summary.lost_ticks == 0
 
 
 def test_runs_that_begin_within_one_second_get_a_folder_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

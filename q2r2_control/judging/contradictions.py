@@ -1,0 +1,49 @@
+"""Contradictions between parts of an episode's file, of which one cannot be true."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from q2r2_control.config.recording import JudgeSettings
+from q2r2_control.judging.figures import EpisodeFigures
+from q2r2_control.judging.thresholds import Rejection
+
+_CONSTANT = 0.05  # of a gripper's stroke, less than which is no motion of it
+_CLOSES = 0.5  # of the stroke, a command over which every gripper follows by some of it
+_GRASPS = re.compile(
+    r"\b(grasp|grip(?!per)|pick|place|stack|lift|carr(y|ies)|insert|hand(s|ed|ing)? .*\b(over|to) |handover|"
+    r"put (.* )?(in|into|on|onto)\b)",
+    re.IGNORECASE,
+)
+
+
+def contradictions(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
+    """Reasons to discard an episode that are no limit of a number, and that no setting but ``needs_task`` changes."""
+    if figures.timing.repeated_stamps:
+        count = figures.timing.repeated_stamps
+        yield Rejection("repeated_stamps", f"{count} ticks have the time of the tick before")
+    if figures.timing.begins_again:
+        yield Rejection("begins_again", "the run goes on after its end: two runs are in one file")
+    if figures.empty_topics:
+        yield Rejection("empty_topics", f"no message on {', '.join(figures.empty_topics)}")
+    if figures.task is not None and not figures.task.strip():
+        yield Rejection("empty_task", "its task is an empty text")
+    elif figures.task is None and settings.needs_task:
+        yield Rejection("needs_task", "it has no task")
+    for name, camera in figures.cameras.items():
+        if camera.swapped_with is not None:
+            what = f"camera {name}: its pictures seem to be those of camera {camera.swapped_with}"
+            yield Rejection("swapped_cameras", what)
+    yield from _grippers(figures)
+
+
+def _grippers(figures: EpisodeFigures) -> Iterator[Rejection]:
+    grippers = {arm: found for arm, found in figures.measured.items() if found.commanded_range is not None}
+    ranges = [found.commanded_range or 0.0 for found in grippers.values()]
+    if ranges and max(ranges) < _CONSTANT and (word := _GRASPS.search(figures.task or "")) is not None:
+        yield Rejection("constant_gripper", f"no gripper is told to move, and the task says '{word.group(0).strip()}'")
+    for arm, found in grippers.items():
+        commanded, measured = found.commanded_range or 0.0, found.opening_range
+        if measured is not None and commanded > _CLOSES and measured < _CONSTANT:
+            yield Rejection("stuck_gripper", f"{arm} arm: its gripper was told to move and did not")

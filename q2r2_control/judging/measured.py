@@ -1,0 +1,88 @@
+"""Whether what was measured of an arm can be true: finite, no faster than its joints, and as its reference says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from q2r2_control.judging.episode import Episode
+from q2r2_control.judging.motion import Track, best_delay
+from q2r2_control.types import Array
+
+_SPEED_FRAMES = 10  # over which a lasting speed is taken
+_MOVES = 0.02  # RMS speed from which on a joint's measured velocity is held against its positions [rad/s]
+_LONGEST_GAP = 0.05  # between the frames that a velocity is compared over [s]
+_LARGEST_LAG = 0.35  # that is looked for [s]
+_STEP = 0.005  # of lags, and of the times that are compared [s]
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredFigures:
+    """One arm, until the run begins to end; None: there is nothing to tell it by."""
+
+    unmeasured_ticks: int  # with a position, velocity, opening or reference that is no finite number
+    joint_speed_share: float  # fastest joint over 20 ms, by its limit
+    velocity_mismatch: float | None  # of the joint whose measured velocity is least the slope of its positions
+    reference_lag_ms: float | None  # of the measured joints behind the reference
+    opening_range: float | None  # measured of the gripper; None: it is not measured
+    commanded_range: float | None  # commanded of the gripper; None: the arm has none
+
+
+def measured_figures(episode: Episode, arm: str) -> MeasuredFigures:
+    """Figures of an arm; torques are left out, which not every plant measures."""
+    index, ticks = episode.arms.index(arm), episode.ticks
+    joints, at = episode.robot.arms[arm].joints, episode.frames.at
+    following = ticks.following[at]
+    t, frames = episode.frame_t[following], episode.frames
+    q, v, reference = (numbers[following][:, joints] for numbers in (frames.q, frames.v, frames.reference_q))
+    fastest = ticks.joint_speed[ticks.following, index].max(initial=0.0)
+    return MeasuredFigures(
+        unmeasured_ticks=int(ticks.unmeasured[:, index].sum()),
+        joint_speed_share=float(max(fastest, _lasting_speed(t, q, episode.robot.velocity_limit[joints]))),
+        velocity_mismatch=_velocity_mismatch(t, q, v),
+        reference_lag_ms=_reference_lag(t, q, reference),
+        opening_range=_range(frames.opening[following, index]),
+        commanded_range=_range(frames.commanded[following, index]),
+    )
+
+
+def _lasting_speed(t: Array, q: Array, limits: Array) -> float:
+    """Greatest speed over ten frames, a tenth of a second, by the limits."""
+    if len(t) <= _SPEED_FRAMES:
+        return 0.0
+    passed = np.maximum(t[_SPEED_FRAMES:] - t[:-_SPEED_FRAMES], 1e-9)
+    steps = np.abs(q[_SPEED_FRAMES:] - q[:-_SPEED_FRAMES])
+    steps = np.where(steps > np.pi, 0.0, steps)  # a joint that turns on for ever begins anew
+    return float(np.nan_to_num(steps / passed[:, None] / limits, posinf=0.0).max())
+
+
+def _velocity_mismatch(t: Array, q: Array, v: Array) -> float | None:
+    """|k - 1| of the worst joint, where v = k dq/dt fits best; -1 is the slope of a velocity of the wrong sign."""
+    if len(t) < 3 or not np.nan_to_num(v).any():  # not measured
+        return None
+    slope, measured = (q[2:] - q[:-2]) / np.maximum(t[2:] - t[:-2], 1e-9)[:, None], v[1:-1]
+    usable = np.isfinite(slope).all(axis=1) & np.isfinite(measured).all(axis=1) & (t[2:] - t[:-2] < _LONGEST_GAP)
+    slope, measured = slope[usable], measured[usable]
+    moves = np.sum(slope**2, axis=0) > _MOVES**2 * max(len(slope), 1)
+    if not moves.any():
+        return None
+    fit = np.sum(measured * slope, axis=0)[moves] / np.sum(slope**2, axis=0)[moves]
+    return float(np.abs(fit - 1.0).max())
+
+
+def _reference_lag(t: Array, q: Array, reference: Array) -> float | None:
+    """By how many ms the measured joints lag behind the reference, as :func:`delays` tells it; negative: they lead."""
+    usable = np.isfinite(q).all(axis=1) & np.isfinite(reference).all(axis=1)
+    t, q, reference = t[usable], q[usable], reference[usable]
+    if len(t) < 2 or t[-1] - t[0] < 3.0 * _LARGEST_LAG:
+        return None
+    when = np.arange(t[0] + _LARGEST_LAG, t[-1] - _LARGEST_LAG, _STEP)
+    lags = np.arange(-_LARGEST_LAG, _LARGEST_LAG + _STEP, _STEP)
+    lag = best_delay(Track(t, reference), Track(t, q), when, lags)
+    return None if lag is None else 1e3 * lag
+
+
+def _range(openings: Array) -> float | None:
+    known = openings[np.isfinite(openings)]
+    return float(known.max() - known.min()) if len(known) else None

@@ -1,0 +1,91 @@
+"""Looks at the pictures of a recording's cameras, and keeps of each so little that a whole episode has room."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.recording.messages import NANOSECONDS
+from q2r2_control.recording.reader import BROKEN, Picture, Recording
+from q2r2_control.types import Array, Flags
+
+VIEW = (24, 32)  # rows and columns of a picture as it is kept
+_SCAN, _END = b"\xff\xda", b"\xff\xd9"  # of the coded pixels of a JPEG
+# Within coded pixels a byte 0xFF is followed by 0, by a restart marker, by the end, or by more of the same (ITU T.81,
+# B.1.1.2 and F.1.2.3). A decoder goes on after any other, with pixels that the camera never saw.
+_FOREIGN_MARKER = re.compile(rb"\xff[\x01-\xcf\xda-\xfe]")
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """k pictures of one camera, in the order of time."""
+
+    t: Array  # (k,) of the tick that they show, since the recording began [s]
+    views: npt.NDArray[np.uint8]  # (k, *VIEW) brightness, averaged; zeros where it could not be decoded
+    repeated: Flags  # (k,) every pixel is as in the picture before
+    damaged: Flags  # (k,) it could not be decoded, or only in part
+    other_size: Flags  # (k,) its size is not that of the cell's camera
+
+    def between(self, start: float, end: float, origin: float) -> Pictures:
+        """Those from ``start`` to ``end`` [s], with times since ``origin`` [s]."""
+        inside = (start <= self.t) & (self.t <= end)
+        cut = {name: values[inside] for name, values in vars(self).items()}
+        return Pictures(**cut | {"t": cut["t"] - origin})
+
+
+class _Look(NamedTuple):
+    t: float
+    view: npt.NDArray[np.uint8]
+    repeated: bool = False
+    damaged: bool = False
+    other_size: bool = False
+
+
+def read_pictures(recording: Recording, cameras: dict[str, CameraConfig]) -> dict[str, Pictures]:
+    """Look at all pictures of ``cameras``, by name. Raises :class:`RecordingError` for a damaged file."""
+    looks: dict[str, list[_Look]] = {name: [] for name in cameras}
+    last: defaultdict[str, bytes] = defaultdict(bytes)
+    for name, picture in recording.pictures_of(cameras):
+        t = (picture.time - recording.about.epoch) / NANOSECONDS
+        if looks[name] and picture.jpeg == last[name]:
+            looks[name].append(looks[name][-1]._replace(t=t, repeated=True))
+            continue
+        looks[name].append(_look_at(picture, t, cameras[name]))
+        last[name] = picture.jpeg
+    return {name: pictures_of(found) for name, found in looks.items()}
+
+
+def pictures_of(looks: Iterable[_Look]) -> Pictures:
+    found = list(looks)
+    flags = (np.array([look[column] for look in found], dtype=bool) for column in range(2, len(_Look._fields)))
+    views = np.array([look.view for look in found], dtype=np.uint8).reshape(-1, *VIEW)
+    return Pictures(np.array([look.t for look in found], dtype=np.float64), views, *flags)
+
+
+def _look_at(picture: Picture, t: float, camera: CameraConfig) -> _Look:
+    try:
+        image = Image.open(io.BytesIO(picture.jpeg))
+        other_size = image.size != (camera.width, camera.height)
+        image.draft("L", (2 * VIEW[1], 2 * VIEW[0]))  # a decoder that has to make few pixels is several times as fast
+        view = image.convert("L").resize(VIEW[::-1], Image.Resampling.BOX)
+    except (OSError, SyntaxError, Image.DecompressionBombError, *BROKEN):
+        return _Look(t, np.zeros(VIEW, np.uint8), damaged=True)
+    return _Look(t, np.asarray(view), damaged=_has_foreign_marker(picture.jpeg), other_size=other_size)
+
+
+def _has_foreign_marker(jpeg: bytes) -> bool:
+    """True if the coded pixels of a JPEG were overwritten: they contain a marker that has no place in them."""
+    scan = jpeg.rfind(_SCAN)  # the last one: a smaller picture, with a scan of its own, may stand before
+    if scan < 0:
+        return False
+    begin = scan + len(_SCAN) + int.from_bytes(jpeg[scan + 2 : scan + 4], "big")
+    return _FOREIGN_MARKER.search(jpeg, begin, max(jpeg.rfind(_END), begin)) is not None

@@ -1,0 +1,122 @@
+"""A clean episode with cameras is kept; each copy of it that was spoiled in one way is discarded, for that reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.config.recording import JudgeSettings
+from q2r2_control.judging.camera_figures import arm_of_link
+from q2r2_control.judging.judge import judge
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.recording.reader import Recording
+from q2r2_control.robot.robot import Robot
+from tests.judging.episodes import hands, loop_of, record_episode
+from tests.judging.spoilers import CAMERAS, NUMBERS, Contents, Spoiler, empty, retitled, spoiled
+from tests.recording.runs import file_of, record
+from tests.support.pictures import needs_opengl
+from tests.support.processes import cell
+
+pytestmark = pytest.mark.slow
+
+DURATION = 4.0  # [s]
+SMALL = {"width": 96, "height": 72}
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An episode without pictures, which takes no OpenGL."""
+    return record_episode(tmp_path_factory.mktemp("clean"), hands(), DURATION)
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One with the pictures of the shipped cell's three cameras, but small."""
+    needs_opengl()
+    cameras = {name: camera.model_copy(update=SMALL) for name, camera in cell().cameras.items()}
+    config = loop_of(hands()).config.model_copy(update={"cameras": cameras})
+    loop = Pipeline.from_config(config, input=hands(), plant="mujoco")
+    return file_of(record(tmp_path_factory.mktemp("filmed"), loop, DURATION))
+
+
+def reasons(file: Path, settings: JudgeSettings | None = None) -> set[str]:
+    (found,) = judge(Recording(file), settings)
+    return {reason.name for reason in found.verdict.reasons}
+
+
+def test_an_episode_is_kept_whose_copy_was_not_spoiled(clean: Path, tmp_path: Path) -> None:
+    assert reasons(spoiled(clean, tmp_path / "same.mcap")) == set()
+
+
+def test_an_episode_with_pictures_is_kept_and_its_cameras_are_in_time(filmed: Path) -> None:
+    (found,) = judge(Recording(filmed))
+    assert found.verdict.line == "keep"
+    assert {name: camera.arm for name, camera in found.figures.cameras.items()} == {
+        "above": None,
+        "left_wrist": "left",
+        "right_wrist": "right",
+    }
+    for camera in found.figures.cameras.values():
+        assert camera.lag_ms == pytest.approx(0.0, abs=60.0)
+        assert camera.rate_share == pytest.approx(1.0, abs=0.03)
+        assert camera.frozen_share == camera.black_share == camera.bad_pictures == 0
+
+
+@pytest.mark.parametrize("what", NUMBERS)
+def test_an_episode_with_spoiled_numbers_is_discarded_for_that_reason(what: str, clean: Path, tmp_path: Path) -> None:
+    spoil, reason = NUMBERS[what]
+    assert reason in reasons(spoiled(clean, tmp_path / "spoiled.mcap", spoil))
+
+
+@pytest.mark.parametrize("what", CAMERAS)
+def test_an_episode_with_spoiled_pictures_is_discarded_for_that_reason(what: str, filmed: Path, tmp_path: Path) -> None:
+    spoil, reason = CAMERAS[what]
+    assert reason in reasons(spoiled(filmed, tmp_path / "spoiled.mcap", spoil))
+
+
+def not_felt(contents: Contents) -> None:
+    contents.rows["tau"] = float("nan")
+    contents.rows["arms"]["opening"] = -float("inf")
+
+
+def one_picture_is_lost(contents: Contents) -> None:
+    contents.keep_pictures("above", lambda number: number != 20)
+
+
+def without_task(contents: Contents) -> None:
+    contents.about = replace(contents.about, notes={})
+
+
+HARMLESS: dict[str, Spoiler] = {
+    "torques and openings that nothing measures": not_felt,
+    "no measured velocity": lambda contents: contents.rows["v"].fill(0.0),
+    "no task": without_task,
+    "a task that says to grasp, and a gripper that moves": lambda contents: retitled(contents, "pick the block"),
+}
+
+
+@pytest.mark.parametrize("what", HARMLESS)
+def test_an_episode_is_kept_that_lacks_what_not_every_plant_or_operator_gives(
+    what: str, clean: Path, tmp_path: Path
+) -> None:
+    assert reasons(spoiled(clean, tmp_path / "harmless.mcap", HARMLESS[what])) == set()
+
+
+def test_one_lost_picture_is_no_reason(filmed: Path, tmp_path: Path) -> None:
+    assert reasons(spoiled(filmed, tmp_path / "lost.mcap", one_picture_is_lost)) == set()
+
+
+def test_a_cell_may_ask_for_a_task(clean: Path, tmp_path: Path) -> None:
+    file = spoiled(clean, tmp_path / "untold.mcap", without_task)
+    assert reasons(file, JudgeSettings(needs_task=True)) == {"needs_task"}
+
+
+def test_a_topic_that_only_some_runs_have_may_be_empty(clean: Path, tmp_path: Path) -> None:
+    assert reasons(spoiled(clean, tmp_path / "quiet.mcap", empty("/q2r2/external_torque"))) == set()
+
+
+def test_a_link_is_carried_by_the_arm_whose_joints_move_it() -> None:
+    robot = Robot.from_config(cell())
+    assert [arm_of_link(robot, link) for link in ("left_hand_e_base", "world", "nowhere")] == ["left", None, None]
