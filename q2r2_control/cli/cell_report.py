@@ -142,7 +142,7 @@ def _plant_faults(config: Config, robot: Robot) -> list[str]:
 
 
 def _notes_on_models(config: Config) -> list[str]:
-    """What a user should look at in the models, as they were written."""
+    """Lines on what the models say, and a user should look at."""
     if config.robot is not None:
         return [f"robot: {note}" for note in load_model(config.robot, config.packages, "robot").notes]
     arms = {side: load_model(arm, config.packages, f"arms.{side}") for side, arm in config.arms.items()}

@@ -1,7 +1,7 @@
 """Parts of a URDF that its readers take in different ways: each is brought to one form, refused, or told.
 
-Readers of URDF skip what they do not know without a word. What is skipped could be a hand, a mass or half of a joint's
-range.
+Readers of URDF skip what they do not know without a word: a hand, a mass or half of a joint's
+range could be missing.
 """
 
 from __future__ import annotations
