@@ -126,6 +126,7 @@ def about_of(folder: Path) -> About:
     return Recording(file).about
 
 
+@pytest.mark.slow
 def test_a_demo_lays_the_parts_of_its_task_where_the_seed_has_them(tmp_path: Path) -> None:
     shipped, places = load_config(CELL).mujoco.objects, []
     for seed in ("3", "4"):

@@ -51,8 +51,8 @@ def test_a_run_goes_on_after_a_call_with_any_value(loop: Pipeline, call: Callabl
 
 
 @pytest.mark.parametrize("value", HOSTILE.values(), ids=list(HOSTILE))
-def test_a_run_refuses_a_duration_that_is_no_positive_number_of_seconds(value: Any) -> None:
+def test_a_run_refuses_a_duration_that_is_no_positive_number_of_seconds(loop: Pipeline, value: Any) -> None:
     if value is None or value is True:
         return
     with pytest.raises(ConfigError, match="duration"):
-        pipeline().run(value, realtime=False)
+        loop.run(value, realtime=False)
