@@ -8,7 +8,7 @@ import queue
 import sys
 from contextlib import suppress
 from logging.handlers import QueueHandler, QueueListener
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -63,8 +63,20 @@ class _StderrHandler(logging.Handler):
             print(self.format(record), file=sys.stderr)
 
 
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version  # which takes as long as all other help
+
+        print(f"q2r2 {version('q2r2_control')}")
+        raise typer.Exit
+
+
 @app.callback()
-def main() -> None:
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
     """Let a thread write what is logged: a control loop must not wait for a terminal."""
     logger = logging.getLogger("q2r2_control")
     if not logger.handlers:

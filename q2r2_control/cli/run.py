@@ -52,6 +52,7 @@ from q2r2_control.demo.assembly_tasks import (
 )
 from q2r2_control.demo.trials import try_tasks
 from q2r2_control.errors import ConfigError
+from q2r2_control.extras import install_line
 from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, place_of, trajectory_named
@@ -246,7 +247,7 @@ def demo(
         viewer = window_fault() is None
         web, web_port = not viewer and find_spec("viser") is not None, 0
         if not (viewer or web):
-            say("--viewer shows the arms in MuJoCo's window, and --web in a browser: pip install 'q2r2_control[web]'")
+            say(f"--viewer shows the arms in MuJoCo's window, and --web in a browser: {install_line('web')}")
     given: dict[str, object] = {"trajectory": trajectory, "human": human or hands is not None, "seed": seed}
     given |= {"shaky": shaky, "spread": spread}
     options = RunOptions(

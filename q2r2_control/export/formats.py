@@ -21,6 +21,7 @@ from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import EpisodeVectors, Write
 from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
 from q2r2_control.export.lerobot_v21 import join_v21, openpi_config, require_v21, write_v21
+from q2r2_control.extras import install_line
 
 _AHEAD = 1  # frames by which actions in HDF5 are
 # Name in the HDF5 file, name of the feature, unit of a joint.
@@ -71,7 +72,7 @@ def require_h5py() -> Any:
     try:
         import h5py
     except ImportError as error:
-        raise ConfigError("export hdf5 needs h5py: pip install 'q2r2_control[export]'") from error
+        raise ConfigError(f"export hdf5 needs h5py: {install_line('export')}") from error
     return h5py
 
 

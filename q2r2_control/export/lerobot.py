@@ -17,6 +17,7 @@ from typing import Any
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import EpisodeVectors
+from q2r2_control.extras import install_line
 from q2r2_control.inputs.policy import ActionSpace
 
 POSITION = ".pos"  # which lerobot looks for at the end of what a policy sees and commands
@@ -30,7 +31,7 @@ _CAP_SYS_NICE, _CAPABILITY_VERSION = 23, 0x20080522  # linux/capability.h
 def require_lerobot() -> None:
     """Raises :class:`ConfigError` where lerobot is not installed; it is not imported, which takes seconds."""
     if find_spec("lerobot") is None:
-        raise ConfigError("export lerobot needs lerobot: pip install 'q2r2_control[lerobot]'")
+        raise ConfigError(f"export lerobot needs lerobot: {install_line('lerobot')}")
 
 
 def video_key(camera: str) -> str:

@@ -20,6 +20,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.lerobot import check_alike, source_of, video_key, write_sources
 from q2r2_control.export.sampling import CameraFrames, Names
+from q2r2_control.extras import install_line
 
 DESCRIPTION = "annotation.human.action.task_description"  # the number of a task, under GR00T's name
 OPENPI_CAMERAS = ("cam_high", "cam_left_wrist", "cam_right_wrist")
@@ -35,7 +36,7 @@ _CODEC, _CODING = "libx264", {"crf": "20", "g": "2", "bf": "0"}
 def require_v21() -> None:
     """Raises :class:`ConfigError` where pyarrow or av is not installed."""
     if find_spec("pyarrow") is None or find_spec("av") is None:
-        raise ConfigError("export lerobot-v2.1 needs pyarrow and av: pip install 'q2r2_control[export]'")
+        raise ConfigError(f"export lerobot-v2.1 needs pyarrow and av: {install_line('export')}")
 
 
 def openpi_names(cameras: Mapping[str, CameraFrames]) -> dict[str, str]:

@@ -20,6 +20,7 @@ from typing import Any
 
 from q2r2_control.config.fri import MODBUS_DELAY, ModbusGripperConfig
 from q2r2_control.errors import ConfigError
+from q2r2_control.extras import install_line
 
 _OUTPUTS, _INPUTS = 0x03E8, 0x07D0  # the first of three registers to write, and to read, of two bytes each
 _PERIOD = 0.025  # of reading, and of writing where the opening is a new one [s]
@@ -180,7 +181,7 @@ def _client(arm: str, config: ModbusGripperConfig) -> Any:
         if config.endpoint is None:
             return ModbusSerialClient(config.modbus, baudrate=115200, timeout=_TIMEOUT, retries=_REPEATS)
     except (ImportError, RuntimeError) as error:  # as pymodbus says that pyserial is missing
-        needs = "needs pymodbus and pyserial: pip install 'q2r2_control[modbus]'"
+        needs = f"needs pymodbus and pyserial: {install_line('modbus')}"
         raise ConfigError(f"fri.{arm}.gripper.modbus: {needs}") from error
     host, port = config.endpoint
     return ModbusTcpClient(host, port=port, timeout=_TIMEOUT, retries=_REPEATS)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.extras import install_line
 
 _PLACES = "the key packages, AMENT_PREFIX_PATH or ROS_PACKAGE_PATH"
 
@@ -56,7 +57,7 @@ def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[
         from xacro import substitution_args
     except ImportError as error:
         raise ConfigError(
-            f"{file}: needs the Python package xacro: pip install 'q2r2_control[xacro]', or expand it to .urdf"
+            f"{file}: needs the Python package xacro: {install_line('xacro')}, or expand it to .urdf"
         ) from error
     # As on xacro's command line.
     texts = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,10 @@ from q2r2_control.verification.soak import SoakReport, run_soak
 from tests.cli.command import CELL, FAST, changed_cell, external_cell, one_object, q2r2
 
 
-@pytest.mark.slow
+def test_the_version_is_that_of_the_installed_package() -> None:
+    assert q2r2("--version").stdout == f"q2r2 {version('q2r2_control')}\n"
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

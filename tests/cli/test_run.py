@@ -15,6 +15,7 @@ from typer import Exit
 
 from q2r2_control.cli.cell_run import RunOptions
 from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.extras import install_line
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from tests.cli.command import CELL, FAST, changed_cell, one_object, q2r2
@@ -118,7 +119,7 @@ def test_a_demo_at_a_terminal_shows_the_arms_where_there_is_a_way_to(
     monkeypatch.setattr(f"{MODULE}.run_cell", run_cell)
     result = q2r2("demo")
     assert result.exit_code == 7
-    assert ("q2r2_control[web]" in result.stderr) is (not (display or viser))
+    assert (install_line("web") in result.stderr) is (not (display or viser))
 
 
 def about_of(folder: Path) -> About:

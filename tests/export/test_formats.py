@@ -17,6 +17,7 @@ from q2r2_control.export import lerobot
 from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.formats import FORMATS, ROBOMIMIC
 from q2r2_control.export.lerobot import SOURCES, join_shards, video_key
+from q2r2_control.extras import install_line
 from tests.cli.command import q2r2
 from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
 
@@ -150,5 +151,5 @@ def test_without_lerobot_one_line_says_how_to_install_it(tmp_path: Path, monkeyp
     (tmp_path / "a.mcap").touch()
     result = q2r2("export", "lerobot", str(tmp_path / "a.mcap"), "--output", str(tmp_path / "out"))
     assert result.exit_code == 2
-    assert result.stderr == "q2r2: export lerobot needs lerobot: pip install 'q2r2_control[lerobot]'\n"
+    assert result.stderr == f"q2r2: export lerobot needs lerobot: {install_line('lerobot')}\n"
     assert not list(tmp_path.glob("out*"))

@@ -18,6 +18,7 @@ import pytest
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.export import lerobot_v21
 from q2r2_control.export.lerobot_v21 import DESCRIPTION, openpi_config, openpi_names
+from q2r2_control.extras import install_line
 from tests.cli.command import q2r2
 from tests.export.files import EPISODES, HEIGHT, WIDTH, Waves
 from tests.export.test_formats import export
@@ -142,4 +143,4 @@ def test_without_pyarrow_one_line_says_how_to_install_it(tmp_path: Path, monkeyp
     (tmp_path / "a.mcap").touch()
     result = q2r2("export", "lerobot-v2.1", str(tmp_path / "a.mcap"), "--output", str(tmp_path / "out"))
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
-    assert "pip install 'q2r2_control[export]'" in result.stderr
+    assert install_line("export") in result.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import socket
 import sys
@@ -16,6 +17,7 @@ from pymodbus.framer import FramerType
 
 from q2r2_control.config.fri import ModbusGripperConfig
 from q2r2_control.errors import ConfigError
+from q2r2_control.extras import install_line
 from q2r2_control.plants.modbus_gripper import ModbusGripper
 from tests.support.headset_server import eventually, warnings
 from tests.support.robotiq_gripper import SimulatedGripper
@@ -243,5 +245,5 @@ def test_on_a_serial_device_it_speaks_modbus_rtu() -> None:
 
 def test_without_its_package_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pymodbus.client", None)
-    with pytest.raises(ConfigError, match=r"fri\.left\.gripper\.modbus: .* pip install 'q2r2_control\[modbus\]'"):
+    with pytest.raises(ConfigError, match=rf"fri\.left\.gripper\.modbus: .* {re.escape(install_line('modbus'))}"):
         ModbusGripper("left", ModbusGripperConfig(modbus="192.168.1.11"))

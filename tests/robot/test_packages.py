@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.extras import install_line
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import load_description
 
@@ -96,5 +98,5 @@ def test_arguments_of_a_model_that_is_no_xacro_are_refused() -> None:
 
 def test_without_xacro_one_line_says_what_to_install(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "xacro", None)
-    with pytest.raises(ConfigError, match=r"pip install 'q2r2_control\[xacro\]', or expand it to .urdf"):
+    with pytest.raises(ConfigError, match=re.escape(f"{install_line('xacro')}, or expand it to .urdf")):
         load_description(MODEL, None, {"my_arm": str(package)})

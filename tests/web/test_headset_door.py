@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from cryptography.x509 import SubjectAlternativeName, load_pem_x509_certificate
 
 from q2r2_control.errors import ConfigError, InputError
+from q2r2_control.extras import install_line
 from q2r2_control.inputs.webxr.certificate import own_certificate
 from q2r2_control.inputs.webxr.exchange import Display
 from q2r2_control.inputs.webxr.webxr import WebXrInput
@@ -137,7 +139,7 @@ def test_a_package_that_is_missing_is_named_with_the_extra_that_has_it(
     source = WebXrInput()
     if shows:
         source.show_on(cast(Display, object()))
-    with pytest.raises(InputError, match=rf"--input webxr needs {package}: pip install 'q2r2_control\[web\]'"):
+    with pytest.raises(InputError, match=re.escape(f"--input webxr needs {package}: {install_line('web')}")):
         source.start()
 
 

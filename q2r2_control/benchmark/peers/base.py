@@ -10,6 +10,7 @@ from typing import Protocol
 import pinocchio as pin
 
 from q2r2_control.config.cell import Config
+from q2r2_control.extras import install_line
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
@@ -24,7 +25,7 @@ PEERS = {
     "embodik, 10 nearest": "embodik",
 }
 WITHOUT_ACCELERATION_LIMIT = ("mink",)
-INSTALL = "pip install 'q2r2_control[bench]'"
+INSTALL = install_line("bench")
 NEAREST_ROWS = 10  # separation rows of a peer that is given the nearest pairs only
 DETECTION_DISTANCE = 0.25  # pairs farther apart than this need no exact distance [m]
 

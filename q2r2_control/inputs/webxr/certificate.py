@@ -11,6 +11,7 @@ from ipaddress import ip_address
 from pathlib import Path
 
 from q2r2_control.errors import InputError
+from q2r2_control.extras import install_line
 from q2r2_control.inputs.addresses import NO_NETWORK
 
 _VALID = timedelta(days=365)
@@ -42,7 +43,7 @@ def own_certificate(folder: Path, addresses: Sequence[str], now: datetime) -> tu
     try:
         from cryptography import x509
     except ImportError as error:
-        raise InputError("https: it needs cryptography: pip install 'q2r2_control[web]'") from error
+        raise InputError(f"https: it needs cryptography: {install_line('web')}") from error
     file = folder / "certificate.pem"
     names = _names(addresses)
     try:

@@ -17,6 +17,7 @@ from q2r2_control.config.cell import Config, HeadsetConfig
 from q2r2_control.config.strict import Network
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError, InputError
+from q2r2_control.extras import install_line
 from q2r2_control.inputs.addresses import reachable_addresses
 from q2r2_control.inputs.connections import SILENCE_ALLOWED
 from q2r2_control.inputs.hand_stream import HandStream
@@ -124,7 +125,7 @@ class WebXrInput:
             raise InputError(f"webxr: already serving {self.url}")
         for package in ("websockets", *(("trimesh",) if self._display is not None else ())):
             if find_spec(package) is None:
-                raise InputError(f"--input webxr needs {package}: pip install 'q2r2_control[web]'")
+                raise InputError(f"--input webxr needs {package}: {install_line('web')}")
         host, port = self.address
         certificate, token, addresses = None, "", reachable_addresses(host)
         if not is_loopback(host):  # a browser trusts localhost without

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from q2r2_control.errors import Q2R2Error
+from q2r2_control.extras import install_line
 
 INTERFACES = Path(__file__).parents[1] / "interfaces"
 # Packages that the generators and ament import while CMake runs; the result is for rclpy.
@@ -115,7 +116,7 @@ def missing_tools(prefix: Path) -> list[str]:
         absent.append("rosidl_default_generators")
     if absent:
         names = ", ".join(absent)
-        missing.append(f"ROS 2 Jazzy with its build tools ({names}; pip install 'q2r2_control[ros]', or source a ROS)")
+        missing.append(f"ROS 2 Jazzy with its build tools ({names}; {install_line('ros')}, or source a ROS)")
     return missing
 
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.extras import install_line
 from q2r2_control.plugins import INPUTS, load_class
 from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_signals
 from q2r2_control.ros.launch.build import build_missing
@@ -166,7 +167,7 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
 def check_rclpy() -> None:
     """Raise :class:`UpError` where there is no ROS."""
     if importlib.util.find_spec("rclpy") is None:
-        cure = "pip install 'q2r2_control[ros]', in a clone pip install -e '.[ros]', or source a ROS 2 Jazzy"
+        cure = f"{install_line('ros')}, or source a ROS 2 Jazzy"
         raise UpError(f"rclpy cannot be imported: {cure}")
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from q2r2_control.events import ReasonKind
+from q2r2_control.extras import install_line
 from q2r2_control.ros.launch.build import interface_packages
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.watching.set_view import SILENT, NodeView, SetView
@@ -162,7 +163,7 @@ for name, proof in json.loads(sys.argv[1]).items():
         lacking.append(name)
 print(json.dumps({"middleware": get_rmw_implementation_identifier(), "lacking": lacking}))
 """
-_INSTALL = "pip install 'q2r2_control[ros]', or source a ROS 2 Jazzy"
+_INSTALL = f"{install_line('ros')}, or source a ROS 2 Jazzy"
 
 
 def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str], list[Finding]]:

@@ -13,6 +13,7 @@ from typing import Any, Self
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError, InputError
+from q2r2_control.extras import install_line
 from q2r2_control.inputs.addresses import reachable_addresses
 from q2r2_control.inputs.listener import is_loopback
 from q2r2_control.inputs.webxr.certificate import installation_folder, own_certificate
@@ -28,7 +29,7 @@ _PATIENCE, _LONGEST = 2.0, 10.0  # for it to end while it does nothing, and whil
 def check_viser() -> None:
     """Raises :class:`ConfigError` where it is not installed."""
     if find_spec("viser") is None:
-        raise ConfigError("--web needs viser: pip install 'q2r2_control[web]'")
+        raise ConfigError(f"--web needs viser: {install_line('web')}")
 
 
 class Page:

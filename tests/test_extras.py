@@ -1,0 +1,34 @@
+"""The line that installs an extra."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from q2r2_control import extras
+from q2r2_control.extras import install_line
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_in_a_checkout_the_line_names_its_folder_so_that_it_works_from_anywhere() -> None:
+    assert install_line("web") == f"pip install -e '{ROOT}[web]'"
+
+
+def test_elsewhere_the_line_names_the_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(extras, "_CHECKOUT", tmp_path)
+    assert install_line("web") == "pip install 'q2r2_control[web]'"
+
+
+def test_every_extra_that_a_message_names_is_one_of_the_package() -> None:
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    named = {
+        text.split(quote)[1]
+        for file in (ROOT / "q2r2_control").rglob("*.py")
+        for text in file.read_text(encoding="utf-8").split("install_line(")[1:]
+        if (quote := text[0]) in "'\""
+    }
+    assert len(named) > 5
+    assert named <= set(known)
