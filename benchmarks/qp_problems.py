@@ -3,7 +3,7 @@
 Writes the QPs of 2,000 ticks, of arms that move freely, press against each other, run into limits and recover, and
 prints qpbenchmark's success rates of the installed solvers. ``qpbenchmark --results-path build/qp_problems.csv
 benchmarks/qp_problems.py run`` then plays the same file, with reports and plots.
-Both need ``pip install 'q2r2_control[bench]'``.
+Both need ``pip install -e '.[bench]'``.
 
 A problem is solved if the largest primal residual, dual residual and duality gap are below the tolerance of the
 settings: 1 (default), 1e-3, 1e-6 and 1e-9. The problem is that of ``CartesianController.problem``, with a slack for
