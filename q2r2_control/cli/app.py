@@ -7,7 +7,9 @@ import logging
 import queue
 import sys
 from contextlib import suppress
+from itertools import groupby
 from logging.handlers import QueueHandler, QueueListener
+from operator import attrgetter
 from typing import Annotated, Any
 
 import typer
@@ -27,6 +29,12 @@ class ErrorHandlingGroup(TyperGroup):
         super().__init__(**attributes)
         for command in COMMANDS:
             self.add_command(CommandOnDemand(command))
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands into the help, each group under its heading."""
+        for group, commands in groupby(COMMANDS, key=attrgetter("group")):
+            with formatter.section(group):
+                formatter.write_dl([(command.name, command.about) for command in commands])
 
     def main(self, *args: Any, **extra: Any) -> Any:
         """Run the command line; leaves by :class:`SystemExit`."""

@@ -1,4 +1,4 @@
-"""The commands of ``q2r2``, in the order of its help. Each module is imported when one of its commands is called."""
+"""The commands of ``q2r2``, by group and in the order of its help. A module is imported when a command of it is called."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ class ListedCommand(NamedTuple):
     name: str
     at: str  # module in this package, and the name of the function or Typer in it
     about: str  # first sentence of the function's docstring
+    group: str = ""  # heading in the help
     example: str = ""  # of a call, for a command that has no commands of its own
 
 
@@ -25,104 +26,121 @@ COMMANDS = (
         "run:demo",
         "Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted "
         "hands.",
+        "Move arms",
         "q2r2 demo --viewer",
     ),
     ListedCommand(
         "run",
         "run:run",
         "Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.",
+        "Move arms",
         "q2r2 run config/dual_iiwa7.yaml --input headset --host 0.0.0.0",
     ),
     ListedCommand(
         "replay",
         "recordings:replay",
         "Give a recorded run's hand samples and measured states to the same loop again, tick by tick.",
+        "Move arms",
         "q2r2 replay recordings/20260101-120000-dual_iiwa7 --compare",
-    ),
-    ListedCommand(
-        "judge",
-        "recordings:judge",
-        "Say of each recorded episode whether to keep or to discard it, why, and by which numbers.",
-        "q2r2 judge recordings --json",
-    ),
-    ListedCommand(
-        "report",
-        "recordings:report",
-        "Write one HTML page of recorded episodes: verdicts, numbers and plots.",
-        "q2r2 report recordings --output report.html",
     ),
     ListedCommand(
         "new-cell",
         "new_cell:new_cell",
         "Write the YAML of a cell for models of your own: tips, grippers, mounts, a home, pairs of links, "
         "accelerations.",
+        "Describe your cell",
         "q2r2 new-cell my_cell --left arm.urdf --right arm.urdf",
     ),
     ListedCommand(
         "check",
         "check:check",
         "Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe.",
+        "Describe your cell",
         "q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf",
+    ),
+    ListedCommand(
+        "mounts",
+        "mounts:mounts",
+        "Find where the right arm's base is: guide both tips by hand to the same points, one after the other.",
+        "Describe your cell",
+        "q2r2 mounts my_cell.yaml --tip 0 0 0.1",
+    ),
+    ListedCommand(
+        "judge",
+        "recordings:judge",
+        "Say of each recorded episode whether to keep or to discard it, why, and by which numbers.",
+        "Data to learn from",
+        "q2r2 judge recordings --json",
+    ),
+    ListedCommand(
+        "report",
+        "recordings:report",
+        "Write one HTML page of recorded episodes: verdicts, numbers and plots.",
+        "Data to learn from",
+        "q2r2 report recordings --output report.html",
+    ),
+    ListedCommand(
+        "export",
+        "recordings:export",
+        "Make a dataset to train on of recordings of q2r2 run --record, an episode each.",
+        "Data to learn from",
+        "q2r2 export lerobot recordings --output datasets/circle --fps 30",
     ),
     ListedCommand(
         "doctor",
         "doctor:doctor",
         "Say what this computer lacks to run a cell, a line each with what cures it; exit 1 where it cannot run it.",
+        "Devices",
         "q2r2 doctor my_cell.yaml",
     ),
     ListedCommand(
-        "commission",
-        "commission:commission",
-        "Commission the arms behind real cabinets, step by step: what each has to show is asked for, or measured.",
-        "q2r2 commission my_cell.yaml --duration 60",
+        "headset-check",
+        "run:headset_check",
+        "Show what a headset sends: connection, rates, ages, last values, and which way each hand moves.",
+        "Devices",
+        "q2r2 headset-check --host 0.0.0.0",
+    ),
+    ListedCommand(
+        "fri-check",
+        "fri_check:fri_check",
+        "Listen to the cabinets of a cell and say what they send; exit 1 where an arm could not be commanded.",
+        "Devices",
+        "q2r2 fri-check config/dual_iiwa7_fri.yaml --duration 60",
     ),
     ListedCommand(
         "fri-cabinet",
         "fri:fri_cabinet",
         "Stand in for the Sunrise cabinets of a cell: q2r2 run CONFIG --plant fri, in another terminal, drives its "
         "arms.",
+        "Devices",
         "q2r2 fri-cabinet config/dual_iiwa7_fri.yaml --period 2",
     ),
     ListedCommand(
-        "fri-check",
-        "fri_check:fri_check",
-        "Listen to the cabinets of a cell and say what they send; exit 1 where an arm could not be commanded.",
-        "q2r2 fri-check config/dual_iiwa7_fri.yaml --duration 60",
+        "commission",
+        "commission:commission",
+        "Commission the arms behind real cabinets, step by step: what each has to show is asked for, or measured.",
+        "Devices",
+        "q2r2 commission my_cell.yaml --duration 60",
     ),
     ListedCommand(
-        "mounts",
-        "mounts:mounts",
-        "Find where the right arm's base is: guide both tips by hand to the same points, one after the other.",
-        "q2r2 mounts my_cell.yaml --tip 0 0 0.1",
-    ),
-    ListedCommand(
-        "headset-check",
-        "run:headset_check",
-        "Show what a headset sends: connection, rates, ages, last values, and which way each hand moves.",
-        "q2r2 headset-check --host 0.0.0.0",
+        "ros",
+        "ros:app",
+        "ROS 2 Jazzy, from apt or from the Python registry.",
+        "Devices",
     ),
     ListedCommand(
         "bench",
         "bench:bench",
         "Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.",
+        "Measure",
         "q2r2 bench --work --motion meet",
     ),
     ListedCommand(
         "soak",
         "bench:soak",
         "Check every promise of the controller in random hostile targets, ticks, starts and solver failures.",
+        "Measure",
         "q2r2 soak --ticks 100000 --contact",
-    ),
-    ListedCommand(
-        "export",
-        "recordings:export",
-        "Make a dataset to train on of recordings of q2r2 run --record, an episode each.",
-        "q2r2 export lerobot recordings --output datasets/circle --fps 30",
-    ),
-    ListedCommand(
-        "ros",
-        "ros:app",
-        "ROS 2 Jazzy, from apt or from the Python registry.",
     ),
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import shlex
 import subprocess
 import sys
@@ -52,3 +53,10 @@ def test_the_example_of_a_command_stands_in_its_help_and_is_understood(command: 
     program, name, *arguments = shlex.split(command.example)
     assert (program, name) == ("q2r2", command.name)
     loaded.make_context(name, arguments)  # raises for an option that there is not
+
+
+def test_the_help_has_every_command_once_under_the_heading_of_its_group() -> None:
+    printed = q2r2("--help").stdout
+    for command in COMMANDS:
+        (section,) = [part for part in printed.split("\n\n") if part.startswith(f"{command.group}:\n")]
+        assert len(re.findall(rf"^  {command.name}  ", section, re.MULTILINE)) == 1
