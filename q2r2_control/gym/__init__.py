@@ -24,13 +24,20 @@ for _task in TASKS:
 
 
 def make_env(
-    n_envs: int = 1, use_async_envs: bool = False, *, task: str = "stack", cfg: object = None, **options: Any
+    n_envs: int = 1,
+    use_async_envs: bool = False,
+    *,
+    task: str = "stack",
+    space: str = "action",
+    cfg: object = None,
+    **options: Any,
 ) -> AsyncVectorEnv | SyncVectorEnv:
     """``n_envs`` environments of a task, each in a process of its own where ``use_async_envs``.
 
-    ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`. ``cfg`` is what lerobot's EnvHub tells besides,
+    ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`, and so is ``space``, which is that of a dataset's
+    ``action`` by default: policies of lerobot answer with it. ``cfg`` is what lerobot's EnvHub tells besides,
     of which nothing is used.
     """
-    made = [partial(gymnasium.make, f"{__name__}:q2r2/{task.capitalize()}-v0", **options)] * n_envs
+    made = [partial(gymnasium.make, f"{__name__}:q2r2/{task.capitalize()}-v0", space=space, **options)] * n_envs
     # Spawned: a copy of this process would share its graphics with it.
     return AsyncVectorEnv(made, context="spawn") if use_async_envs else SyncVectorEnv(made)

@@ -40,8 +40,10 @@ class TaskEnv(gymnasium.Env):
 
     Observations and actions have the numbers of the datasets' features, in their order: ``action_names`` has those of
     the ``space``, openings of grippers behind. An action is followed for 1 / ``rate`` [s], and the observation after n
-    steps is frame n of a dataset at this rate. ``spread`` [m]: how far the task's parts lie from their places at most,
-    along x and y, as the seed has it. ``pictures``: with those of the cell's cameras, or of one in front of it.
+    steps is frame n of a dataset at this rate. An agent that has learned nothing moves the arms in the default space,
+    ``action.tool_delta``. In the others it would ask for jumps, which are refused. ``spread`` [m]: how far the task's
+    parts lie from their places at most, along x and y, as the seed has it. ``pictures``: with those of the cell's
+    cameras, or of one in front of it.
 
     No action breaks a limit or a distance. ``info["promises"]`` has what a step came to: ``nearest_distance`` [m] of
     any pair, ``nearest_pair``, ``margin`` [m] to the distance that a pair keeps, ``certified``, and in ``held_back``
@@ -56,7 +58,7 @@ class TaskEnv(gymnasium.Env):
         task: str,
         *,
         cell: Config | Path | str = CELL,
-        space: ActionSpace | str = ActionSpace.JOINTS,
+        space: ActionSpace | str = ActionSpace.TOOL_DELTA,
         rate: float = 30.0,
         spread: float = 0.01,
         pictures: bool = False,

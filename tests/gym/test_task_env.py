@@ -40,7 +40,7 @@ def make(task: str = "grasp", **options: Any) -> TaskEnv:
 
 @cache
 def shared() -> TaskEnv:
-    return make()
+    return make(space=ActionSpace.JOINTS)
 
 
 def test_every_task_is_registered_and_lasts_as_long_as_its_work_takes() -> None:
@@ -104,6 +104,19 @@ def test_a_seed_lays_the_parts_and_the_same_actions_then_do_the_same() -> None:
     np.testing.assert_array_equal(seen[0][0], seen[1][0])
     np.testing.assert_array_equal(seen[0][1], seen[1][1])
     assert 0.0 < np.abs(seen[0][0] - seen[2][0]).max() <= 0.02
+
+
+def test_an_agent_that_has_learned_nothing_moves_the_tools() -> None:
+    env = make()
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    tools, held = [], set()
+    for _ in range(10):
+        observed, _, _, _, info = env.step(env.action_space.sample())
+        tools.append(observed["observation.tool"])
+        held.add(info["promises"]["held_back"])
+    assert np.abs(tools[-1] - tools[0]).max() > 0.01
+    assert not any("jump" in said for said in held)
 
 
 def test_the_arms_follow_small_actions_and_say_why_they_refuse_large_ones() -> None:
