@@ -34,9 +34,9 @@ def make_env(
 ) -> AsyncVectorEnv | SyncVectorEnv:
     """``n_envs`` environments of a task, each in a process of its own where ``use_async_envs``.
 
-    ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`, and so is ``space``, which is that of a dataset's
-    ``action`` by default: policies of lerobot answer with it. ``cfg`` is what lerobot's EnvHub tells besides,
-    of which nothing is used.
+    ``space`` and ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`. By default actions are those of a
+    dataset's ``action``, as policies of lerobot answer. ``cfg`` is what lerobot's EnvHub tells besides, of which
+    nothing is used.
     """
     made = [partial(gymnasium.make, f"{__name__}:q2r2/{task.capitalize()}-v0", space=space, **options)] * n_envs
     # Spawned: a copy of this process would share its graphics with it.
