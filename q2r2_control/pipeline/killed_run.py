@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 from q2r2_control.config.cell import Config
@@ -21,6 +22,7 @@ from q2r2_control.types import Array
 
 _LOOKS = 0.005  # [s]
 _PATIENCE = 5.0  # for the ports to be released [s]
+_FREEING = 0.5  # for the system to free the memory of a program that is killed, before anybody sees its end [s]
 
 
 def main(requests: Iterator[Config], answer: Callable[[Any], None]) -> None:
@@ -58,7 +60,8 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
     took = time.monotonic() - killed
     # Arms that wait for each other may have begun to brake just before the end.
     last, rest = next(moment for moment in reversed(moments) if _goes_up(robot, moment)), posture()
-    return [stop_report(robot, arm, "program killed", last, last.q, rest, took) for arm in robot.arms]
+    reports = [stop_report(robot, arm, "program killed", last, last.q, rest, took) for arm in robot.arms]
+    return [replace(report, allowed_s=report.allowed_s + _FREEING) for report in reports]
 
 
 def _goes_up(robot: Robot, moment: Moment) -> bool:
