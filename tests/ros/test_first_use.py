@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 from unittest.mock import MagicMock
 
 import pytest
 
+from q2r2_control.extras import install_line
 from q2r2_control.ros.launch import build, processes
 from q2r2_control.ros.launch.build import BuildError, Interfaces, build_missing
 from q2r2_control.ros.launch.processes import UpError, run_together
@@ -28,7 +30,7 @@ def test_nodes_without_rclpy_are_refused_in_one_line_that_says_how_to_install_it
     monkeypatch: pytest.MonkeyPatch, built: MagicMock
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UpError, match=r"^rclpy cannot be imported: .*pip install -e '\.\[ros\]'.*$"):
+    with pytest.raises(UpError, match=rf"^rclpy cannot be imported: .*{re.escape(install_line('ros'))}"):
         run_together([MagicMock()], print)
     assert not built.called
 
