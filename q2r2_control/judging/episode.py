@@ -15,8 +15,9 @@ from q2r2_control.events import Event
 from q2r2_control.judging.pictures import Pictures, read_pictures
 from q2r2_control.recording.about import Conclusion
 from q2r2_control.recording.messages import NANOSECONDS, is_compressed
-from q2r2_control.recording.reader import Recording, TickChunk
+from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, check_tools, tool_poses
+from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, targets_or_tools, tick_type
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, Flags

@@ -24,8 +24,9 @@ from q2r2_control.events import Event
 from q2r2_control.recording import messages as names
 from q2r2_control.recording.about import ROS
 from q2r2_control.recording.messages import NANOSECONDS, STORE, Message, pose_of
-from q2r2_control.recording.reader import Recording, TickChunk
+from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, tool_poses
+from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array
@@ -51,9 +52,9 @@ class RosRecording(Recording):
             )
         ticks = RosTicks(self.about.epoch, robot)
         previous: TickChunk | None = None
-        for messages in self.messages():
+        for messages in self.messages(ticks.topics):
             with self._faults():
-                chunk = ticks.add_messages((self.declared_topics[one.channel].name, one) for one in messages)
+                chunk = ticks.add_messages((self.topic(one), one) for one in messages)
             if len(chunk.rows):
                 if previous is not None:
                     yield previous

@@ -24,10 +24,11 @@ from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording import messages as names
 from q2r2_control.recording.about import ROS, About, as_yaml
-from q2r2_control.recording.reader import TickChunk, read_spans
+from q2r2_control.recording.reader import read_spans
 from q2r2_control.recording.recorder import ROOM, MessageRecorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.ros_recording import open_recording
+from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.types import Array
 from tests.recording.runs import read_elsewhere
 from tests.support.external_cell import external
