@@ -31,6 +31,7 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array
 
+_CLOCK_SET = 0.5  # times of a reference and a tick are not so far apart unless the clock was set between them [s]
 _SAME = 1e-6  # times of one tick may differ by their rounding [s]
 
 
@@ -188,11 +189,11 @@ class RosTicks:
         """Those whose reference is there; what came with one whose reference was lost is the next one's."""
         while self._due and self._references:
             tick, (now, reference) = self._due[0], self._references[0]
-            if now < tick.now - _SAME:
+            if self._is_older(now, tick.now):
                 self._references.popleft()
                 continue
             self._due.popleft()
-            if now > tick.now + _SAME:
+            if abs(now - tick.now) > _SAME:
                 following = self._due[0] if self._due else None
                 samples = following.samples if following else self._samples
                 events = following.events if following else self._events
@@ -206,6 +207,15 @@ class RosTicks:
             self._last_index = index
             row["index"] = self._number
             yield tick
+
+    def _is_older(self, reference: float, tick: float) -> bool:
+        """True if the tick of the oldest reference, of time ``reference`` [s], is not there."""
+        if abs(reference - tick) < _CLOCK_SET:
+            return reference < tick - _SAME
+        # The clock was set between the two, forward or back: which of them is the later one, others tell.
+        return not any(abs(other.now - reference) <= _SAME for other in self._due) and any(
+            abs(other - tick) <= _SAME for other, _ in self._references
+        )
 
     def _chunk(self, ticks: Sequence[_Tick]) -> TickChunk:
         rows = np.concatenate([np.empty(0, dtype=self._type), *(tick.row for tick in ticks)])
