@@ -93,6 +93,7 @@ class RosTicks:
         self._fields, self._type = names.tick_fields(arms), tick_type(len(arms), len(robot.joint_names))
         self._types = {topic.name: topic.type for topic in names.ros_topics(arms, {})}
         self.joints = np.full((3, len(robot.joint_names)), np.nan)  # newest q, v and tau
+        self._known = np.zeros(len(robot.joint_names), dtype=bool)  # joints that were measured
         self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)
         self._targets: dict[int, tuple[int, Array]] = {}  # by the arm's place: when it came [ns], and the pose
         self._samples: list[Array] = []
@@ -136,10 +137,12 @@ class RosTicks:
 
     def _on_joints(self, message: Any, _: int) -> None:
         columns = {name: column for column, name in enumerate(message.name)}
-        for index, name in enumerate(self._joint_names):
-            if (column := columns.get(name)) is not None:
-                for row, values in enumerate((message.position, message.velocity, message.effort)):
-                    self.joints[row, index] = values[column] if len(values) else 0.0
+        ours = [index for index, name in enumerate(self._joint_names) if name in columns]
+        places = [columns[self._joint_names[index]] for index in ours]
+        self._known[ours] = True
+        for row, field in enumerate(("position", "velocity", "effort")):
+            numbers = np.asarray(getattr(message, field), dtype=np.float64)
+            self.joints[row, ours] = names.measured(field, numbers[places]) if len(numbers) else 0.0
 
     def _on_reference(self, message: Any, _: int) -> None:
         stamp, point = message.header.stamp, message.points[0]
@@ -164,7 +167,7 @@ class RosTicks:
         self._samples.append(sample)
 
     def _on_tick(self, message: Any, time: int) -> None:
-        if np.isnan(self.joints).any() or np.isnan(self._flags[:, 0]).any():
+        if not self._known.all() or np.isnan(self._flags[:, 0]).any():
             return  # nothing can be said of it yet
         values = dict(zip(self._fields, message.data.tolist(), strict=True))
         row = np.zeros(1, dtype=self._type)

@@ -189,6 +189,21 @@ def test_a_controller_that_was_started_again_begins_with_the_next_number_once_jo
     assert ticks.numbers.tolist() == list(range(20))
 
 
+def test_no_tick_is_dropped_for_numbers_that_the_robot_does_not_measure(nodes: NodesOnFile) -> None:
+    """A position that is no number is in its tick too, for the judge to find."""
+    play(nodes, 5)
+    nothing, q = np.full(len(nodes.joints), np.nan), np.array(nodes.robot.home)
+    for place, position in ((10, q), (11, nothing)):
+        message = names.joint_state(list(nodes.joints), position, nothing, nothing)
+        nodes.put(names.JOINT_STATES, place * PERIOD - 1, message)
+        nodes.tick(place * PERIOD, place - 4, q)
+    (ticks,) = ticks_in(nodes.close())
+    assert len(ticks.rows) == 7
+    assert not ticks.rows["tau"].any()
+    assert not ticks.rows["v"].any()
+    assert np.isnan(ticks.rows["q"]).all(axis=1).tolist() == [False] * 6 + [True]
+
+
 def test_episodes_are_those_that_arms_and_services_tell_of(nodes: NodesOnFile) -> None:
     for at, kind, arm in (
         *((20, K.EPISODE_BEGINS, "left"), (60, K.MARK, "right"), (80, K.EPISODE_ENDS, "right")),
