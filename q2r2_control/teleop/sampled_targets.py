@@ -61,14 +61,15 @@ class SampledTargets:
             now: When it came, by the clock of :meth:`at` [s].
 
         Returns:
-            False if the pose is not finite; the arm then goes on to its last one.
+            False if the pose is not finite or no rotation; the arm then goes on to its last one.
 
         Raises:
             RobotError: For an arm that does not exist, what is no pose, and a time that is not finite.
         """
         check_kind("pose", pose, pin.SE3, "a pinocchio.SE3", RobotError)
         name, now = self._controller.robot.arm(arm).name, _time(now)
-        if not np.isfinite(pose.homogeneous).all():
+        rotation = pose.rotation
+        if not np.isfinite(pose.translation).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
             return False
         if (line := self._lines.get(name)) is None:
             line = self._lines[name] = Interpolator(self.delay, self._period)

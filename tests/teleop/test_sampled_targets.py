@@ -67,9 +67,11 @@ def test_targets_begin_at_the_tool_and_rest_at_the_newest_sample_and_end_with_a_
     assert targets.at(6.0) == {}
 
 
-def test_a_sample_that_is_not_finite_is_not_used_and_other_faults_are_named(controller: CartesianController) -> None:
+def test_a_sample_that_is_no_pose_is_not_used_and_other_faults_are_named(controller: CartesianController) -> None:
     targets, start = SampledTargets(controller, 50.0), controller.tool_pose("left")
     assert not targets.set("left", pin.SE3(np.eye(3), np.array([math.nan, 0.0, 0.0])), 0.0)
+    assert not targets.set("left", pin.SE3(2.0 * np.eye(3), np.zeros(3)), 0.0)
+    assert not targets.set("left", pin.SE3(np.full((3, 3), math.nan), np.zeros(3)), 0.0)
     assert targets.at(0.0) == {}
     for action, message in (
         (lambda: targets.set("middle", start, 0.0), "middle"),
