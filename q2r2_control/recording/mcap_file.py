@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections import defaultdict
 from collections.abc import Collection, Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -29,7 +27,6 @@ _LARGEST = 1 << 30  # of a record [bytes]
 _BATCH = 1000  # messages that are given at once where no chunk has them together
 _HEADER = struct.Struct("<BQ")  # kind and length of a record, before its content
 _CHUNK_TIMES = struct.Struct("<QQ")  # of a chunk's first and last message [ns], where its content begins
-_CHANNEL = struct.Struct("<H")  # where the content of an index of messages begins
 
 
 class _Place(NamedTuple):
@@ -87,14 +84,11 @@ class McapFile:
     def messages(self, topics: Collection[str] | None = None, since: int = 0) -> Iterator[list[Message]]:
         """All messages, or those of some ``topics``, a chunk or some hundred at once.
 
-        They come in the order of the file. Where topics have chunks of their own, they come in the order of time.
-        Chunks that end before ``since`` [ns] are left out. Raises what the package ``mcap`` raises of a damaged file.
+        They come in the order of the file, which ``mcap sort`` makes that of time. Chunks that end before ``since`` [ns]
+        are left out. Raises what the package ``mcap`` raises of a damaged file.
         """
         with self._path.open("rb") as stream:
-            found = self._in_file_order(stream, topics, since)
-            if _split_by_topic(_places(stream)):
-                found = self._in_order_of_time(stream, topics, since)
-            yield from found
+            yield from self._in_file_order(stream, topics, since)
 
     def _in_file_order(self, stream: BinaryIO, topics: Collection[str] | None, since: int) -> Iterator[list[Message]]:
         loose: list[Message] = []  # those that no chunk has
@@ -130,25 +124,6 @@ class McapFile:
             else:
                 self._declare(one)
 
-    def _in_order_of_time(
-        self, stream: BinaryIO, topics: Collection[str] | None, since: int
-    ) -> Iterator[list[Message]]:
-        summary = self.summary()
-        if summary is None or not summary.chunk_indexes:  # the file was cut
-            all_of_them = [one for several in self._in_file_order(stream, topics, since) for one in several]
-            yield sorted(all_of_them, key=lambda message: message.time)
-            return
-        for record in (*summary.schemas.values(), *summary.channels.values()):
-            self._declare(record)
-        stream.seek(0)
-        reader, batch = SeekingReader(stream, validate_crcs=True, record_size_limit=_LARGEST), list[Message]()
-        for _, _, one in reader.iter_messages(topics, starting_at=since):
-            batch.append(Message(one.channel_id, one.sequence, one.log_time, one.publish_time, one.data))
-            if len(batch) == _BATCH:
-                yield batch
-                batch = []
-        yield batch
-
     def _declare_all(self, stream: BinaryIO, place: _Place) -> None:
         record = _record(stream, place)
         for one in breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]:
@@ -177,8 +152,7 @@ def _places(stream: BinaryIO) -> Iterator[_Place]:
         head = os.pread(file, room, place)
         kind, length = _HEADER.unpack_from(head)
         end = place + _HEADER.size + length
-        # Where the power was cut, there may be zeros in place of the last data; no record has the kind 0.
-        if (end > size or kind == 0) and not ended:
+        if end > size and not ended:
             return
         if end > size:
             raise EndOfFile
@@ -191,25 +165,3 @@ def _places(stream: BinaryIO) -> Iterator[_Place]:
 def _record(stream: BinaryIO, place: _Place) -> McapRecord:
     stream.seek(place.begin)
     return next(StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=_LARGEST).records)
-
-
-def _split_by_topic(places: Iterator[_Place]) -> bool:
-    """True if chunks overlap in time though those of each channel do not, so that order of time is order of sending.
-
-    It is not where a channel's own chunks go back too, since the clock was set back then.
-    """
-    chunks: list[tuple[int, int]] = []
-    of_channels: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
-    try:
-        for place in places:
-            if place.kind == Opcode.CHUNK:
-                chunks.append(place.times)
-            elif place.kind == Opcode.MESSAGE_INDEX and chunks:
-                of_channels[_CHANNEL.unpack_from(place.head)[0]].append(chunks[-1])
-    except EndOfFile:
-        pass  # told where the messages end
-    return _overlap(chunks) and bool(of_channels) and not any(map(_overlap, of_channels.values()))
-
-
-def _overlap(spans: list[tuple[int, int]]) -> bool:
-    return any(after[0] < before[1] for before, after in pairwise(spans))
