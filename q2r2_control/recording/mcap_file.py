@@ -84,8 +84,8 @@ class McapFile:
     def messages(self, topics: Collection[str] | None = None, since: int = 0) -> Iterator[list[Message]]:
         """All messages, or those of some ``topics``, a chunk or some hundred at once.
 
-        They come in the order of the file, which ``mcap sort`` makes that of time. Chunks that end before ``since`` [ns]
-        are left out. Raises what the package ``mcap`` raises of a damaged file.
+        They come in the order of the file, which ``mcap sort`` makes that of time. Chunks that end before ``since``
+        [ns] are left out. Raises what the package ``mcap`` raises of a damaged file.
         """
         with self._path.open("rb") as stream:
             yield from self._in_file_order(stream, topics, since)

@@ -97,7 +97,7 @@ class TickAssembly:
             raise ValueError("ticks are not in the order of their numbers")
         if (np.diff(chunk.times, prepend=self._last_time) < 0).any():
             raise ValueError("ticks are not in the order of time")
-        if border is not None and len(chunk.samples) < chunk.rows["samples"].sum():
+        if any(message.number <= self._last_number for message in taken[SAMPLES]):
             raise ValueError("samples come after the ticks that took them; mcap sort puts them in order")
         if len(rows):
             self._last_number, self._last_time = int(chunk.numbers[-1]), int(chunk.times[-1])
