@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # "as" says to type checkers that a name is public
     from q2r2_control.robot.robot import Robot as Robot
     from q2r2_control.summary.run_summary import RunSummary as RunSummary
     from q2r2_control.teleop.relative import RelativeMotion as RelativeMotion
+    from q2r2_control.teleop.sampled_targets import SampledTargets as SampledTargets
     from q2r2_control.types import Command as Command
     from q2r2_control.types import CommandMode as CommandMode
     from q2r2_control.types import DeviceControls as DeviceControls
@@ -80,6 +81,7 @@ _MODULES = {
     "RobotError": "errors",
     "RobotState": "types",
     "RunSummary": "summary.run_summary",
+    "SampledTargets": "teleop.sampled_targets",
     "Solver": "control.qp",
     "StepReport": "types",
     "Task": "control.tasks.external",

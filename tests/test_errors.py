@@ -25,6 +25,7 @@ from q2r2_control import (
     Q2R2Error,
     RelativeMotion,
     Robot,
+    SampledTargets,
     load_config,
 )
 from q2r2_control.config.cell import Config
@@ -285,6 +286,13 @@ CALLS: dict[str, Call] = {
     "CartesianController.set_holding": lambda own, x: own.controller.set_holding(x, True),
     "CartesianController.set_opening": lambda own, x: own.controller.set_opening("left", x, 1.0),
     "CartesianController.move_obstacle": lambda own, x: own.controller.move_obstacle(x, BALL),
+    "SampledTargets": lambda own, x: SampledTargets(x, 90.0),
+    "SampledTargets rate_hz": lambda own, x: SampledTargets(own.controller, x),
+    "SampledTargets.set": lambda own, x: SampledTargets(own.controller, 90.0).set(x, pin.SE3.Identity(), 0.0),
+    "SampledTargets.set pose": lambda own, x: SampledTargets(own.controller, 90.0).set("left", x, 0.0),
+    "SampledTargets.set now": lambda own, x: SampledTargets(own.controller, 90.0).set("left", pin.SE3.Identity(), x),
+    "SampledTargets.release": lambda own, x: SampledTargets(own.controller, 90.0).release(x),
+    "SampledTargets.at": lambda own, x: SampledTargets(own.controller, 90.0).at(x),
     **each("RelativeMotion", RELATIVE, lambda own, by, x: RelativeMotion(**{by: x})),
     "RelativeMotion.of": lambda own, x: RelativeMotion.of(x),
     **each("Pipeline", PARTS, lambda own, by, x: own.pipeline_of(**{by: x})),

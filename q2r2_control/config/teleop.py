@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.config.strict import STREAM_TIMEOUT, StrictModel
-from q2r2_control.types import Array, Interval
+from q2r2_control.types import SIDES, Array, Interval
 
 _Scale = Annotated[float, Field(ge=0, le=10)]
 PRECISION_SCALE = 0.25
@@ -39,6 +39,10 @@ class Stance(StrEnum):
     SIDE_BY_SIDE = "side_by_side"  # beside the robot, facing the same way: left moves left
     MIRROR = "mirror"  # facing the robot: hands swapped, the room's axes kept
     MIRROR_REFLECTED = "mirror_reflected"  # hands swapped and the motion reflected left to right
+
+    def hand_of(self, arm: str) -> str:
+        """The hand that leads an arm."""
+        return arm if self is Stance.SIDE_BY_SIDE else SIDES[1 - SIDES.index(arm)]
 
 
 class RotationFrame(StrEnum):

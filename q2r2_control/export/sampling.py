@@ -21,6 +21,7 @@ from PIL import Image, UnidentifiedImageError
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import RecordingError
 from q2r2_control.inputs.policy import ActionSpace, action_names
+from q2r2_control.recording.clock_steps import clock_step_text, clock_steps
 from q2r2_control.recording.messages import NANOSECONDS
 from q2r2_control.recording.reader import WHOLE, EpisodeSpan, Picture, Recording
 from q2r2_control.recording.recorded_ticks import check_tools, tool_poses
@@ -48,12 +49,12 @@ def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan
     ``intervention`` (n, arms) is 1 where a hand moves the arm in the place of a policy. ``time`` (n,) [s] is since t_0,
     ``stamp`` (n,) the time of day [ns]. ``trim``: from the first to the last tick at which an arm is engaged or the
     reference moves. Raises :class:`RecordingError` for a damaged file, one without a tick to
-    take, and one in which ticks were lost for longer than a frame.
+    take, one in which ticks were lost for longer than a frame, and a ``span`` in which a clock was set.
     """
     picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("stamp", *OBSERVED, *COMMANDED)}
     start, end, count = None, 0, 0
     known: Columns = {}
-    for columns in _ticks(recording, fps):
+    for columns in _ticks(recording, fps, span):
         # With the last tick of the chunk before, which may be the newest one of a frame in this chunk.
         known = {name: np.concatenate((known.get(name, values[:0])[-1:], values)) for name, values in columns.items()}
         passed = (columns["time"] - recording.about.epoch) / NANOSECONDS
@@ -91,9 +92,13 @@ def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArr
     return times[times <= last]
 
 
-def _ticks(recording: Recording, fps: int) -> Iterator[Columns]:
-    """Columns of the ticks, some half a second at a time; checks that none are missing for longer than a frame."""
+def _ticks(recording: Recording, fps: int, span: EpisodeSpan) -> Iterator[Columns]:
+    """Columns of the ticks, some at a time; checks that none are missing for longer than a frame.
+
+    Checks too that no clock was set within the ``span``.
+    """
     numbers = times = np.empty(0, dtype=np.int64)
+    dts = np.empty(0)
     for chunk in recording.chunks():
         if not len(chunk.rows):
             continue
@@ -106,6 +111,8 @@ def _ticks(recording: Recording, fps: int) -> Iterator[Columns]:
                 f"{recording.file}: {int(numbers[gap + 1] - numbers[gap]) - 1} ticks were lost after {when:.3f} s when "
                 f"it was recorded; allowed: none for longer than a frame, 1/{fps} s"
             )
+        dts = np.append(dts[-1:], chunk.rows["dt"])
+        _check_clock(recording, span, numbers, (times - recording.about.epoch) / NANOSECONDS, dts)
         rows, arms = chunk.rows, chunk.rows["arms"]
         yield {
             "time": chunk.times,
@@ -120,6 +127,18 @@ def _ticks(recording: Recording, fps: int) -> Iterator[Columns]:
             "reference_tool": arms["tool"],
             "intervention": arms["intervention"],
         }
+
+
+def _check_clock(recording: Recording, span: EpisodeSpan, numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> None:
+    """Raises :class:`RecordingError` where a clock was set in the ``span``, or back to a time in it."""
+    steps = clock_steps(numbers, t, dt)
+    for at in np.flatnonzero(steps):
+        first, last = sorted(t[at - 1 : at + 1])
+        if span.start < last and span.end > first:
+            raise RecordingError(
+                f"{recording.file}: {clock_step_text(steps[at])} after {t[at - 1]:.3f} s, so nobody knows the times of "
+                "its frames; allowed: episodes in which no clock is set"
+            )
 
 
 def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]:

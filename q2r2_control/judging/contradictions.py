@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.judging.figures import EpisodeFigures
 from q2r2_control.judging.thresholds import Rejection
+from q2r2_control.recording.clock_steps import clock_step_text
 
 _CONSTANT = 0.05  # of a gripper's stroke, less than which is no motion of it
 _CLOSES = 0.5  # of the stroke, a command over which every gripper follows by some of it
@@ -23,6 +24,8 @@ def contradictions(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator
     if figures.timing.repeated_stamps:
         count = figures.timing.repeated_stamps
         yield Rejection("repeated_stamps", f"{count} ticks have the time of the tick before")
+    if figures.timing.clock_step_s:
+        yield Rejection("clock_set", clock_step_text(figures.timing.clock_step_s))
     if figures.timing.begins_again:
         yield Rejection("begins_again", "the run goes on after its end: two runs are in one file")
     if figures.empty_topics:

@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.config.cell import Config
-from q2r2_control.config.teleop import Stance
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event
 from q2r2_control.judging.pictures import Pictures, read_pictures
 from q2r2_control.recording.about import Conclusion
 from q2r2_control.recording.messages import NANOSECONDS, is_compressed
-from q2r2_control.recording.reader import Recording, TickChunk
+from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, check_tools, tool_poses
+from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, targets_or_tools, tick_type
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, Flags
@@ -130,8 +130,7 @@ def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:
             check_tools(read.first_reference, frames.reference[0], robot)
         except RecordingError as error:
             raise RecordingError(f"{recording.file}: {error}") from error
-    swapped = config.teleop.stance is not Stance.SIDE_BY_SIDE
-    arms = {SIDES[1 - SIDES.index(arm)] if swapped else arm: arm for arm in recording.about.arms}
+    arms = {config.teleop.stance.hand_of(arm): arm for arm in recording.about.arms}
     hands = {hand: read.hand(hand, arm, ticks) for hand, arm in arms.items()}
     tools = tool_poses(frames.q, robot)
     looked_at, damage = _pictures(recording, config, damage) if pictures else ({}, damage)

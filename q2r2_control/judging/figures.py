@@ -13,6 +13,7 @@ from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.measured import MeasuredFigures, measured_figures
 from q2r2_control.judging.motion import ArmFigures, arm_figures, idle_share
 from q2r2_control.recording.about import LOOP
+from q2r2_control.recording.clock_steps import clock_steps
 from q2r2_control.recording.messages import hand_pose, loop_topics, target
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
 from q2r2_control.types import Array, Flags
@@ -106,6 +107,7 @@ class TimingFigures:
     compute_time_us_p99: float | None
     ended: bool  # the arms came to rest and the file was closed
     repeated_stamps: int | None  # ticks with a time that the one before had; None of nodes, whose receipts may coincide
+    clock_step_s: float  # the largest by which a clock was set meanwhile; negative: back; 0: none was
     begins_again: bool  # the run goes on after it has begun to end: there are two in one file
 
 
@@ -199,10 +201,11 @@ def timing_figures(episode: Episode) -> TimingFigures:
     """Figures of ticks; missed are those between which more time passed, by what each tick says, than a period."""
     ticks, count = episode.ticks, len(episode.ticks.t)
     if not count:
-        return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended, 0, False)
+        return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended, 0, 0.0, False)
     period = 1.0 / episode.config.nominal_rate_hz
     lost = np.diff(ticks.number, prepend=-1) - 1  # the first tick of a run is number 0
     gaps = np.diff(ticks.t, prepend=0.0) - ticks.dt
+    steps = clock_steps(ticks.number, ticks.t, ticks.dt)
     missed = int(np.maximum(np.round(ticks.dt / period) - 1, 0).sum())
     return TimingFigures(
         ticks=count,
@@ -216,6 +219,7 @@ def timing_figures(episode: Episode) -> TimingFigures:
         compute_time_us_p99=1e6 * float(np.percentile(ticks.compute_time, 99)),
         ended=episode.ended,
         repeated_stamps=_repeated_stamps(episode),
+        clock_step_s=float(steps[np.argmax(np.abs(steps))]),
         begins_again=bool((np.diff(ticks.following.astype(int)) > 0).any()),
     )
 

@@ -98,7 +98,9 @@ def parts_of(episode: Episode) -> list[Episode]:
 def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
     """An episode of a recording. Times are since it began, and its first tick is number 0."""
     ticks, frames = episode.ticks, episode.frames
-    first, end = np.searchsorted(ticks.t, span.start), np.searchsorted(ticks.t, span.end, side="right")
+    # Not a search in sorted times: where the clock was set back, times repeat.
+    inside = np.flatnonzero((span.start <= ticks.t) & (ticks.t <= span.end))
+    first, end = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
     cut = {name: values[first:end] for name, values in vars(ticks).items()}
     began = float(cut["t"][0] - cut["dt"][0]) if len(cut["t"]) else 0.0
     if len(cut["t"]):
@@ -106,9 +108,9 @@ def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
     shown = (first <= frames.at) & (frames.at < end)
     hands = {}
     for name, hand in episode.hands.items():
-        inside = (span.start <= hand.polled) & (hand.polled <= span.end)
-        received, polled = hand.received[inside] - began, hand.polled[inside] - began
-        hands[name] = Hand(hand.arm, received, polled, hand.position[inside])
+        meant = (span.start <= hand.polled) & (hand.polled <= span.end)
+        received, polled = hand.received[meant] - began, hand.polled[meant] - began
+        hands[name] = Hand(hand.arm, received, polled, hand.position[meant])
     pictures = {name: found.between(span.start, span.end, began) for name, found in episode.pictures.items()}
     told = span.end < math.inf
     return replace(

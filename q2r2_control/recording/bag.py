@@ -56,7 +56,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._stream = path.open("xb")
         self._whole = 0  # bytes that were flushed
         self._empty = True  # no message was flushed
-        # The writer would end a chunk between two messages of one tick, which replay needs in one.
+        # The writer would end a chunk between two messages of one tick, and a killed run would lose that tick.
         self._writer, self._unflushed = Writer(self._stream, chunk_size=sys.maxsize), 0
         try:
             self._channels = self._begin()

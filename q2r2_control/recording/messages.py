@@ -233,6 +233,18 @@ def joint_state(names: list[str], position: Array, velocity: Array, effort: Arra
     return make(JOINTS, header(), names, position, velocity, effort)
 
 
+def measured(field: str, numbers: Array) -> Array:
+    """A JointState's ``numbers`` of its ``field``, with zeros where NaN means that they are not measured.
+
+    ros2_control's broadcaster fills NaN in for what a robot's hardware does not tell. Of velocities, only those of all
+    joints may be missing: one of them is a fault.
+    """
+    missing = np.isnan(numbers)
+    if field == "effort" or (field == "velocity" and missing.all()):
+        return np.where(missing, 0.0, numbers)
+    return numbers
+
+
 def joint_trajectory(names: list[str], q: Array, v: Array, a: Array, stamp: int = 0) -> Any:
     """A trajectory_msgs/JointTrajectory of one point that is due at once."""
     at_once = make("builtin_interfaces/msg/Duration", 0, 0)

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 import struct
-from collections.abc import Container, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 from mcap.exceptions import EndOfFile, McapError
-from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Attachment, Metadata
 from mcap.summary import Summary
 from rosbags.serde import SerdeError
 from zstandard import ZstdError
@@ -26,49 +20,16 @@ from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event, ReasonKind
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, LOOP, ROBOT, About, Conclusion
-from q2r2_control.recording.file_end import size_of_whole_records
-from q2r2_control.recording.messages import (
-    PICTURE,
-    SAMPLES,
-    STATE,
-    TEXT,
-    TICK,
-    Message,
-    Topic,
-    data_of,
-    numbers_of,
-    picture_topic,
-)
-from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
+from q2r2_control.recording.mcap_file import McapFile
+from q2r2_control.recording.messages import PICTURE, Message, Topic, data_of, picture_topic
+from q2r2_control.recording.tick_chunks import TickAssembly, TickChunk
 from q2r2_control.teleop.both_arms import EpisodeMarks
-from q2r2_control.types import Array
 
-_LARGEST = 1 << 30  # of a record [bytes]
 # Errors that readers raise of a file that is damaged, or another program's.
 BROKEN = (
     *(McapError, ZstdError, SerdeError, ValueError, KeyError, IndexError),
     *(struct.error, TypeError, OverflowError, MemoryError, AssertionError),
 )
-
-
-@dataclass(frozen=True)
-class TickChunk:
-    """The n ticks of one chunk, which may be none."""
-
-    rows: Rows  # (n,) of tick_type
-    times: npt.NDArray[np.int64]  # (n,) of day [ns]
-    samples: Array  # (m, numbers of SAMPLE_FIELDS)
-    states: dict[int, str]  # JSON, by the number of the tick
-
-    @property
-    def numbers(self) -> npt.NDArray[np.int64]:
-        """(n,) of the ticks, from 0 on."""
-        return np.asarray(self.rows["index"].astype(np.int64))
-
-    def events(self) -> dict[int, list[Event]]:
-        """Events by the number of the tick. Raises ValueError, KeyError and TypeError for other data."""
-        found = {number: json.loads(text).get("events", ()) for number, text in self.states.items()}
-        return {number: [Event.from_json(event) for event in events] for number, events in found.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,32 +48,24 @@ class Recording:
         if len(files) != 1:
             raise RecordingError(f"{path}: has {len(files)} files .mcap; allowed: a folder with one, or a file")
         self.file = files[0]
+        self._mcap = McapFile(self.file)
         self.about = self._read_about()
         self.since = 0  # time of day [ns]; what is known to be before it is left out
 
     def chunks(self) -> Iterator[TickChunk]:
-        """All ticks, some half a second at a time; some may be missing in between, where they were lost."""
-        kind, labels = tick_type(len(self.about.arms), len(self.about.joints)), len(SAMPLE_FIELDS)
-        last_number, last_time = -1, 0
-        for messages in self.messages((TICK, SAMPLES, STATE)):
-            found: dict[str, list[Message]] = {TICK: [], SAMPLES: [], STATE: []}
-            for message in messages:
-                found[self.declared_topics[message.channel].name].append(message)
-            with self._faults():
-                rows = numbers_of([message.payload for message in found[TICK]], kind.itemsize // 8)
-                chunk = TickChunk(
-                    rows=rows.reshape(-1).view(kind),
-                    times=np.array([message.time for message in found[TICK]], dtype=np.int64),
-                    samples=numbers_of([message.payload for message in found[SAMPLES]], labels),
-                    states={message.number: str(data_of(message.payload, TEXT)) for message in found[STATE]},
-                )
-                if (np.diff(chunk.numbers, prepend=last_number) < 1).any():
-                    raise ValueError("ticks are not in the order of their numbers")
-                if (np.diff(chunk.times, prepend=last_time) < 0).any():
-                    raise ValueError("ticks are not in the order of time")
-            if len(rows):
-                last_number, last_time = int(chunk.numbers[-1]), int(chunk.times[-1])
-            yield chunk
+        """All ticks, some at once; some may be missing in between, where they were lost."""
+        ticks = TickAssembly(len(self.about.arms), len(self.about.joints))
+        try:
+            for messages in self.messages(ticks.topics):
+                ticks.add((self.topic(message), message) for message in messages)
+                with self._faults():
+                    yield from ticks.whole()
+        except RecordingError:
+            with suppress(*BROKEN):
+                yield from ticks.rest(ended=False)
+            raise
+        with self._faults():
+            yield from ticks.rest(self.closed)
 
     def pictures(self, camera: str) -> Iterator[Picture]:
         """All pictures of a camera, in the order of time."""
@@ -125,44 +78,34 @@ class Recording:
             for message in messages:
                 with self._faults():
                     picture = Picture(message.time, message.number, bytes(data_of(message.payload, PICTURE)))
-                yield names[self.declared_topics[message.channel].name], picture
+                yield names[self.topic(message)], picture
 
     def _topic_of(self, camera: str) -> str:
         return picture_topic(camera)
 
     @cached_property
     def declared_topics(self) -> dict[int, Topic]:
-        """All topics that are in the file, by channel; none before its first messages."""
-        types: dict[int, str] = {}
-        found: dict[int, Topic] = {}
+        """All topics that are in the file, by channel."""
         with self._faults():
-            chunk = next((record for record in self._records() if isinstance(record, Chunk)), None)
-            for record in breakup_chunk(chunk, validate_crc=True) if chunk is not None else ():
-                if isinstance(record, Schema):
-                    types[record.id] = record.name
-                elif isinstance(record, Channel):
-                    found[record.id] = Topic(record.id, record.topic, types[record.schema_id])
-        return found
+            return self._mcap.topics()
 
-    def messages(self, topics: Container[str] | None = None) -> Iterator[list[Message]]:
-        """All messages, or those of some ``topics``, chunk by chunk."""
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[list[Message]]:
+        """All messages, or those of some ``topics``, some at once."""
         with self._faults():
-            for record in self._records():
-                if isinstance(record, DataEnd):
-                    return
-                if isinstance(record, Chunk) and record.message_end_time >= self.since:
-                    declared = self.declared_topics.items()
-                    channels = {channel for channel, topic in declared if topics is None or topic.name in topics}
-                    records = breakup_chunk(record, validate_crc=True)
-                    found = (one for one in records if isinstance(one, McapMessage) and one.channel_id in channels)
-                    yield [Message(m.channel_id, m.sequence, m.log_time, m.publish_time, m.data) for m in found]
+            yield from self._mcap.messages(topics, self.since)
+
+    def topic(self, message: Message) -> str:
+        """The topic of a message that was read."""
+        return self._mcap.topic(message.channel)
 
     @contextmanager
     def _faults(self) -> Iterator[None]:
         try:
             yield
-        except EndOfFile:
-            return  # cut off in the middle of a record, by a machine that lost its power
+        except OSError as error:
+            raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
+        except EndOfFile as error:
+            raise RecordingError(f"{self.file}: damaged: a record is longer than what has it") from error
         except BROKEN as error:
             raise RecordingError(f"{self.file}: damaged: {reason_of(error):.200}") from error
 
@@ -183,40 +126,16 @@ class Recording:
     @property
     def conclusion(self) -> Conclusion:
         """Facts of the end of the run; none where the file has no index."""
-        if (summary := self._summary()) is not None:
-            for index in summary.metadata_indexes:
-                with self._faults():
-                    record = next(self._records(index.offset), None) if index.name == CONCLUSION else None
-                    if isinstance(record, Metadata):
+        if self.closed:
+            with self._faults():
+                for record in self._mcap.extras():
+                    if isinstance(record, Metadata) and record.name == CONCLUSION:
                         return Conclusion.from_texts(record.metadata)
         return Conclusion()
 
     def _summary(self) -> Summary | None:
         try:
-            with self.file.open("rb") as stream:
-                return SeekingReader(stream, record_size_limit=_LARGEST).get_summary()
-        except OSError as error:
-            raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
-        except (EndOfFile, StopIteration, *BROKEN):
-            return None
-
-    def _records(self, start: int = 0) -> Iterator[McapRecord]:
-        """All from the beginning, or from a record that starts at ``start``.
-
-        Records that are written meanwhile are left out: a reader that is slower than the writer would never end. The
-        last one of a file that ends within it is left out too.
-        """
-        try:
-            with self.file.open("rb") as stream:
-                if (size := size_of_whole_records(stream)) == 0:
-                    return
-                stream.seek(start)
-                # Not wrapped, so that a file that changes meanwhile is not read twice.
-                reader = StreamReader(stream, start > 0, emit_chunks=True, record_size_limit=_LARGEST)
-                for record in reader.records:
-                    yield record
-                    if stream.tell() >= size:
-                        return
+            return self._mcap.summary()
         except OSError as error:
             raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
 
@@ -224,15 +143,15 @@ class Recording:
         texts: dict[str, str] = {}
         attachments: dict[str, str] = {}
         try:
-            for record in self._records():
-                if isinstance(record, Metadata) and record.name == ABOUT:
-                    texts = record.metadata
-                elif isinstance(record, Attachment):
+            for record in self._mcap.extras():
+                if isinstance(record, Attachment):
                     attachments[record.name] = record.data.decode()
-                elif isinstance(record, Chunk):
+                elif record.name == ABOUT:
+                    texts = record.metadata
+                if texts and {CELL, ROBOT} <= attachments.keys():
                     break
-        except EndOfFile:
-            pass
+        except OSError as error:
+            raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
         except BROKEN as error:
             raise RecordingError(f"{self.file}: not an MCAP file, or damaged: {reason_of(error):.200}") from error
         if not texts:

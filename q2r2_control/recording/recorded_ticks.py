@@ -12,7 +12,8 @@ import numpy as np
 from q2r2_control.config.cell import Config, parse_config
 from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.events import Event
-from q2r2_control.recording.reader import Recording, TickChunk
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.recording.tick_rows import HAND_FAULTS, NOT_MEASURED, SAMPLE_FIELDS, PackedTick
 from q2r2_control.recording.writer import RecordedRobot
 from q2r2_control.robot.robot import Robot

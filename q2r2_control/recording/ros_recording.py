@@ -24,12 +24,14 @@ from q2r2_control.events import Event
 from q2r2_control.recording import messages as names
 from q2r2_control.recording.about import ROS
 from q2r2_control.recording.messages import NANOSECONDS, STORE, Message, pose_of
-from q2r2_control.recording.reader import Recording, TickChunk
+from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, tool_poses
+from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array
 
+_CLOCK_SET = 0.5  # times of a reference and a tick are not so far apart unless the clock was set between them [s]
 _SAME = 1e-6  # times of one tick may differ by their rounding [s]
 
 
@@ -51,9 +53,9 @@ class RosRecording(Recording):
             )
         ticks = RosTicks(self.about.epoch, robot)
         previous: TickChunk | None = None
-        for messages in self.messages():
+        for messages in self.messages(ticks.topics):
             with self._faults():
-                chunk = ticks.add_messages((self.declared_topics[one.channel].name, one) for one in messages)
+                chunk = ticks.add_messages((self.topic(one), one) for one in messages)
             if len(chunk.rows):
                 if previous is not None:
                     yield previous
@@ -91,6 +93,7 @@ class RosTicks:
         self._fields, self._type = names.tick_fields(arms), tick_type(len(arms), len(robot.joint_names))
         self._types = {topic.name: topic.type for topic in names.ros_topics(arms, {})}
         self.joints = np.full((3, len(robot.joint_names)), np.nan)  # newest q, v and tau
+        self._known = np.zeros(len(robot.joint_names), dtype=bool)  # joints that were measured
         self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)
         self._targets: dict[int, tuple[int, Array]] = {}  # by the arm's place: when it came [ns], and the pose
         self._samples: list[Array] = []
@@ -134,10 +137,12 @@ class RosTicks:
 
     def _on_joints(self, message: Any, _: int) -> None:
         columns = {name: column for column, name in enumerate(message.name)}
-        for index, name in enumerate(self._joint_names):
-            if (column := columns.get(name)) is not None:
-                for row, values in enumerate((message.position, message.velocity, message.effort)):
-                    self.joints[row, index] = values[column] if len(values) else 0.0
+        ours = [index for index, name in enumerate(self._joint_names) if name in columns]
+        places = [columns[self._joint_names[index]] for index in ours]
+        self._known[ours] = True
+        for row, field in enumerate(("position", "velocity", "effort")):
+            numbers = np.asarray(getattr(message, field), dtype=np.float64)
+            self.joints[row, ours] = names.measured(field, numbers[places]) if len(numbers) else 0.0
 
     def _on_reference(self, message: Any, _: int) -> None:
         stamp, point = message.header.stamp, message.points[0]
@@ -162,7 +167,7 @@ class RosTicks:
         self._samples.append(sample)
 
     def _on_tick(self, message: Any, time: int) -> None:
-        if np.isnan(self.joints).any() or np.isnan(self._flags[:, 0]).any():
+        if not self._known.all() or np.isnan(self._flags[:, 0]).any():
             return  # nothing can be said of it yet
         values = dict(zip(self._fields, message.data.tolist(), strict=True))
         row = np.zeros(1, dtype=self._type)
@@ -187,11 +192,11 @@ class RosTicks:
         """Those whose reference is there; what came with one whose reference was lost is the next one's."""
         while self._due and self._references:
             tick, (now, reference) = self._due[0], self._references[0]
-            if now < tick.now - _SAME:
+            if self._is_older(now, tick.now):
                 self._references.popleft()
                 continue
             self._due.popleft()
-            if now > tick.now + _SAME:
+            if abs(now - tick.now) > _SAME:
                 following = self._due[0] if self._due else None
                 samples = following.samples if following else self._samples
                 events = following.events if following else self._events
@@ -205,6 +210,15 @@ class RosTicks:
             self._last_index = index
             row["index"] = self._number
             yield tick
+
+    def _is_older(self, reference: float, tick: float) -> bool:
+        """True if the tick of the oldest reference, of time ``reference`` [s], is not there."""
+        if abs(reference - tick) < _CLOCK_SET:
+            return reference < tick - _SAME
+        # The clock was set between the two, forward or back: which of them is the later one, others tell.
+        return not any(abs(other.now - reference) <= _SAME for other in self._due) and any(
+            abs(other - tick) <= _SAME for other, _ in self._references
+        )
 
     def _chunk(self, ticks: Sequence[_Tick]) -> TickChunk:
         rows = np.concatenate([np.empty(0, dtype=self._type), *(tick.row for tick in ticks)])

@@ -16,7 +16,6 @@ from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
 from q2r2_control.teleop.carry import CarriedTools, RelationKeeper
 from q2r2_control.teleop.gestures import Press
 from q2r2_control.teleop.hand_motion import Anchor, ArmMeasurements
-from q2r2_control.types import SIDES
 
 _OUTCOMES = {Action.RECORD_FAILURE: ReasonKind.EPISODE_FAILED, Action.RECORD_SUCCESS: ReasonKind.EPISODE_SUCCEEDED}
 
@@ -112,8 +111,7 @@ class BothArms:
         self._bindings, self._leash = settings.bindings, settings.leash.carried()
 
     def assign_hands(self, stance: Stance) -> None:
-        hands = dict(zip(SIDES, SIDES if stance is Stance.SIDE_BY_SIDE else reversed(SIDES), strict=True))
-        self.arm_of_hand = {hands[name]: name for name in self.arms}
+        self.arm_of_hand = {stance.hand_of(name): name for name in self.arms}
 
     def any_in(self, *states: ArmState) -> bool:
         return any(arm.state in states for arm in self.arms.values())

@@ -31,15 +31,19 @@ class Interpolator:
     makes up for the motion that it missed within a part of the gap, and not at once.
     """
 
-    def __init__(self, delay: float) -> None:
-        self.delay = delay
+    def __init__(self, delay: float, period: float = _USUAL_PERIOD) -> None:
+        """``period``: of the samples, until it is known [s]."""
+        self.delay, self._usual_period = delay, period
         self._knots: deque[tuple[float, Vector, Quaternion]] = deque()
         self._velocity: tuple[Vector, Vector] | None = None  # from the first knot to the second; None: not known yet
 
     def reset(self, position: Vector, rotation: Quaternion, now: float) -> None:
         self._knots, self._velocity = deque([(now - self.delay, position, rotation)]), None
         self._stamp, self._caught_up = now, -math.inf  # of the last sample, and the end of the way after a gap [s]
-        self._even, self._period = -math.inf, _USUAL_PERIOD  # when the last sample was measured, but for a constant [s]
+        self._even, self._period = (
+            -math.inf,
+            self._usual_period,
+        )  # when the last sample was measured, but for a constant [s]
 
     def add(self, position: Vector, rotation: Quaternion, stamp: float, now: float) -> None:
         """Append a sample received at ``stamp`` <= ``now`` [s]; ``reset`` has to come first."""

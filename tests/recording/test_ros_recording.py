@@ -24,12 +24,13 @@ from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording import messages as names
 from q2r2_control.recording.about import ROS, About, as_yaml
-from q2r2_control.recording.reader import TickChunk, read_spans
+from q2r2_control.recording.reader import read_spans
 from q2r2_control.recording.recorder import ROOM, MessageRecorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.ros_recording import open_recording
+from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.types import Array
-from tests.recording.runs import read_elsewhere
+from tests.recording.runs import read_elsewhere, rewrite
 from tests.support.external_cell import external
 from tests.support.processes import cell
 
@@ -188,6 +189,21 @@ def test_a_controller_that_was_started_again_begins_with_the_next_number_once_jo
     assert ticks.numbers.tolist() == list(range(20))
 
 
+def test_no_tick_is_dropped_for_numbers_that_the_robot_does_not_measure(nodes: NodesOnFile) -> None:
+    """A position that is no number is in its tick too, for the judge to find."""
+    play(nodes, 5)
+    nothing, q = np.full(len(nodes.joints), np.nan), np.array(nodes.robot.home)
+    for place, position in ((10, q), (11, nothing)):
+        message = names.joint_state(list(nodes.joints), position, nothing, nothing)
+        nodes.put(names.JOINT_STATES, place * PERIOD - 1, message)
+        nodes.tick(place * PERIOD, place - 4, q)
+    (ticks,) = ticks_in(nodes.close())
+    assert len(ticks.rows) == 7
+    assert not ticks.rows["tau"].any()
+    assert not ticks.rows["v"].any()
+    assert np.isnan(ticks.rows["q"]).all(axis=1).tolist() == [False] * 6 + [True]
+
+
 def test_episodes_are_those_that_arms_and_services_tell_of(nodes: NodesOnFile) -> None:
     for at, kind, arm in (
         *((20, K.EPISODE_BEGINS, "left"), (60, K.MARK, "right"), (80, K.EPISODE_ENDS, "right")),
@@ -240,6 +256,45 @@ def test_a_known_step_is_in_action_and_observation_at_the_frames_of_its_times(no
     closed = [int(np.argmax(vector[:, -1] < 0.5)) for vector in (action, state)]
     assert closed == [59, 69]
     assert episode.task == "to count"
+
+
+@pytest.mark.parametrize("step", [5 * SECOND, -SECOND // 4], ids=["forward", "back"])
+def test_an_episode_in_which_the_clock_was_set_is_discarded_and_not_exported_and_others_are(
+    nodes: NodesOnFile, tmp_path: Path, step: int
+) -> None:
+    nodes.event(1, K.EPISODE_BEGINS)
+    play(nodes, 200, engaged=range(5, 205))
+    nodes.event(205 * PERIOD, K.EPISODE_ENDS)
+    nodes.event(206 * PERIOD, K.EPISODE_BEGINS)
+    play(nodes, 100, first=207, index=201, engaged=range(207, 300))
+    border = nodes.epoch + 104 * PERIOD
+
+    def set_clock(_: str, message: names.Message) -> names.Message:
+        return message._replace(time=message.time + step * (message.time > border))
+
+    recording = open_recording(rewrite(nodes.close(), tmp_path / "stepped.mcap", set_clock))
+    assert sum(len(chunk.rows) for chunk in recording.chunks()) == 300
+    spoiled, clean = judge(recording)
+    set_by = f"a clock was set {'forward' if step > 0 else 'back'}"
+    assert any(set_by in reason.text for reason in spoiled.verdict.reasons)
+    assert not any("clock" in reason.text for reason in clean.verdict.reasons)
+    first, second = read_spans(recording)
+    with pytest.raises(RecordingError, match=set_by):
+        make_episode(recording.file, FrameSampling(fps=50), first)
+    assert make_episode(recording.file, FrameSampling(fps=50), second).frames == 20
+
+
+def test_ticks_keep_their_references_when_the_clock_is_set_and_one_of_a_pair_is_lost(nodes: NodesOnFile) -> None:
+    put = nodes.put
+    for step, lost in ((5, names.REFERENCE), (-5, names.CONTROLLER_TICK), (5, names.CONTROLLER_TICK)):
+        play(nodes, 20)
+        nodes.put = lambda topic, *message, lost=lost: None if topic == lost else put(topic, *message)  # type: ignore[method-assign]
+        play(nodes, 1, first=25, index=21)
+        nodes.put = put  # type: ignore[method-assign]
+        nodes.epoch += step * SECOND
+        play(nodes, 20, first=26, index=22)
+    chunks = ticks_in(nodes.close())
+    assert sum(len(chunk.rows) for chunk in chunks) == 3 * (20 + 20)
 
 
 def test_messages_without_room_are_lost_and_counted(tmp_path: Path) -> None:

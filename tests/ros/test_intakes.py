@@ -146,10 +146,35 @@ def test_joint_states_of_an_arm_each_are_merged_and_need_all_joints(context: Any
     assert isinstance(state, RobotState)
     np.testing.assert_allclose(state.q, q)
     part("right", without="right_A3")
-    assert taken[-1] == Reason.of(ReasonKind.BAD_JOINT_STATES, text="/right/joint_states: no joint right_A3")
     for _ in range(2):
         part("left")
-    assert taken[-2].stamp == taken[-1].stamp > state.stamp  # as old as the oldest of its parts, which is the right's
+    assert taken[-2].stamp == taken[-1].stamp > state.stamp  # as old as the joint that was measured longest ago
+    node.destroy_node()
+
+
+def test_publishers_on_one_topic_are_merged_by_joint_and_a_joint_that_none_sends_is_named(
+    context: Any, robot: Robot
+) -> None:
+    node = BaseNode("intake", context=context)
+    intake = JointIntake(node, robot)
+    taken: list[Any] = []
+    intake.subscribe(lambda state, now: taken.append(state), lambda message: None)
+    names, q = list(robot.joint_names), robot.home + 0.01 * np.arange(len(robot.home))
+
+    def send(first: int, end: int) -> None:
+        message = JointState(name=["finger", *names[first:end]], position=[math.nan, *q[first:end]])
+        Arrivals(node, "/joint_states").arrive(message)
+
+    send(0, 5)
+    assert taken == [Reason.of(ReasonKind.BAD_JOINT_STATES, text=f"no joint {names[5]} and 8 more")]
+    send(5, 14)
+    np.testing.assert_allclose(taken[-1].q, q)
+    q += 0.1
+    send(5, 14)
+    np.testing.assert_allclose(taken[-1].q, [*(q[:5] - 0.1), *q[5:]])
+    assert taken[-1].stamp == taken[-2].stamp  # of the first publisher, which may have ceased
+    send(0, 5)
+    assert taken[-1].stamp > taken[-2].stamp
     node.destroy_node()
 
 
@@ -338,6 +363,13 @@ def test_joints_are_matched_by_name_others_may_be_not_finite_and_torques_missing
     assert state.stamp == 7.0
 
 
+def test_numbers_that_are_not_measured_are_zero_as_missing_ones() -> None:
+    unmeasured = [math.nan] * 4
+    state = robot_state(joint_state(velocity=unmeasured, effort=[1.0, math.nan, math.nan, 2.0]), NAMES, 7.0)
+    assert isinstance(state, RobotState)
+    assert (state.v.tolist(), state.tau.tolist()) == ([0.0] * 3, [0.0, 2.0, 1.0])
+
+
 @pytest.mark.parametrize(
     ("changes", "fault"),
     [
@@ -345,6 +377,8 @@ def test_joints_are_matched_by_name_others_may_be_not_finite_and_torques_missing
         ({"name": ["c", "finger", "other", "b"]}, "no joint a"),
         ({"position": [3.0, 9.0, math.nan, 2.0]}, "position of a is not finite"),
         ({"velocity": [math.inf, 0.9, 0.1, 0.2]}, "velocity of c is not finite"),
+        ({"velocity": [math.nan, 0.9, 0.1, 0.2]}, "velocity of c is not finite"),
+        ({"effort": [0.1, 0.9, math.inf, 0.2]}, "effort of a is not finite"),
         ({"position": [3.0, 9.0, 1.0]}, "3 position values for 4 joints"),
         ({"position": []}, "0 position values for 4 joints"),
     ],

@@ -180,6 +180,18 @@ def test_arms_have_a_process_each_where_that_is_asked_for_and_a_cell_with_one_ar
     assert names(nodes_of(str(file), "none")) == ["mujoco_robot", "cartesian_controller", "left_arm_controller"]
 
 
+@pytest.mark.parametrize(("stance", "hand"), [("side_by_side", "right"), ("mirror", "left")])
+def test_a_scripted_input_has_only_the_hand_that_leads_the_one_arm_of_a_cell(
+    tmp_path: Path, stance: str, hand: str
+) -> None:
+    cell = yaml.safe_load((ROOT / "config" / "iiwa7.yaml").read_text())
+    assert list(cell["arms"]) == ["right"]
+    cell.setdefault("teleop", {})["stance"] = stance
+    (file := tmp_path / "one.yaml").write_text(yaml.safe_dump(cell))
+    assert nodes_of(str(file), "scripted")[-1].parameters["side"] == hand
+    assert "side" not in nodes_of(CONFIG, "scripted")[-1].parameters
+
+
 def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
     scripts: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     for source in ("scripted", "headset", NO_INPUT):

@@ -43,6 +43,7 @@ _LATEST = 0.02  # that a target is received, later than others after the time of
 _OLD = 0.5  # a target that is older than the one before it, by so much, was made before its sender stood still [s]
 _LONGEST_PERIOD, _PERIOD_SHARE = 0.02, 0.05  # of joint states that may tell arms apart in time [s], and of its mean
 COMMAND_TIME = 0.01  # that a command takes to its driver and arm, where drivers do not tell [s]
+_PARTS = 64  # kinds of messages that are remembered
 _LAG_NOISE = 0.01  # of a lag that is found in joint states [s]
 _WARNING_TIME = 1.0  # refused targets are reported for this long [s]
 # Takes an arm's target in the world frame, or None if it is no pose, the time [s], the message's number, and when the
@@ -174,7 +175,9 @@ class JointIntake:
             self._topics.setdefault(topic, []).append(arm)
         self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
         self._others = {topic: tuple(set(robot.arms).difference(its)) for topic, its in self._topics.items()}
-        self._stamps = dict.fromkeys(self._topics, -math.inf)
+        self._stamps = np.full(len(robot.joint_names), -math.inf)  # when each joint was measured, (nv,) [s]
+        # By a topic and the names in its message: those of our joints among them, and their indices.
+        self._parts: dict[tuple[str, tuple[str, ...]], tuple[list[str], list[int]]] = {}
         self._periods = dict.fromkeys(self._topics, _LONGEST_PERIOD)  # between messages, as a rule [s]
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
         what = 'external torques of all joints, for admittance and vibrations: effort of a JointState; "": none'
@@ -203,15 +206,19 @@ class JointIntake:
 
     def source(self) -> str:
         """The publishers of the oldest joint states, for the middle of a sentence."""
-        topic = min(self._stamps, key=lambda name: self._stamps[name])
+        topic = min(self._topics, key=self._stamp)
         where = f" on {topic}" if len(self._topics) > 1 else ""
         return self._publishers.source(topic) + where
+
+    def _stamp(self, topic: str) -> float:
+        """When the joint of a topic was measured that was longest ago [s]."""
+        return float(self._stamps[self._joints[topic]].min())
 
     def timings(self, now: float) -> dict[str, ArmTiming]:
         """When arms with topics of their own are measured, at ``now`` [s]; empty: one driver moves all, or none yet."""
         if len(self._topics) < 2 or self.state is None:
             return {}
-        silent = {topic: now - stamp for topic, stamp in self._stamps.items()}
+        silent = {topic: now - self._stamp(topic) for topic in self._topics}
         return {
             arm: ArmTiming(None, silent[topic], self._periods[topic], _LAG_NOISE)
             for topic, arms in self._topics.items()
@@ -227,25 +234,30 @@ class JointIntake:
             self._node.drop(topic, f"{len(bytes(data))} bytes")
             return
         look(message)
-        names = self._names[topic]
-        if not set(names).isdisjoint(message.name):
+        names, joints = self._part(topic, tuple(message.name))
+        if names:
             if topic not in self._own_names:
                 self._own_names.add(topic)
-                for name in names:
+                for name in self._names[topic]:
                     self.theirs.pop(name, None)
-        elif not (names := self._named_otherwise(topic, message.name)):
+        elif names := self._named_otherwise(topic, message.name):
+            joints = list(self._joints[topic])
+        else:
             return  # of a gripper or another robot
         now = self._node.now
         part = robot_state(message, names, now)
         if isinstance(part, str):
-            text = part if len(self._topics) == 1 else f"{topic}: {part}"
-            take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=text), now)
+            take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=self._on_topic(topic, part)), now)
             return
-        passed = min(now - self._stamps[topic], _LONGEST_PERIOD)
+        passed = min(now - float(self._stamps[joints].min()), _LONGEST_PERIOD)
         self._periods[topic] += _PERIOD_SHARE * (passed - self._periods[topic])
-        self._stamps[topic] = now
-        oldest = min(self._stamps.values())
-        self._values[:, self._joints[topic]] = part.q, part.v, part.tau
+        self._stamps[joints] = now
+        self._values[:, joints] = part.q, part.v, part.tau
+        if missing := [name for name in self._names[topic] if self._stamps[self._joint_names.index(name)] == -math.inf]:
+            text = f"no joint {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
+            take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=self._on_topic(topic, text)), now)
+            return
+        oldest = float(self._stamps.min())
         q, v, tau = self._values.copy()
         if oldest == -math.inf:
             return
@@ -256,6 +268,19 @@ class JointIntake:
             take(Reason.of(ReasonKind.NO_EXTERNAL_TORQUES, topic=self._external_topic), now)
         else:
             take(self.driver_fault() or self.state, now)
+
+    def _on_topic(self, topic: str, text: str) -> str:
+        return text if len(self._topics) == 1 else f"{topic}: {text}"
+
+    def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], list[int]]:
+        """The joints of a topic that a message names, for each arm may have a publisher of its own on it."""
+        if (part := self._parts.get((topic, given))) is None:
+            if len(self._parts) >= _PARTS:  # somebody sends other names each time
+                self._parts.clear()
+            pairs = zip(self._names[topic], self._joints[topic], strict=True)
+            found = [(name, int(joint)) for name, joint in pairs if name in given]
+            part = self._parts[topic, given] = [name for name, _ in found], [joint for _, joint in found]
+        return part
 
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
         """The sender's names of an arm's joints, where they can be known; told once."""

@@ -17,6 +17,7 @@ from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
 from q2r2_control.inputs.messages import HandPose, HandTwist
+from q2r2_control.recording.messages import measured
 from q2r2_control.ros.bridge.wire import JointNumbers, Template, read_pose
 from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, RobotState
 
@@ -157,7 +158,8 @@ def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t:
 def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: float) -> RobotState | str:
     """State in the order of ``names``, received at ``t`` [s]; or what is wrong with the message, in one line.
 
-    Other joints in the message are ignored. Velocities and torques may be missing as a whole and are then zero.
+    Other joints in the message are ignored. Velocities and torques may be missing as a whole and are then zero. So
+    are those that are not measured, see :func:`measured`.
     """
     order = order_of(tuple(message.name), tuple(names))
     if isinstance(order, str):
@@ -170,7 +172,7 @@ def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: flo
             continue
         if len(numbers) != len(message.name):
             return f"{len(numbers)} {field} values for {len(message.name)} joints"
-        numbers = numbers[order]
+        numbers = measured(field, numbers[order])
         if not math.isfinite(sum(numbers.tolist())) and not np.isfinite(numbers).all():
             return f"{field} of {names[int(np.argmin(np.isfinite(numbers)))]} is not finite"
         values.append(numbers)

@@ -86,7 +86,10 @@ def nodes_of(
     nodes += [NodeProcess(name, config) for name in (["arm_controllers"] if together else arms)]
     if source != NO_INPUT:
         executable = getattr(load_class(INPUTS, source), "executable", "hand_input")
-        nodes.append(NodeProcess(executable, config | {"input": source}))
+        # Nobody listens to the other hand of a cell with one arm.
+        hands = [cell.teleop.stance.hand_of(str(arm)) for arm in cell.arms]
+        side: dict[str, str | float] = {"side": hands[0]} if len(hands) == 1 else {}
+        nodes.append(NodeProcess(executable, config | {"input": source} | side))
     if page is not None:
         host, port = page
         address: dict[str, str | float] = {"web_host": host, "web_port": port, "recorded": recording is not None}

@@ -1,0 +1,100 @@
+"""Targets of a tracker, a camera or a policy, which come less often than the controller's steps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.errors import RobotError, check_kind, shown
+from q2r2_control.quaternions import floats_of, se3_of
+from q2r2_control.teleop.filters import Interpolator
+from q2r2_control.types import is_number
+
+_DELAY_PERIODS = 1.25  # so that a sample which comes late by a quarter of a period is in time
+_SLOWEST, _FASTEST = 1.0, 500.0  # [Hz]
+
+
+class SampledTargets:
+    """Tool targets at every step, straight from each sample to the next.
+
+    A target that is held until its next sample stands still in most steps and jumps in one of them. The controller
+    follows such a target with a joint at its limit of acceleration in two of three steps, at 90 samples a second. Here
+    each sample is reached :attr:`delay` after it was set, and the steps in between get what is in between::
+
+        targets = SampledTargets(controller, rate_hz=90)
+        while True:
+            for arm, pose in tracker.poll().items():
+                targets.set(arm, pose, now)
+            reference = controller.step(targets.at(now), dt)
+
+    Nothing is extrapolated: where no sample comes any more, the tool comes to rest at the newest.
+    """
+
+    def __init__(self, controller: CartesianController, rate_hz: float) -> None:
+        """Targets for a controller.
+
+        Args:
+            controller: Whose tools the targets begin at.
+            rate_hz: Of the samples as a rule, 1 to 500 [Hz].
+
+        Raises:
+            RobotError: For another rate, and for what is no controller.
+        """
+        check_kind("controller", controller, CartesianController, "a CartesianController", RobotError)
+        if not is_number(rate_hz) or not _SLOWEST <= rate_hz <= _FASTEST:
+            raise RobotError(f"rate_hz = {shown(rate_hz)}: allowed: {_SLOWEST:g} .. {_FASTEST:g}")
+        self.delay = _DELAY_PERIODS / rate_hz  # from a sample to its target [s]
+        self._controller, self._period = controller, 1.0 / rate_hz
+        self._lines: dict[str, Interpolator] = {}
+
+    def set(self, arm: str, pose: pin.SE3, now: float) -> bool:
+        """Take a sample.
+
+        The first one of an arm, also after :meth:`release`, begins a line at its tool.
+
+        Args:
+            arm: Whose tool it is for.
+            pose: Of the tool in the world.
+            now: When it came, by the clock of :meth:`at` [s].
+
+        Returns:
+            False if the pose is not finite or no rotation; the arm then goes on to its last one.
+
+        Raises:
+            RobotError: For an arm that does not exist, what is no pose, and a time that is not finite.
+        """
+        check_kind("pose", pose, pin.SE3, "a pinocchio.SE3", RobotError)
+        name, now = self._controller.robot.arm(arm).name, _time(now)
+        rotation = pose.rotation
+        if not np.isfinite(pose.translation).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+            return False
+        if (line := self._lines.get(name)) is None:
+            line = self._lines[name] = Interpolator(self.delay, self._period)
+            line.reset(*floats_of(self._controller.tool_pose(name)), now)
+        line.add(*floats_of(pose), now, now)
+        return True
+
+    def release(self, arm: str) -> None:
+        """Let an arm hold. Raises :class:`RobotError` for an arm that does not exist."""
+        self._lines.pop(self._controller.robot.arm(arm).name, None)
+
+    def at(self, now: float) -> dict[str, pin.SE3]:
+        """Targets of the arms that have samples, for :meth:`CartesianController.step`.
+
+        Args:
+            now: Time of the step, which does not go back [s].
+
+        Raises:
+            RobotError: For a time that is not finite.
+        """
+        now = _time(now)
+        return {arm: se3_of(line.at(now)[:2]) for arm, line in self._lines.items()}
+
+
+def _time(now: float) -> float:
+    if not is_number(now) or not math.isfinite(now):
+        raise RobotError(f"now = {shown(now)}: allowed: a finite time [s]")
+    return float(now)
