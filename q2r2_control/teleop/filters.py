@@ -40,10 +40,8 @@ class Interpolator:
     def reset(self, position: Vector, rotation: Quaternion, now: float) -> None:
         self._knots, self._velocity = deque([(now - self.delay, position, rotation)]), None
         self._stamp, self._caught_up = now, -math.inf  # of the last sample, and the end of the way after a gap [s]
-        self._even, self._period = (
-            -math.inf,
-            self._usual_period,
-        )  # when the last sample was measured, but for a constant [s]
+        self._even = -math.inf  # when the last sample was measured, but for a constant [s]
+        self._period = self._usual_period
 
     def add(self, position: Vector, rotation: Quaternion, stamp: float, now: float) -> None:
         """Append a sample received at ``stamp`` <= ``now`` [s]; ``reset`` has to come first."""
