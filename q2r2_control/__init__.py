@@ -32,12 +32,12 @@ if TYPE_CHECKING:  # "as" says to type checkers that a name is public
     from q2r2_control.errors import RobotError as RobotError
     from q2r2_control.inputs.base import Input as Input
     from q2r2_control.inputs.policy import PolicyInput as PolicyInput
+    from q2r2_control.loop.sampled_targets import SampledTargets as SampledTargets
     from q2r2_control.pipeline.pipeline import Pipeline as Pipeline
     from q2r2_control.plants.base import Plant as Plant
     from q2r2_control.robot.robot import Robot as Robot
     from q2r2_control.summary.run_summary import RunSummary as RunSummary
     from q2r2_control.teleop.relative import RelativeMotion as RelativeMotion
-    from q2r2_control.teleop.sampled_targets import SampledTargets as SampledTargets
     from q2r2_control.types import Command as Command
     from q2r2_control.types import CommandMode as CommandMode
     from q2r2_control.types import DeviceControls as DeviceControls
@@ -81,7 +81,7 @@ _MODULES = {
     "RobotError": "errors",
     "RobotState": "types",
     "RunSummary": "summary.run_summary",
-    "SampledTargets": "teleop.sampled_targets",
+    "SampledTargets": "loop.sampled_targets",
     "Solver": "control.qp",
     "StepReport": "types",
     "Task": "control.tasks.external",

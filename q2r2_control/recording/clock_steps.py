@@ -32,7 +32,7 @@ def clock_steps(numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> Array:
 
 
 def clock_step_text(step: float) -> str:
-    """What a ``step`` [s] of :func:`clock_steps` means."""
+    """Words on a ``step`` [s] of :func:`clock_steps`."""
     if step < 0.0:
         return f"a clock was set back by {-step:.3f} s"
     return f"a clock was set forward, or the controller stood still, by {step:.3f} s"

@@ -79,7 +79,7 @@ class TickAssembly:
         yield chunk
 
     def _taken(self, border: int | None) -> TickChunk:
-        """What is held of ticks below the ``border``, which goes on to be held; None: of all."""
+        """Take all that is held of ticks below the ``border``, and keep the rest. A border of None takes all."""
         taken: dict[str, list[Message]] = {}
         for topic, messages in self._found.items():
             end = len(messages)
