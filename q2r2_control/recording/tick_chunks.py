@@ -40,7 +40,7 @@ class TickChunk:
 class TickAssembly:
     """Gives ticks of which all messages are there.
 
-    Messages have the numbers of their ticks and come in the order of time. So a tick is whole when the next one comes;
+    Messages have the numbers of their ticks and come in the order of time. A tick is whole, therefore, when the next one comes;
     the last one is when there are no more messages.
     """
 
