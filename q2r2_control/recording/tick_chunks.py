@@ -40,8 +40,8 @@ class TickChunk:
 class TickAssembly:
     """Gives ticks of which all messages are there.
 
-    Messages have the numbers of their ticks and come in the order of time. A tick is whole, therefore, when the next one comes;
-    the last one is when there are no more messages.
+    Messages have the numbers of their ticks and come in the order of time. Therefore a tick is whole when the next one
+    comes. The last one is whole when there are no more messages.
     """
 
     topics = (TICK, SAMPLES, STATE)
