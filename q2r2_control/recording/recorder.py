@@ -19,7 +19,7 @@ from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.camera_recorder import CameraRecorder
-from q2r2_control.recording.messages import Message, Topic, run_topics
+from q2r2_control.recording.messages import DESCRIPTION, Message, Topic, run_topics
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, RecordingSetup, Written
@@ -110,9 +110,11 @@ class BaseRecorder:
 
 
 def _is_empty(file: Path) -> bool:
-    """True if a file, as a writer that was killed leaves it, has no message."""
+    """True if a file, as a writer that was killed leaves it, has no message but the robot's description."""
     try:
-        return not any(Recording(file).messages())
+        recording = Recording(file)
+        found = (message for some in recording.messages() for message in some)
+        return all(recording.topic(message) == DESCRIPTION for message in found)
     except RecordingError:
         return not file.exists() or file.stat().st_size < _HEADER
 
