@@ -19,7 +19,7 @@ from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.camera_recorder import CameraRecorder
-from q2r2_control.recording.messages import DESCRIPTION, Message, Topic, run_topics
+from q2r2_control.recording.messages import Message, Topic, run_topics
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, RecordingSetup, Written
@@ -37,7 +37,6 @@ _BEHIND, _CAUGHT_UP = 2.0, 1.0  # time by which the file is behind the run, to b
 ROOM_WITH_PICTURES = 64 << 20  # of cameras of nodes, which have a megabyte each where they are not compressed
 _LAST_NUMBER = 2**32 - 1
 _BATCH = 16  # ticks that are sent at once
-_HEADER = 256  # of a file that tells nothing [bytes]
 _LONGEST_FAULT = 500  # that ended a run [characters]
 
 _logger = logging.getLogger(__name__)
@@ -110,13 +109,15 @@ class BaseRecorder:
 
 
 def _is_empty(file: Path) -> bool:
-    """True if a file, as a writer that was killed leaves it, has no message but the robot's description."""
+    """True if a file, as a writer that was killed leaves it, has no message."""
     try:
         recording = Recording(file)
-        found = (message for some in recording.messages() for message in some)
-        return all(recording.topic(message) == DESCRIPTION for message in found)
+    except RecordingError as error:  # messages come after what it lacks, unless the disk fails
+        return not isinstance(error.__cause__, OSError) or not file.exists()
+    try:
+        return not any(recording.messages())
     except RecordingError:
-        return not file.exists() or file.stat().st_size < _HEADER
+        return False
 
 
 class MessageRecorder(BaseRecorder):
