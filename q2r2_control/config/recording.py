@@ -55,7 +55,7 @@ class JudgeSettings(StrictModel):
         2.5, description="of a camera: longest time without a picture, in its periods"
     )
     max_frozen_share: Share | None = Field(0.2, description="of a camera: the picture stays while the arms move")
-    max_black_share: Share | None = Field(0.05, description="of the pictures: black, or of one colour")
+    max_black_share: Share | None = Field(0.05, description="of the pictures: those that are black or of one colour")
     max_bad_pictures: Annotated[int, Field(ge=0, le=10**6)] | None = Field(
         0, description="pictures of a camera that are damaged, or not of its size"
     )

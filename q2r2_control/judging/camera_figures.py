@@ -37,14 +37,14 @@ _MOSTLY, _HARDLY = 0.5, 0.35  # of what a camera sees stands still: a fixed came
 class CameraFigures:
     """One camera, until the run begins to end; None: there is nothing to tell it by."""
 
-    arm: str | None  # that carries it
+    arm: str | None  # the arm that carries the camera; None if none does
     pictures: int
     rate_share: float | None  # pictures by those that were due
     longest_gap_periods: float | None  # longest time without a picture, in the camera's periods
     frozen_share: float | None  # pictures like the one before, of those between which the arms moved
-    black_share: float | None  # of the pictures: black, or of one colour
-    bad_pictures: int  # that cannot be decoded as a whole, or have another size than the cell's camera
-    lag_ms: float | None  # of the motion in the pictures behind that of the joints
+    black_share: float | None  # share of the pictures that are black or have one colour only
+    bad_pictures: int  # number of pictures that are damaged, or have another size than the cell says
+    lag_ms: float | None  # delay of the motion in the pictures behind the motion of the joints
     swapped_with: str | None  # the camera whose place it has
 
 

@@ -45,7 +45,7 @@ class Ticks:
     slip_angle: Array  # (n, arms) [rad]
     gripper: Array  # (n, arms) opening that is wanted, 0 closed .. 1 open
     now: Array  # (n,) by the loop's own clock [s]
-    unmeasured: Flags  # (n, arms) a measured position, velocity or opening, or a reference, is no finite number
+    unmeasured: Flags  # (n, arms) a measured number, or a number of the reference, is not finite
     joint_speed: Array  # (n, arms) of the measured joint that is nearest to its limit of speed, by that limit
 
 
@@ -167,7 +167,8 @@ class _Read:
         self._recording = recording
         self._limits = robot.velocity_limit
         self._joints = [arm.joints for arm in robot.arms.values()]
-        self._wraps = robot.position_upper - robot.position_lower >= 2.0 * np.pi  # of a joint that turns on for ever
+        # A joint that can turn a full circle may be measured modulo that circle.
+        self._wraps = robot.position_upper - robot.position_lower >= 2.0 * np.pi
         self._last: tuple[float, Array] | None = None  # time [s] and measured joints of the newest tick
         self.ticks: list[Ticks] = []
         self.frames: list[Frames] = []

@@ -10,7 +10,7 @@ from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.motion import Track, best_delay
 from q2r2_control.types import Array
 
-_SPEED_FRAMES = 10  # over which a lasting speed is taken
+_SPEED_FRAMES = 10  # number of frames that a joint's speed is averaged over
 _MOVES = 0.02  # RMS speed from which on a joint's measured velocity is held against its positions [rad/s]
 _LONGEST_GAP = 0.05  # between the frames that a velocity is compared over [s]
 _LARGEST_LAG = 0.35  # that is looked for [s]
@@ -22,7 +22,7 @@ class MeasuredFigures:
     """One arm, until the run begins to end; None: there is nothing to tell it by."""
 
     unmeasured_ticks: int  # with a position, velocity, opening or reference that is no finite number
-    joint_speed_share: float  # fastest joint over 20 ms, by its limit
+    joint_speed_share: float  # largest of the joints: mean speed over 20 ms divided by the speed limit
     velocity_mismatch: float | None  # of the joint whose measured velocity is least the slope of its positions
     reference_lag_ms: float | None  # of the measured joints behind the reference
     opening_range: float | None  # measured of the gripper; None: it is not measured

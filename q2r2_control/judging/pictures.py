@@ -19,7 +19,7 @@ from q2r2_control.recording.reader import BROKEN, Picture, Recording
 from q2r2_control.types import Array, Flags
 
 VIEW = (24, 32)  # rows and columns of a picture as it is kept
-_SCAN, _END = b"\xff\xda", b"\xff\xd9"  # of the coded pixels of a JPEG
+_SCAN, _END = b"\xff\xda", b"\xff\xd9"  # markers before and after the coded pixels of a JPEG
 # Within coded pixels a byte 0xFF is followed by 0, by a restart marker, by the end, or by more of the same (ITU T.81,
 # B.1.1.2 and F.1.2.3). A decoder goes on after any other, with pixels that the camera never saw.
 _FOREIGN_MARKER = re.compile(rb"\xff[\x01-\xcf\xda-\xfe]")

@@ -126,7 +126,7 @@ def anonymous(notes: Mapping[str, str]) -> dict[str, str]:
     """The notes without those that tell of a person or of a computer's name and address."""
     kept = {name: text for name, text in notes.items() if name not in _PERSONAL}
     if "machine" in kept:
-        kept["machine"] = kept["machine"].partition(", ")[2]  # the system, without the name before it
+        kept["machine"] = kept["machine"].partition(", ")[2]  # only the operating system
     return kept
 
 

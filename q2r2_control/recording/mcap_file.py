@@ -24,7 +24,7 @@ from mcap.writer import MCAP0_MAGIC
 from q2r2_control.recording.messages import Message, Topic
 
 _LARGEST = 1 << 30  # of a record [bytes]
-_BATCH = 1000  # messages that are given at once where no chunk has them together
+_BATCH = 1000  # number of messages that are read together from a file without chunks
 _HEADER = struct.Struct("<BQ")  # kind and length of a record, before its content
 _CHUNK_TIMES = struct.Struct("<QQ")  # of a chunk's first and last message [ns], where its content begins
 
@@ -65,7 +65,7 @@ class McapFile:
         return self._topics[channel].name
 
     def extras(self) -> Iterator[Metadata | Attachment]:
-        """All metadata and attachments, wherever they stand."""
+        """All metadata and attachments, in the order of the file."""
         with self._path.open("rb") as stream:
             for place in _places(stream):
                 if place.kind in (Opcode.METADATA, Opcode.ATTACHMENT):

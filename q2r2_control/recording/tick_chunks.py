@@ -32,7 +32,7 @@ class TickChunk:
         return np.asarray(self.rows["index"].astype(np.int64))
 
     def events(self) -> dict[int, list[Event]]:
-        """Events by the number of the tick. Raises ValueError, KeyError and TypeError for other data."""
+        """The events of each tick, by the tick's number. Raises ValueError, KeyError and TypeError for other data."""
         found = {number: json.loads(text).get("events", ()) for number, text in self.states.items()}
         return {number: [Event.from_json(event) for event in events] for number, events in found.items()}
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
 READ_AHEAD = 4 << 20  # of what was sent, for what waits to be written [bytes]
 _NICENESS = 10  # the loop goes first where there are not enough processors
-_ROUNDING = 1e-6  # of a period: a message that is due but for the rounding of times is due
+_ROUNDING = 1e-6  # share of a period by which rounding may make a message seem to come too early
 _LAST_TIME = (2**31 - 1) * NANOSECONDS  # that a stamp can have [ns]
 _HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (
     SAMPLE_FIELDS.index(name) for name in ("hand", "pose_stamp", "inputs_stamp", "x", "button_upper")

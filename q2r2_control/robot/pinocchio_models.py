@@ -146,7 +146,7 @@ def _check_mesh(file: str, where: str) -> None:
 
 
 def _has_extent(mesh: coal.BVHModelBase) -> bool:
-    """Whether the corners of a mesh lie in more than one line."""
+    """Whether the corners of a mesh span more than a straight line."""
     points = np.array(mesh.vertices()).reshape(-1, 3)
     if len(points) < 3 or not np.isfinite(points).all():
         return False

@@ -43,9 +43,9 @@ class StandstillLimits:
     begins: float = 0.0  # the same where the arm has not followed yet: until it begins to [s]
 
 
-# Of a driver that takes joint commands, whose filter and whose session may have just begun [rad].
+# Limits for a driver that takes joint commands. Its filter and its session may have just begun [rad].
 JOINTS = StandstillLimits(least=0.01, ahead=0.01, begins=0.05)
-# Of a controller that takes poses, and may have an inverse kinematics that lags by 0.4 s [rad], [m].
+# Limits for a controller that takes poses. Its inverse kinematics may lag by 0.4 s [rad], [m].
 LAGGING_JOINTS = StandstillLimits(least=0.01, ahead=0.01, patience=0.08, begins=0.4)
 LAGGING_TOOL = StandstillLimits(least=0.01, ahead=0.02, patience=0.08, begins=0.4)
 

@@ -31,7 +31,7 @@ def chain() -> tuple[Any, Any, Any]:
 
 
 def compiled(kinds: dict[Any, Any]) -> Any:
-    """The one thing that a kernel was compiled to, as a whole or as a part."""
+    """The only compiled version of a kernel, among its wholes or its parts."""
     (found,) = kinds.values()
     return found
 

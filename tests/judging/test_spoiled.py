@@ -27,7 +27,7 @@ SMALL = {"width": 96, "height": 72}
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An episode without pictures, which takes no OpenGL."""
+    """An episode without pictures, so that the test needs no OpenGL."""
     return record_episode(tmp_path_factory.mktemp("clean"), hands(), DURATION)
 
 
