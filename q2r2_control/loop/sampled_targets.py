@@ -21,7 +21,7 @@ class SampledTargets:
     """Tool targets at every step, straight from each sample to the next.
 
     A target that is held until its next sample stands still in most steps and jumps in one of them. The controller
-    follows such a target with a joint at its limit of acceleration in two of three steps, at 90 samples a second. Here
+    follows such a target with a joint at its limit of acceleration in most steps, at 90 samples a second. Here
     each sample is reached :attr:`delay` after it was set, and the steps in between get what is in between::
 
         targets = SampledTargets(controller, rate_hz=90)

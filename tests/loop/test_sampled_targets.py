@@ -27,6 +27,12 @@ def wave(start: pin.SE3, t: float) -> pin.SE3:
     return pin.SE3(start.rotation @ turn, start.translation + np.array([0.0, 0.1 * math.sin(2.0 * t), 0.0]))
 
 
+def share_at_limit(velocities: list[Array]) -> float:
+    """The share of steps in which some joint is at its limit of acceleration, after the beginning."""
+    accelerations = np.abs(np.diff(np.array(velocities[300:]), axis=0)).max(axis=1) / DT
+    return float((accelerations > 0.99 * LIMIT).mean())
+
+
 @pytest.mark.parametrize("rate", [10.0, 30.0, 90.0])
 @pytest.mark.parametrize("jitter", [0.0, 0.2], ids=["even", "uneven by a fifth of a period"])
 def test_joints_are_hardly_ever_at_their_limits_while_a_tool_follows_sampled_targets(
@@ -45,9 +51,17 @@ def test_joints_are_hardly_ever_at_their_limits_while_a_tool_follows_sampled_tar
         behind = max(now - targets.delay - jitter / rate, 0.0)
         error = wave(start, behind).actInv(controller.tool_pose("left"))
         off.append(float(np.linalg.norm(error.translation)))
-    accelerations = np.abs(np.diff(np.array(velocities[300:]), axis=0)).max(axis=1) / DT
-    assert (accelerations > 0.99 * LIMIT).mean() <= 0.05
+    assert share_at_limit(velocities) <= 0.05
     assert max(off[300:]) < 0.01
+
+
+def test_targets_that_are_held_drive_a_joint_to_its_limit_in_most_steps(
+    controller: CartesianController,
+) -> None:
+    controller.reset(controller.robot.home)
+    start = controller.tool_pose("left")
+    held = (wave(start, math.floor(step * DT * 90.0) / 90.0) for step in range(1500))
+    assert share_at_limit([controller.step({"left": target}, DT).v for target in held]) > 0.5
 
 
 def test_targets_begin_at_the_tool_and_rest_at_the_newest_sample_and_end_with_a_release(
