@@ -16,7 +16,7 @@ from tests.support.modules import ROOT, load_script
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 SHARED = (
     *("arena_hands.py", "arena_robosuite.py", "arena_robot.py"),
-    *("ros_processes.py", "work_hands.py"),
+    *("ros_processes.py", "work_hands.py", "safety_claims.py", "guard_claims.py"),
 )
 SCRIPTS = sorted(file.name for file in FOLDER.glob("*.py") if file.name not in SHARED)
 NEEDED = {
