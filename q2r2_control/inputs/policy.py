@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from types import NoneType
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +23,12 @@ from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError, check_kind, shown
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input, make_input
+from q2r2_control.inputs.policy_checks import PolicyErrors, UnusableError, check_finite, check_names, numbers_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import POSE_FIELDS, QUEST_CONTROLS, ActionChunk, Array, HandSample, HapticFeedback, Observation
 
 MOTION_FIELDS = ("x", "y", "z", "rx", "ry", "rz")
 _GAPS = 0.002, 0.5  # from one action to the next [s]
-_LARGEST = 1e3  # of any number, in metres or radians
 _MOST = 1000  # actions in a chunk
 _KEPT = 20  # chunks between two ticks: of more, the newest
 _JOINED = 1.0  # how long a policy that computes may take to end with the run [s]
@@ -95,6 +94,7 @@ class PolicyInput:
         self._robot: Robot | None = None
         self._realtime, self._started = True, False
         self._due = -np.inf  # when the policy is asked again [s]
+        self._errors = PolicyErrors()
 
     @classmethod
     def from_config(
@@ -164,7 +164,7 @@ class PolicyInput:
         """
         try:
             chunk = self._checked(actions, times, names)
-        except _UnusableError as error:
+        except UnusableError as error:
             chunk = self._fault(str(error))
         self._chunks.append(chunk)
 
@@ -181,11 +181,19 @@ class PolicyInput:
             return
         count = 1
         try:
-            actions = np.atleast_2d(np.asarray(self._policy(observation), dtype=np.float64))
+            answer = self._policy(observation)
+            if answer is None:
+                raise UnusableError("the policy returned None; allowed: an array of actions (n, size)")
+            actions = np.atleast_2d(numbers_of("actions", answer))
             count = len(actions)
             self.send(actions, observation.time + self.period * np.arange(count))
-        except Exception as error:  # whatever a policy does, the loop goes on
-            self._chunks.append(self._fault(f"{type(error).__name__}: {error}"))
+        except UnusableError as error:
+            self._chunks.append(self._fault(str(error)))
+        except BaseException as error:  # whatever a policy does, the loop goes on
+            if not isinstance(error, Exception) and threading.current_thread() is threading.main_thread():
+                raise  # of a signal's handler, which ends the program
+            self._errors.show(error)
+            self._chunks.append(self._fault(f"the policy raised {type(error).__name__}: {error}".removesuffix(": ")))
         self._due = observation.time + max(count // 2, 1) * self.period - 1e-9
 
     def _fault(self, text: str) -> ActionChunk:
@@ -195,19 +203,21 @@ class PolicyInput:
     def _checked(self, actions: npt.ArrayLike, times: npt.ArrayLike | None, names: Sequence[str]) -> ActionChunk:
         robot = self._robot
         if robot is None:
-            raise _UnusableError("sent before the run began")
-        values = np.atleast_2d(_numbers("actions", actions))
+            raise UnusableError("sent before the run began")
+        values = np.atleast_2d(numbers_of("actions", actions))
         expected = action_names(robot, self.space)
         grippers = tuple(f"{arm}_gripper" for arm in robot.arms)
         if not isinstance(names, list | tuple):
-            raise _UnusableError(f"names = {shown(names)}; allowed: a list of names")
+            raise UnusableError(f"names = {shown(names)}; allowed: a list of names")
         allowed = tuple(names) if names else (*expected, *grippers)[: values.shape[-1]]
-        _check_names(allowed, expected, grippers)
+        check_names(allowed, expected, grippers)
         size = len(allowed)
-        if values.ndim != 2 or values.shape[1] != size or not 0 < len(values) <= _MOST:
+        if values.ndim == 2 and not 0 < len(values) <= _MOST:
+            raise UnusableError(f"{len(values)} actions in one answer; allowed: 1 to {_MOST}")
+        if values.ndim != 2 or values.shape[1] != size:
             sizes = f"{len(expected)} or {len(expected) + len(grippers)}"
-            raise _UnusableError(f"actions have the shape {values.shape}; allowed: (n, {size if names else sizes})")
-        _check_finite(values, allowed)
+            raise UnusableError(f"actions have the shape {values.shape}; allowed: (n, {size if names else sizes})")
+        check_finite(values, allowed)
         stamps = self._stamps(times, len(values))
         period = (stamps[-1] - stamps[0]) / (len(stamps) - 1) if len(stamps) > 1 else self.period
         openings = {
@@ -225,20 +235,20 @@ class PolicyInput:
             lengths = np.linalg.norm(poses[:, 3:], axis=1)
             if (wrong := np.flatnonzero((lengths < 0.5) | (lengths > 2.0))).size:
                 where = f"action {wrong[0]}: the quaternion of {arm}"
-                raise _UnusableError(f"{where} has the length {lengths[wrong[0]]:.3g}; allowed: 1, or nearly so")
+                raise UnusableError(f"{where} has the length {lengths[wrong[0]]:.3g}; allowed: 1, or nearly so")
         return ActionChunk(stamps, period, tools=parts, grippers=openings)
 
     def _stamps(self, times: npt.ArrayLike | None, count: int) -> Array:
         if times is None:
             if self.observation is None:
-                raise _UnusableError("times are missing, and nothing was observed yet")
+                raise UnusableError("times are missing, and nothing was observed yet")
             return np.asarray(self.observation.time + self.period * np.arange(count))
-        stamps = np.atleast_1d(_numbers("times", times))
+        stamps = np.atleast_1d(numbers_of("times", times))
         if stamps.shape != (count,) or not np.isfinite(stamps).all():
-            raise _UnusableError(f"times = {shown(times)}; allowed: a finite number for each of {count} actions")
+            raise UnusableError(f"times = {shown(times)}; allowed: a finite number for each of {count} actions")
         gaps = np.diff(stamps)
         if ((gaps < _GAPS[0]) | (gaps > _GAPS[1])).any():
-            raise _UnusableError(f"times = {shown(times)}; allowed: ascending, {_GAPS[0]:g} to {_GAPS[1]:g} s apart")
+            raise UnusableError(f"times = {shown(times)}; allowed: ascending, {_GAPS[0]:g} to {_GAPS[1]:g} s apart")
         return stamps
 
     def _tools(self, postures: Array) -> dict[str, Array]:
@@ -253,35 +263,6 @@ class PolicyInput:
                 pose = pin.updateFramePlacement(robot.model, data, arm.frame_id)
                 tools[name][index] = pin.SE3ToXYZQUATtuple(pose)
         return tools
-
-
-class _UnusableError(Exception):
-    """Why actions cannot be used."""
-
-
-def _numbers(what: str, values: Any) -> Array:
-    try:
-        return np.array(values, dtype=np.float64)  # a copy: its sender may use the array again
-    except (TypeError, ValueError, OverflowError) as error:
-        raise _UnusableError(f"{what} = {shown(values)}; allowed: an array of numbers") from error
-
-
-def _check_finite(values: Array, names: Sequence[str]) -> None:
-    if not (usable := np.abs(values) <= _LARGEST).all():  # nor is NaN
-        action, column = np.argwhere(~usable)[0]
-        allowed = f"allowed: finite numbers, {_LARGEST:g} at most"
-        raise _UnusableError(f"action {action}: {names[column]} = {values[action, column]}; {allowed}")
-
-
-def _check_names(names: Sequence[str], expected: Sequence[str], grippers: Sequence[str]) -> None:
-    """Raises :class:`_UnusableError` for other names than the joints' or arms', and grippers' behind, in this order."""
-    for place, name in enumerate(expected):
-        if place >= len(names) or names[place] != name:
-            found = shown(names[place]) if place < len(names) else "missing"
-            raise _UnusableError(f"number {place} is {found}; allowed: {name}, in the order {', '.join(expected)}")
-    behind = list(names[len(expected) :])
-    if behind != [name for name in grippers if name in behind]:
-        raise _UnusableError(f"names end with {shown(behind)}; allowed: {', '.join(grippers)}, in this order")
 
 
 def _loaded(where: str) -> Policy:

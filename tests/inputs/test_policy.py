@@ -86,7 +86,9 @@ def with_one(value: float) -> Array:
         (ZEROS[:, :13], [0.0, 0.1], (), "number 13 is missing; allowed: right_A7"),
         (np.zeros((2, 17)), [0.0, 0.1], (), "actions have the shape (2, 17); allowed: (n, 14 or 16)"),
         (np.zeros((2, 2, 14)), [0.0, 0.1], (), "actions have the shape (2, 2, 14)"),
-        (np.zeros((0, 14)), [], (), "actions have the shape (0, 14)"),
+        (np.zeros((0, 14)), [], (), "0 actions in one answer; allowed: 1 to 1000"),
+        (np.zeros((1001, 14)), None, (), "1001 actions in one answer; allowed: 1 to 1000"),
+        (None, [0.0], (), "actions are None; allowed: an array of numbers"),
         ("left", [0.0], (), "actions = 'left'; allowed: an array of numbers"),
         (ZEROS, [0.1, 0.0], (), "times = [0.1, 0.0]; allowed: ascending"),
         (ZEROS, [0.0], (), "allowed: a finite number for each of 2 actions"),
@@ -138,16 +140,77 @@ def test_a_policy_is_asked_on_its_own_thread_and_again_when_half_of_its_actions_
         policy.close()
 
 
+def asked(policy: PolicyInput, time: float = 1.0) -> str:
+    """What the fault says that comes of asking the policy in simulated time."""
+    policy.observe(observed(time))
+    (chunk,) = policy.chunks()
+    assert chunk.fault is not None
+    return sentence(chunk.fault)
+
+
+def of_function(function: Any) -> PolicyInput:
+    policy = PolicyInput(function)
+    policy.prepare(robot(), realtime=False)
+    return policy
+
+
 def test_a_policy_that_raises_is_a_fault_of_its_actions() -> None:
     def fails(observation: Observation) -> Array:
         raise RuntimeError("no weights\nwere found")
 
-    policy = PolicyInput(fails)
-    policy.prepare(robot(), realtime=False)
-    policy.observe(observed())
-    (chunk,) = policy.chunks()
-    assert chunk.fault is not None
-    assert sentence(chunk.fault).endswith("RuntimeError: no weights were found")
+    assert asked(of_function(fails)).endswith("the policy raised RuntimeError: no weights were found")
+
+
+def test_the_traceback_of_a_policy_is_logged_once_for_each_error(caplog: pytest.LogCaptureFixture) -> None:
+    def fails(observation: Observation) -> Array:
+        if observation.time > 2.5:
+            raise ValueError("another error")
+        raise RuntimeError("no weights were found")
+
+    policy = of_function(fails)
+    for time in (1.0, 2.0, 3.0, 4.0):
+        asked(policy, time)
+    first, second = (record.getMessage() for record in caplog.records)
+    assert 'raise RuntimeError("no weights were found")' in first
+    assert 'raise ValueError("another error")' in second
+    assert "_ask" not in first, "the traceback begins in the policy"
+
+
+def test_a_policy_that_returns_nothing_is_told_so() -> None:
+    told = asked(of_function(lambda seen: None))
+    assert told.endswith("the policy returned None; allowed: an array of actions (n, size)")
+
+
+@pytest.mark.parametrize("error", [SystemExit(3), GeneratorExit()], ids=repr)
+def test_a_policy_that_ends_its_thread_is_named_and_asked_again(error: BaseException) -> None:
+    def leaves(observation: Observation) -> Array:
+        raise error
+
+    policy = PolicyInput(leaves)
+    policy.prepare(robot(), realtime=True)
+    chunks: list[ActionChunk] = []
+
+    def received(count: int) -> bool:
+        chunks.extend(policy.chunks())
+        return len(chunks) == count
+
+    policy.start()
+    try:
+        for count in (1, 2):
+            policy.observe(observed(float(count)))
+            wait_until(partial(received, count))
+        faults = [chunk.fault for chunk in chunks]
+        assert all(fault and f"the policy raised {type(error).__name__}" in sentence(fault) for fault in faults)
+    finally:
+        policy.close()
+
+
+def test_a_signal_that_ends_the_program_is_no_fault_of_the_policy() -> None:
+    def interrupted(observation: Observation) -> Array:
+        raise SystemExit
+
+    with pytest.raises(SystemExit):
+        asked(of_function(interrupted))
 
 
 def test_the_command_line_names_a_policy_of_this_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

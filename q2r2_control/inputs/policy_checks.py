@@ -1,0 +1,67 @@
+"""Why the actions of a policy cannot be used, and the traceback of a policy that failed."""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from q2r2_control.errors import shown
+from q2r2_control.types import Array
+
+_LARGEST = 1e3  # of any number, in metres or radians
+_logger = logging.getLogger(__name__)
+
+
+class UnusableError(Exception):
+    """Why actions cannot be used."""
+
+
+def numbers_of(what: str, values: Any) -> Array:
+    """The ``values`` as an array of their own. Raises :class:`UnusableError` where they are no numbers."""
+    if values is None:
+        raise UnusableError(f"{what} are None; allowed: an array of numbers")
+    try:
+        return np.array(values, dtype=np.float64)  # a copy: its sender may use the array again
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UnusableError(f"{what} = {shown(values)}; allowed: an array of numbers ({error})") from error
+
+
+def check_finite(values: Array, names: Sequence[str]) -> None:
+    """Raises :class:`UnusableError` for a number of ``values`` (n, size) that is not finite, or too large."""
+    if not (usable := np.abs(values) <= _LARGEST).all():  # nor is NaN
+        action, column = np.argwhere(~usable)[0]
+        allowed = f"allowed: finite numbers, {_LARGEST:g} at most"
+        raise UnusableError(f"action {action}: {names[column]} = {values[action, column]}; {allowed}")
+
+
+def check_names(names: Sequence[str], expected: Sequence[str], grippers: Sequence[str]) -> None:
+    """Raises :class:`UnusableError` for other names than the joints' or arms', and grippers' behind, in this order."""
+    for place, name in enumerate(expected):
+        if place >= len(names) or names[place] != name:
+            found = shown(names[place]) if place < len(names) else "missing"
+            raise UnusableError(f"number {place} is {found}; allowed: {name}, in the order {', '.join(expected)}")
+    behind = list(names[len(expected) :])
+    if behind != [name for name in grippers if name in behind]:
+        raise UnusableError(f"names end with {shown(behind)}; allowed: {', '.join(grippers)}, in this order")
+
+
+class PolicyErrors:
+    """Logs the traceback of each error of a policy once, although the policy is asked many times a second."""
+
+    def __init__(self) -> None:
+        self._shown: set[str] = set()  # types of errors, and the lines that raised them
+
+    def show(self, error: BaseException) -> None:
+        """Log ``error`` with its traceback, unless this type was logged from the same line before."""
+        own = error.__traceback__  # whose first frame is the caller's, which nobody needs to see
+        trace = None if own is None else own.tb_next
+        frames = traceback.extract_tb(trace)
+        place = f"{type(error).__name__} {[(frame.filename, frame.lineno) for frame in frames[-1:]]}"
+        if place not in self._shown:
+            self._shown.add(place)
+            lines = "".join(traceback.format_exception(type(error), error, trace)).rstrip()
+            _logger.error("the policy failed; this traceback is shown once:\n%s", lines)
