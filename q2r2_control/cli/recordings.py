@@ -195,6 +195,9 @@ def export(
     skip_bad: Annotated[bool, Option("--skip-bad", help="Exit code 0 although recordings cannot be read.")] = False,
     anonymous: Anonymous = False,
     no_pictures: Annotated[bool, Option("--no-pictures", help="Leave out what cameras recorded.")] = False,
+    ahead: Annotated[
+        int | None, Option(metavar="FRAMES", help="Actions of so many frames later in each row; 1 with hdf5, else 0.")
+    ] = None,
 ) -> None:
     """Make a dataset to train on of recordings of q2r2 run --record, an episode each.
 
@@ -206,7 +209,9 @@ def export(
     if (chosen := FORMATS.get(name)) is None:
         raise ConfigError(f"export {name}: allowed: {', '.join(FORMATS)}")
     chosen.require()
-    sampling = FrameSampling(fps, trim, pictures=not no_pictures, anonymous=anonymous)
+    sampling = FrameSampling(
+        fps, trim, pictures=not no_pictures, anonymous=anonymous, ahead=chosen.ahead if ahead is None else ahead
+    )
     target, files = Output(output), recordings_in(recordings)
     try:
         with counting("recordings") as progress:

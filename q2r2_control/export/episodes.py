@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.sampling import CameraFrames, Names, Vectors, features, sample
+from q2r2_control.inputs.policy import ActionSpace
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.process.pools import pool_of
 from q2r2_control.recording.about import anonymous
@@ -25,7 +26,7 @@ from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
 
 FASTEST = 1000  # [frames/s]
-_FORMAT = 6  # of kept episodes; those of another one are made again
+_FORMAT = 7  # of kept episodes; those of another one are made again
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,13 @@ class FrameSampling:
     trim: bool = False  # to the time in which arms are engaged or moving
     pictures: bool = False
     anonymous: bool = False  # without notes that tell of a person or of a computer's name
+    ahead: int = 0  # frames by which actions that are positions come earlier
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= FASTEST:
             raise ConfigError(f"--fps {self.fps}: allowed: 1 .. {FASTEST}")
+        if not 0 <= self.ahead <= self.fps:
+            raise ConfigError(f"--ahead {self.ahead}: allowed: 0 .. {self.fps}, the frames of a second")
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class EpisodeVectors:
     notes: dict[str, str]  # program, machine, operator and the like, as recorded
     vectors: Vectors
     success: bool | None = None  # None: nobody said
+    ahead: int = 0  # frames by which actions that are positions come earlier: row k has those of frame k + ahead
     part: int = 0  # which of the episodes in the file, from 1 on; 0: the whole
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # pictures by camera, one a frame
 
@@ -77,6 +82,8 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         vectors, labels = features(frames, robot)
     except RecordingError as error:
         raise RecordingError(f"{recording.file}: {error}") from error
+    for action in (ActionSpace.JOINTS, ActionSpace.TOOL):  # a motion leads to the next frame already
+        vectors[action] = _earlier(vectors[action], sampling.ahead)
     notes = dict(recording.about.notes)
     notes = anonymous(notes) if sampling.anonymous else notes
     task = notes.pop("task", "")
@@ -90,9 +97,15 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         notes=notes,
         vectors=vectors,
         success=span.success,
+        ahead=sampling.ahead,
         part=span.number,
         cameras={name: CameraFrames(recording, name, cell.cameras[name], stamps) for name in cameras},
     )
+
+
+def _earlier(rows: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:
+    """``rows`` (n, size) so many ``frames`` earlier; the last one is repeated."""
+    return rows[np.minimum(np.arange(len(rows)) + frames, len(rows) - 1)]
 
 
 def spans_to_export(file: Path) -> list[EpisodeSpan]:

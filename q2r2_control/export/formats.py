@@ -23,7 +23,6 @@ from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shar
 from q2r2_control.export.lerobot_v21 import join_v21, openpi_config, require_v21, write_v21
 from q2r2_control.extras import install_line
 
-_AHEAD = 1  # frames by which actions in HDF5 are
 # Name in the HDF5 file, name of the feature, unit of a joint.
 _DATA = (
     ("observations/qpos", "observation.state", "rad"),
@@ -82,7 +81,7 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
         file.attrs["sim"] = True  # trainers take the action of the same row then
         file.attrs["compress"] = False  # pictures are pixels, however the file packs them
         file.attrs["fps"] = episode.fps
-        file.attrs["action_ahead_frames"] = _AHEAD
+        file.attrs["action_ahead_frames"] = episode.ahead
         for name in ("recording", "cell", "task"):
             file.attrs[name] = getattr(episode, name)
         if episode.success is not None:
@@ -91,8 +90,6 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
             file.attrs[f"note_{name}"] = text
         for name, feature, unit in _DATA:
             values, labels = episode.vectors[feature], episode.names[feature]
-            if name == "action":
-                values = np.concatenate((values[_AHEAD:], np.repeat(values[-1:], _AHEAD, axis=0)))[: episode.frames]
             data = file.create_dataset(name, data=values)
             data.attrs["names"] = list(labels)
             data.attrs["units"] = [_OPENING_UNIT if label.endswith(_OPENING) else unit for label in labels]
@@ -139,11 +136,12 @@ class Format:
     join: Callable[[Sequence[Path], Path], None]
     require: Callable[[], object] = lambda: None  # raises ConfigError where a package is not installed
     advice: Callable[[Path], str] | None = None  # what a trainer wants to be told of the output
+    ahead: int = 0  # frames by which actions come earlier unless --ahead says otherwise
 
 
 FORMATS = {
     "lerobot": Format(write_shard, join_shards, require_lerobot),
     "lerobot-v2.1": Format(write_v21, join_v21, require_v21, openpi_config),
-    "hdf5": Format(write_hdf5, gather_hdf5, require_h5py),
+    "hdf5": Format(write_hdf5, gather_hdf5, require_h5py, ahead=1),
     "csv": Format(write_table, gather_tables),
 }

@@ -41,7 +41,8 @@ def video_key(camera: str) -> str:
 def source_of(episode: EpisodeVectors) -> dict[str, Any]:
     """The entry of an episode in :data:`SOURCES`, without its number."""
     part = {"part": episode.part} if episode.part else {}
-    return {"recording": episode.recording, **part, "success": episode.success, **episode.notes}
+    ahead = {"action_ahead_frames": episode.ahead} if episode.ahead else {}
+    return {"recording": episode.recording, **part, "success": episode.success, **ahead, **episode.notes}
 
 
 def write_sources(sources: Sequence[dict[str, Any]], folder: Path) -> None:

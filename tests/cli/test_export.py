@@ -49,6 +49,21 @@ def test_the_config_that_trains_openpi_is_printed_behind_its_dataset(
     assert (tmp_path / "circle/data/chunk-000/episode_000001.parquet").exists()
 
 
+def test_hdf5_has_the_next_frames_actions_unless_it_is_told_otherwise(
+    recordings: Sequence[Path], tmp_path: Path
+) -> None:
+    h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
+    actions = {}
+    for name, options in (("usual", ()), ("plain", ("--ahead", "0"))):
+        out = tmp_path / name
+        assert q2r2("export", "hdf5", str(recordings[0]), "--output", str(out), *options).exit_code == 0
+        with h5py.File(out / "episode_0.hdf5") as file:
+            actions[name, int(file.attrs["action_ahead_frames"])] = file["action"][:]
+    assert set(actions) == {("usual", 1), ("plain", 0)}
+    assert (actions["usual", 1][:-1] == actions["plain", 0][1:]).all()
+    assert (actions["usual", 1] != actions["plain", 0]).any()
+
+
 def test_a_bad_recording_is_left_out_and_the_exit_code_tells_of_it_unless_it_is_skipped(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:

@@ -15,6 +15,7 @@ import pytest
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.export.episodes import FrameSampling, Output, keep_episodes, make_episode
+from q2r2_control.export.lerobot import source_of
 from tests.export.files import CAMERA, HEIGHT, WIDTH, Run, contents, load_vectors, record_step, write_vectors
 from tests.recording.runs import RATE, file_of, pipeline, record
 from tests.support.pictures import needs_opengl
@@ -74,6 +75,20 @@ def test_an_episode_has_the_pictures_of_its_frames(tmp_path: Path) -> None:
     episode = make_episode(file, FrameSampling(20, pictures=True))
     shown = list(episode.cameras[CAMERA])
     assert (len(shown), shown[0].shape) == (episode.frames, episode.cameras[CAMERA].size)
+
+
+def test_actions_that_are_positions_come_as_many_frames_earlier_as_asked_for(run: Run) -> None:
+    plain, ahead = (make_episode(run.file, FrameSampling(fps=30, ahead=frames)) for frames in (0, 2))
+    assert (plain.ahead, ahead.ahead, ahead.frames) == (0, 2, plain.frames)
+    for name, rows in plain.vectors.items():
+        moved = name in ("action", "action.tool")
+        expected = np.concatenate((rows[2:], rows[-1:], rows[-1:])) if moved else rows
+        np.testing.assert_array_equal(ahead.vectors[name], expected, err_msg=name)
+    assert "action_ahead_frames" not in source_of(plain)
+    assert source_of(ahead)["action_ahead_frames"] == 2
+    for wrong in (-1, 31):
+        with pytest.raises(ConfigError, match=rf"--ahead {wrong}: allowed: 0 \.\. 30"):
+            FrameSampling(fps=30, ahead=wrong)
 
 
 @pytest.mark.parametrize("fps", [0, -30, 1001])

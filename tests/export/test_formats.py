@@ -66,6 +66,7 @@ NAMES_FOR_ACT = {"observation.state": POSITIONS, "observation.velocity": POSITIO
 EPISODES_FOR_ACT = [
     replace(
         with_pictures(plain, number),
+        ahead=2,
         names=NAMES_FOR_ACT,
         vectors={
             name: plain.vectors["action"][:, : len(labels)] * (1 + at)
@@ -76,7 +77,7 @@ EPISODES_FOR_ACT = [
 ]
 
 
-def test_each_episode_is_an_hdf5_file_of_what_act_asks_for_with_the_next_action(tmp_path: Path) -> None:
+def test_each_episode_is_an_hdf5_file_of_what_act_asks_for(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
     made = export("hdf5", EPISODES_FOR_ACT, tmp_path, ["a", "b"])
     for number, episode in enumerate(EPISODES_FOR_ACT):
@@ -84,8 +85,7 @@ def test_each_episode_is_an_hdf5_file_of_what_act_asks_for_with_the_next_action(
             state, pictures = file["observations/qpos"], file[f"observations/images/{CAMERA}"]
             np.testing.assert_array_equal(state, episode.vectors["observation.state"])
             np.testing.assert_array_equal(file["observations/qvel"], episode.vectors["observation.velocity"])
-            actions = episode.vectors["action"]
-            np.testing.assert_array_equal(file["action"], [*actions[1:], actions[-1]])
+            np.testing.assert_array_equal(file["action"], episode.vectors["action"])
             np.testing.assert_array_equal(pictures, list(episode.cameras[CAMERA]))
             assert pictures.chunks == (1, HEIGHT, WIDTH, 3)
             assert list(state.attrs["names"]) == list(POSITIONS)
@@ -94,7 +94,7 @@ def test_each_episode_is_an_hdf5_file_of_what_act_asks_for_with_the_next_action(
             about = dict(file.attrs)
             assert (about["fps"], about["task"], about["cell"]) == (30, episode.task, "two_arms")
             assert (about["recording"], about["note_operator"]) == (f"run-{number + 1}.mcap", "Ada")
-            assert (about["sim"], about["action_ahead_frames"], about.get("success")) == (1, 1, episode.success)
+            assert (about["sim"], about["action_ahead_frames"], about.get("success")) == (1, 2, episode.success)
 
 
 def test_robomimic_finds_the_same_numbers_in_one_file_of_links(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_robomimic_finds_the_same_numbers_in_one_file_of_links(tmp_path: Path) -
             demo = file[f"data/demo_{number}"]
             assert demo.attrs["num_samples"] == episode.frames
             np.testing.assert_array_equal(demo["obs/qpos"], episode.vectors["observation.state"])
-            np.testing.assert_array_equal(demo["actions"][:-1], episode.vectors["action"][1:])
+            np.testing.assert_array_equal(demo["actions"], episode.vectors["action"])
             np.testing.assert_array_equal(demo[f"obs/{CAMERA}"], list(episode.cameras[CAMERA]))
             assert np.flatnonzero(demo["dones"]).tolist() == [episode.frames - 1]
             assert demo["rewards"][-1] == bool(episode.success)
