@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 # One call of pip at a time, also where make runs with -j.
 PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot test-lerobot test-learning test-web web-setup chromium lint bench docs picture page-picture soak wheel release-check arena clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot lerobot-ros test-lerobot test-learning test-web web-setup chromium lint bench docs picture page-picture soak wheel release-check arena clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed-dev
@@ -100,6 +100,21 @@ LEROBOT_PLUGINS := $(addprefix --editable plugins/,lerobot_robot_q2r2 lerobot_te
 IN_LEROBOT := HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/python
 
 lerobot: $(LEROBOT)/.installed
+	@$(LEROBOT)/bin/python -c "$$CHOSEN_LEROBOT"
+
+# Says which lerobot pip chose, since an old Python gets an old one in silence.
+define CHOSEN_LEROBOT
+import sys
+from importlib.metadata import version
+python, found = '.'.join(map(str, sys.version_info[:2])), version('lerobot')
+old = sys.version_info < (3, 12)
+print(f'lerobot {found} with Python {python} in $(LEROBOT)')
+print('lerobot 0.5 and newer need Python 3.12: rm -r $(LEROBOT); make lerobot LEROBOT_PYTHON=python3.12' if old else '', end='\n' * old)
+endef
+export CHOSEN_LEROBOT
+
+# The robot's plant `ros` besides: rclpy, and message packages that are built.
+lerobot-ros: $(LEROBOT)/.installed-ros
 
 test-lerobot: lerobot
 	$(IN_LEROBOT) -m pytest tests/lerobot
@@ -115,8 +130,11 @@ $(LEROBOT)/.installed: pyproject.toml setup.py $(wildcard plugins/*/pyproject.to
 	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' 'lerobot$(LEROBOT_VERSION)' \
 		'pytest>=8' 'hypothesis>=6.100' $(LEROBOT_PLUGINS)
 	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # its loader needs torch, which is there
-	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[ros]' && $(LEROBOT)/bin/q2r2 ros build-interfaces \
-		|| echo 'No ROS 2 packages for this machine: going on without.'
+	touch $@
+
+$(LEROBOT)/.installed-ros: $(LEROBOT)/.installed
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[ros]'
+	$(LEROBOT)/bin/q2r2 ros build-interfaces
 	touch $@
 
 lint: setup
