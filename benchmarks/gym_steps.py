@@ -2,7 +2,8 @@
 
     make arena  # an environment of its own with robosuite, where it runs this
 
-An environment is stepped by one process, with random actions and without pictures.
+An environment is stepped by one process, with random actions and without pictures. ``--loop-rate 100`` slows down the
+control loop of ours.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
@@ -21,16 +22,17 @@ from q2r2_control.cli.output import Json, print_report
 from q2r2_control.gym import TASKS
 from q2r2_control.viewer.tables import figure_table
 
-SECONDS, WARM = 20.0, 5  # of each environment, after so many steps
+SECONDS, WARM = 20.0, 5  # of each environment, unless told otherwise, after so many steps
 RATE = 20  # steps in a second of simulated time, robosuite's default
 SHARE = 0.1  # of the largest action
 
 Environment = tuple[str, Any, Callable[[], Any]]  # name, environment, and what draws an action
 
 
-def of_ours() -> Iterator[Environment]:
+def of_ours(loop_rate: float | None) -> Iterator[Environment]:
     for task in TASKS:
-        env = gymnasium.make(f"q2r2_control.gym:q2r2/{task.capitalize()}-v0", space="action.tool_delta", rate=RATE)
+        name = f"q2r2_control.gym:q2r2/{task.capitalize()}-v0"
+        env = gymnasium.make(name, space="action.tool_delta", rate=RATE, loop_rate=loop_rate)
         yield f"q2r2 {task}", env, env.action_space.sample
 
 
@@ -52,22 +54,27 @@ def of_robosuite() -> Iterator[Environment]:
         yield f"robosuite {name}", env, partial(np.random.default_rng(1).uniform, *env.action_spec)
 
 
-def main(json: Json = False) -> None:
-    """Print the steps per second of each environment."""
-    data = {}
-    for environments in (of_ours(), of_robosuite()):
+LoopRate = Annotated[float | None, typer.Option(metavar="HZ", help="Of our control loop; by default the cell's.")]
+Seconds = Annotated[float, typer.Option(help="Of each environment.")]
+
+
+def main(loop_rate: LoopRate = None, seconds: Seconds = SECONDS, json: Json = False) -> None:
+    """Print the steps per second, and the processor time of a step, of each environment."""
+    data, computed = {}, {}
+    for environments in (of_ours(loop_rate), of_robosuite()):
         for name, env, action in environments:
             env.reset()
             for _ in range(WARM):
                 env.step(SHARE * action())
-            steps, began = 0, time.perf_counter()
-            while (passed := time.perf_counter() - began) < SECONDS:
+            steps, began, computing = 0, time.perf_counter(), time.process_time()
+            while (passed := time.perf_counter() - began) < seconds:
                 if any(env.step(SHARE * action())[2:-1]):  # done, or terminated and truncated
                     env.reset()
                 steps += 1
-            data[name] = steps / passed
-    rows = [(name, rate, rate / RATE) for name, rate in data.items()]
-    print_report(data, (figure_table("environments", ("environment", "steps/s", "times real time"), rows),), json)
+            data[name], computed[name] = steps / passed, 1e3 * (time.process_time() - computing) / steps
+    rows = [(name, rate, rate / RATE, computed[name]) for name, rate in data.items()]
+    columns = ("environment", "steps/s", "times real time", "CPU ms a step")
+    print_report(data, (figure_table("environments", columns, rows),), json)
 
 
 if __name__ == "__main__":

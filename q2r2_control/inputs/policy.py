@@ -110,6 +110,11 @@ class PolicyInput:
     def connected(self) -> bool:
         return self._started if self.operator is None else self.operator.connected
 
+    @property
+    def feels(self) -> bool:
+        """True if there is an operator, whose device may vibrate."""
+        return self.operator is not None
+
     def prepare(self, robot: Robot, realtime: bool) -> None:
         """See :class:`PolicySource`."""
         self._robot, self._realtime = robot, realtime

@@ -49,6 +49,7 @@ class OperatorSide:
         self._teleop, self._input, self._supervisor = teleop, source, supervisor
         self._policy = source if isinstance(source, PolicySource) else None
         self.chunks: list[ActionChunk] = []  # of a policy, since the last poll
+        self._feels = getattr(source, "feels", True)  # False: there is no device that could vibrate
         self._controller, self._requests, self._impedance = controller, requests, impedance
         self._homing = False  # supervision is on the way home
         self._in_the_way: frozenset[str] = frozenset()  # moving obstacles, at their last report
@@ -96,6 +97,8 @@ class OperatorSide:
         now = tick.now
         if self._policy is not None:
             self._policy.observe(Observation(now, tick.state, tick.openings, tick.tools))
+        if not self._feels:
+            return
         for event in tick.events:
             self._pulses[event.arm].start_pulse(event)
         self._conditions.note(tick.reference.report, now)

@@ -183,7 +183,7 @@ class Pipeline(RequestedRun):
         self._pace = None
         self._prepare(realtime=False)
         self._start_input(realtime=False)
-        self._begin(realtime=False)
+        self._begin(realtime=False, counts=False)
 
     def tick_until(self, end: float) -> None:
         """Take the ticks of a run that has begun, up to the newest one at or before ``end`` [s] on the loop's clock.
@@ -271,7 +271,7 @@ class Pipeline(RequestedRun):
             self.controller, self.drive, period, streams, watch, gripper_delay=delay, standstill=standstill
         )
 
-    def _begin(self, realtime: bool) -> None:
+    def _begin(self, realtime: bool, counts: bool = True) -> None:
         self._following = True
         self._told_late = False
         self._targets = {arm: ArmTarget(None, OPEN) for arm in self.robot.arms}
@@ -295,7 +295,7 @@ class Pipeline(RequestedRun):
             self.loop.wait(self._state)
         is_torque = self.drive.mode is CommandMode.TORQUE
         self._longest_advance = max(_LONGEST_TORQUE, self._clock.period) if is_torque else LONGEST_DT
-        self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop)
+        self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop, counts)
         self._operator = OperatorSide(
             self.teleop, self.input, self.supervisor, self.controller, self.requests, self.impedance
         )

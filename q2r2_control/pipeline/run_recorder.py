@@ -14,7 +14,10 @@ from q2r2_control.supervision.tick_pacer import TickPacer
 
 
 class RunRecorder(RunStatistics):
-    """Adds up every tick and tells listeners of it. A listener that raises ends the run and is not called again."""
+    """Adds up every tick and tells listeners of it. A listener that raises ends the run and is not called again.
+
+    ``counts`` is False for a run whose summary nobody can ask for: its ticks are not added up.
+    """
 
     def __init__(
         self,
@@ -22,8 +25,10 @@ class RunRecorder(RunStatistics):
         control: ControllerSettings,
         listeners: Iterable[Callable[[Tick], None]],
         stop: Callable[[], None],
+        counts: bool = True,
     ) -> None:
         super().__init__(robot, control)
+        self._counts = counts
         self._listeners, self._stop = list(listeners), stop
         self._failure: Exception | None = None  # of a listener
 
@@ -34,7 +39,8 @@ class RunRecorder(RunStatistics):
 
     def add(self, tick: Tick) -> None:
         """Count one tick, and hand it to every listener."""
-        super().add(tick)
+        if self._counts:
+            super().add(tick)
         for listener in list(self._listeners):
             try:
                 listener(tick)

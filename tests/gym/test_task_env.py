@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import subprocess
@@ -22,10 +23,14 @@ from gymnasium.utils.env_checker import check_env
 
 from q2r2_control import gym
 from q2r2_control.demo.assembly_tasks import TASKS
+from q2r2_control.errors import ConfigError
 from q2r2_control.gym.task_env import TaskEnv
 from q2r2_control.inputs.assembly import WORKS
 from q2r2_control.inputs.policy import ActionSpace
 from q2r2_control.inputs.way_points import HOME, WayPoints
+from q2r2_control.pipeline.operator_side import OperatorSide
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.summary.run_summary import RunStatistics
 from q2r2_control.types import SIDES
 from tests.demo.test_assembly_tasks import coarse
 from tests.support.pictures import needs_opengl
@@ -137,6 +142,38 @@ def test_the_arms_follow_small_actions_and_say_why_they_refuse_large_ones() -> N
     action[0] = np.nan
     *_, info = env.step(action)
     assert "nan" in info["promises"]["held_back"]
+
+
+def test_a_slower_loop_takes_fewer_ticks_for_the_same_steps_and_keeps_the_promises(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ticks, tools, tick, taken = [], [], Pipeline.tick, itertools.count()
+    monkeypatch.setattr(Pipeline, "tick", lambda self: (next(taken), tick(self))[1])
+    for rate in (1000.0, 100.0):
+        env = TaskEnv("grasp", rate=RATE, loop_rate=rate, spread=0.0)
+        env.reset(seed=0)
+        before = next(taken)
+        move = env.action_space.low * 0.1
+        for _ in range(10):
+            observed, *_, info = env.step(move)
+            assert info["promises"]["certified"]
+            assert info["promises"]["margin"] >= 0.0
+        ticks.append(next(taken) - before - 1)
+        tools.append(observed["observation.tool"])
+    assert ticks == [333, 33]
+    np.testing.assert_allclose(tools[0], tools[1], atol=0.02)  # each is some ticks behind its targets
+    with pytest.raises(ConfigError, match=r"loop_rate = 20: allowed: 50 to 1000 Hz"):
+        TaskEnv("grasp", loop_rate=20)
+
+
+def test_a_step_adds_up_no_summary_and_shakes_no_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = shared()
+    env.reset(seed=0)
+    for owner, name in ((RunStatistics, "add"), (OperatorSide, "_inspect")):
+        monkeypatch.setattr(owner, name, lambda *_: pytest.fail("nobody asks for this"))
+    action = env.reset(seed=0)[0]["observation.state"]
+    for _ in range(3):
+        env.step(action)
 
 
 def time_of(env: TaskEnv) -> float:
