@@ -29,7 +29,10 @@ if TYPE_CHECKING:  # "as" says to type checkers that a name is public
     from q2r2_control.errors import ConfigError as ConfigError
     from q2r2_control.errors import PlantError as PlantError
     from q2r2_control.errors import Q2R2Error as Q2R2Error
+    from q2r2_control.errors import RecordingError as RecordingError
     from q2r2_control.errors import RobotError as RobotError
+    from q2r2_control.export.episodes import EpisodeVectors as EpisodeVectors
+    from q2r2_control.export.export_format import ExportFormat as ExportFormat
     from q2r2_control.inputs.base import Input as Input
     from q2r2_control.inputs.policy import PolicyInput as PolicyInput
     from q2r2_control.loop.sampled_targets import SampledTargets as SampledTargets
@@ -59,6 +62,8 @@ _MODULES = {
     "ControllerSettings": "config.control",
     "DeviceControls": "types",
     "ElbowSwivel": "control.tasks.elbow",
+    "EpisodeVectors": "export.episodes",
+    "ExportFormat": "export.export_format",
     "HandInputs": "types",
     "HandSample": "types",
     "HapticFeedback": "types",
@@ -74,6 +79,7 @@ _MODULES = {
     "Q2R2Error": "errors",
     "QpProblem": "control.qp",
     "QpSolution": "control.qp",
+    "RecordingError": "errors",
     "Reference": "types",
     "RelativeMotion": "teleop.relative",
     "RelativePose": "control.tasks.named_tasks",

@@ -1,4 +1,4 @@
-"""Inputs, plants and presets by name: entry points that any installed package may declare.
+"""Inputs, plants, presets and formats of exports by name: entry points that any installed package may declare.
 
 [project.entry-points."q2r2_control.inputs"]
 gamepad = "my_package.gamepad:Gamepad"
@@ -14,6 +14,7 @@ from q2r2_control.errors import ConfigError
 INPUTS = "q2r2_control.inputs"
 PLANTS = "q2r2_control.plants"
 PRESETS = "q2r2_control.presets"
+EXPORTS = "q2r2_control.exports"
 
 
 def names_of(group: str) -> tuple[str, ...]:
@@ -22,7 +23,7 @@ def names_of(group: str) -> tuple[str, ...]:
 
 
 def load_class(group: str, name: str) -> Any:
-    """The class, or preset, called ``name``.
+    """The class, preset or format called ``name``.
 
     Raises :class:`ConfigError` where there is none, or it cannot be imported.
     """

@@ -28,7 +28,7 @@ from q2r2_control.cli.output import (
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import FASTEST, FrameSampling, Output, keep_episodes
-from q2r2_control.export.formats import FORMATS
+from q2r2_control.export.formats import FORMATS, format_named
 from q2r2_control.judging.judge import Judged, Unreadable, discarded_episodes, judge_all
 from q2r2_control.judging.page import COLUMNS, page_of
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -183,7 +183,7 @@ def _judged(recordings: Sequence[Path], config: str | None) -> _Judgements:
 
 
 def export(
-    name: Annotated[str, Argument(metavar="FORMAT", help=f"One of {', '.join(FORMATS)}.")],
+    name: Annotated[str, Argument(metavar="FORMAT", help=f"One of {', '.join(FORMATS)}, or of an installed package.")],
     recordings: Recordings,
     output: Annotated[Path, Option(metavar="OUT", help="A folder that does not exist yet.")],
     fps: Annotated[int, Option(help=f"Frames per second: 1 .. {FASTEST}.")] = 30,
@@ -206,8 +206,7 @@ def export(
     numbers. Episodes that q2r2 judge discards are left out and named. Exit code 2 if there was a recording that cannot
     be read.
     """
-    if (chosen := FORMATS.get(name)) is None:
-        raise ConfigError(f"export {name}: allowed: {', '.join(FORMATS)}")
+    chosen = format_named(name)
     chosen.require()
     sampling = FrameSampling(
         fps, trim, pictures=not no_pictures, anonymous=anonymous, ahead=chosen.ahead if ahead is None else ahead

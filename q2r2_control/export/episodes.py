@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.sampling import CameraFrames, Names, Vectors, features, sample
+from q2r2_control.export.sampling import CameraFrames, Names, Vectors, features, sample, units_of
 from q2r2_control.inputs.policy import ActionSpace
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.process.pools import pool_of
@@ -61,6 +61,11 @@ class EpisodeVectors:
     ahead: int = 0  # frames by which actions that are positions come earlier: row k has those of frame k + ahead
     part: int = 0  # which of the episodes in the file, from 1 on; 0: the whole
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # pictures by camera, one a frame
+
+    @property
+    def units(self) -> Names:
+        """The unit of each number, by feature as ``names`` are."""
+        return units_of(self.names)
 
     @property
     def frames(self) -> int:

@@ -1,4 +1,4 @@
-"""The formats of ``q2r2 export``: CSV, HDF5 and two LeRobotDatasets.
+"""The formats of ``q2r2 export``: CSV, HDF5 and two LeRobotDatasets, and those that other packages declare.
 
 CSV and HDF5 have a file for each episode; HDF5 is laid out as ``record_sim_episodes.py`` in
 https://github.com/tonyzhaozh/act does it. A further file shows all episodes as https://github.com/ARISE-Initiative/robomimic
@@ -9,27 +9,27 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.episodes import EpisodeVectors, Write
+from q2r2_control.errors import ConfigError, RecordingError, shown
+from q2r2_control.export.episodes import EpisodeVectors
+from q2r2_control.export.export_format import ExportFormat
 from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
 from q2r2_control.export.lerobot_v21 import join_v21, openpi_config, require_v21, write_v21
 from q2r2_control.extras import install_line
+from q2r2_control.plugins import EXPORTS, load_class, names_of
 
-# Name in the HDF5 file, name of the feature, unit of a joint.
+# Name in the HDF5 file, name of the feature.
 _DATA = (
-    ("observations/qpos", "observation.state", "rad"),
-    ("observations/qvel", "observation.velocity", "rad/s"),
-    ("action", "action", "rad"),
+    ("observations/qpos", "observation.state"),
+    ("observations/qvel", "observation.velocity"),
+    ("action", "action"),
 )
-_OPENING, _OPENING_UNIT = "_gripper", "0 closed .. 1 open"
 _COMPRESSION = 1  # of gzip's levels, the fastest
 ROBOMIMIC = "robomimic.h5"  # not .hdf5: some trainers of ACT read each file of that name
 # Where robomimic looks in a demonstration, and what it finds there: a link, so numbers and pictures are kept once.
@@ -88,11 +88,10 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
             file.attrs["success"] = episode.success
         for name, text in episode.notes.items():
             file.attrs[f"note_{name}"] = text
-        for name, feature, unit in _DATA:
-            values, labels = episode.vectors[feature], episode.names[feature]
-            data = file.create_dataset(name, data=values)
-            data.attrs["names"] = list(labels)
-            data.attrs["units"] = [_OPENING_UNIT if label.endswith(_OPENING) else unit for label in labels]
+        for name, feature in _DATA:
+            data = file.create_dataset(name, data=episode.vectors[feature])
+            data.attrs["names"] = list(episode.names[feature])
+            data.attrs["units"] = list(episode.units[feature])
         for name, flags in zip(("dones", "rewards"), episode.outcome().values(), strict=True):
             file.create_dataset(name, data=flags.astype(np.float32))
         images = file.create_group("observations/images")
@@ -128,20 +127,22 @@ def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
         demos.attrs["total"] = total
 
 
-@dataclass(frozen=True)
-class Format:
-    """How episodes are written one by one, and then joined in the output."""
-
-    write: Write
-    join: Callable[[Sequence[Path], Path], None]
-    require: Callable[[], object] = lambda: None  # raises ConfigError where a package is not installed
-    advice: Callable[[Path], str] | None = None  # what a trainer wants to be told of the output
-    ahead: int = 0  # frames by which actions come earlier unless --ahead says otherwise
-
-
 FORMATS = {
-    "lerobot": Format(write_shard, join_shards, require_lerobot),
-    "lerobot-v2.1": Format(write_v21, join_v21, require_v21, openpi_config),
-    "hdf5": Format(write_hdf5, gather_hdf5, require_h5py, ahead=1),
-    "csv": Format(write_table, gather_tables),
+    "lerobot": ExportFormat(write_shard, join_shards, require_lerobot),
+    "lerobot-v2.1": ExportFormat(write_v21, join_v21, require_v21, openpi_config),
+    "hdf5": ExportFormat(write_hdf5, gather_hdf5, require_h5py, ahead=1),
+    "csv": ExportFormat(write_table, gather_tables),
 }
+
+
+def format_named(name: str) -> ExportFormat:
+    """The format called ``name``, of this package or another one. Raises :class:`ConfigError` where there is none."""
+    if (own := FORMATS.get(name)) is not None:
+        return own
+    others = names_of(EXPORTS)
+    if name not in others:
+        raise ConfigError(f"export {name}: allowed: {', '.join((*FORMATS, *others))}")
+    found = load_class(EXPORTS, name)
+    if not isinstance(found, ExportFormat):
+        raise ConfigError(f"export {name} is {shown(found)}; allowed: an ExportFormat")
+    return found

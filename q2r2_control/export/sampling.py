@@ -36,6 +36,14 @@ Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b
 
 OBSERVED = ("position", "velocity", "effort", "opening")
 COMMANDED = ("reference", "gripper", "target", "reference_tool", "intervention")
+_JOINT_UNITS = {
+    "observation.state": "rad",
+    "observation.velocity": "rad/s",
+    "observation.effort": "Nm",
+    str(ActionSpace.JOINTS): "rad",
+}
+_FLAGS = ("intervention",)
+OPENING_UNIT = "0 closed .. 1 open"
 _MOVING = 0.01  # fastest joint of a reference that moves [rad/s]
 _OLDEST = 2  # periods of the camera: one picture may be lost
 
@@ -181,6 +189,22 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
     return {str(name): values.astype(np.float32) for name, (values, _) in made.items()}, {
         str(name): labels for name, (_, labels) in made.items()
     }
+
+
+def units_of(names: Names) -> Names:
+    """The unit of each number of the features, whose ``names`` are those of :func:`features`."""
+    return {feature: tuple(_unit(feature, label) for label in labels) for feature, labels in names.items()}
+
+
+def _unit(feature: str, label: str) -> str:
+    number = label.rpartition("_")[2]
+    if number == "gripper":
+        return OPENING_UNIT
+    if feature in _FLAGS:
+        return "0 or 1"
+    if feature in _JOINT_UNITS:
+        return _JOINT_UNITS[feature]
+    return "m" if number in ("x", "y", "z") else "quaternion" if number.startswith("q") else "rad"
 
 
 def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> list[int]:

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.export.formats import FORMATS, Format, write_table
+from q2r2_control.export.export_format import ExportFormat
+from q2r2_control.export.formats import FORMATS, write_table
 from tests.cli.command import q2r2
 from tests.export.files import DURATION, contents, record_two
 from tests.recording.runs import rewrite
@@ -99,7 +100,7 @@ def test_an_interrupted_export_leaves_nothing_half_and_the_next_one_ends_it(
 
     arguments = ("export", "csv", *map(str, recordings), "--output")
     with monkeypatch.context() as patch:
-        patch.setitem(FORMATS, "csv", Format(write_table, interrupted))
+        patch.setitem(FORMATS, "csv", ExportFormat(write_table, interrupted))
         assert q2r2(*arguments, str(tmp_path / "out")).exit_code == 130
     assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
     for name in ("out", "at_once"):

@@ -1,0 +1,81 @@
+"""The format ``zarr`` of ``q2r2 export``: one store, as diffusion_policy's ReplayBuffer reads it.
+
+All episodes stand one after the other in arrays under ``data``; ``meta/episode_ends`` has where each of them ends. See
+https://github.com/real-stanford/diffusion_policy, diffusion_policy/common/replay_buffer.py.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+
+from q2r2_control import EpisodeVectors, ExportFormat, RecordingError
+
+_LAYOUT = 2  # of zarr's own formats, the one that diffusion_policy's version of the package reads
+_ROWS = 1000  # numbers of so many frames in one chunk; each picture is a chunk by itself
+
+
+def array_name(feature: str) -> str:
+    """The name of a feature's array: ``state`` for ``observation.state``, ``action_tool`` for ``action.tool``."""
+    return feature.removeprefix("observation.").replace(".", "_")
+
+
+def write_episode(episode: EpisodeVectors, path: Path) -> None:
+    """Write one episode as a store of its own, at ``path``; what is there is removed."""
+    shutil.rmtree(path, ignore_errors=True)
+    root = zarr.open_group(str(path), mode="w", zarr_format=_LAYOUT)
+    root.attrs.update(
+        {
+            **{name: getattr(episode, name) for name in ("cell", "task", "fps", "recording", "success")},
+            "action_ahead_frames": episode.ahead,
+            "notes": dict(episode.notes),
+        }
+    )
+    data = root.create_group("data")
+    for feature, rows in episode.vectors.items():
+        made = _create(data, array_name(feature), rows[0])
+        made.attrs.update({"names": list(episode.names[feature]), "units": list(episode.units[feature])})
+        made.append(rows)
+    for camera, pictures in episode.cameras.items():
+        made = _create(data, camera, np.empty(pictures.size, dtype=np.uint8))
+        for pixels in pictures:
+            made.append(pixels[None])
+
+
+def join_episodes(files: Sequence[Path], folder: Path) -> None:
+    """Join stores of single episodes, at least one, in a new one. Raises :class:`RecordingError` where they differ."""
+    root = zarr.open_group(str(folder), mode="w-", zarr_format=_LAYOUT)
+    data, ends, about, first = root.create_group("data"), list[int](), list[dict[str, Any]](), ""
+    for file in files:
+        episode = zarr.open_group(str(file), mode="r")
+        about.append(dict(episode.attrs))
+        arrays = dict(episode["data"].arrays())
+        recording = str(about[-1]["recording"])
+        first = first or recording
+        for name, rows in arrays.items():
+            if not ends:
+                _create(data, name, np.empty(rows.shape[1:], dtype=rows.dtype)).attrs.update(dict(rows.attrs))
+            made = data.get(name)
+            if made is None or made.shape[1:] != rows.shape[1:] or dict(made.attrs) != dict(rows.attrs):
+                raise RecordingError(f"{recording}: has not the {name} that {first} has")
+            for begin in range(0, rows.shape[0], made.chunks[0]):
+                made.append(rows[begin : begin + made.chunks[0]])
+        if missing := set(data.array_keys()) - arrays.keys():
+            raise RecordingError(f"{recording}: has no {min(missing)}, which {first} has")
+        ends.append(arrays["action"].shape[0] + (ends[-1] if ends else 0))
+    root.create_group("meta").create_array("episode_ends", data=np.array(ends, dtype=np.int64))
+    root.attrs.update({"cell": about[0]["cell"], "fps": about[0]["fps"], "episodes": about})
+
+
+def _create(group: Any, name: str, row: Any) -> Any:
+    """An array without rows yet, of the shape and type of ``row``."""
+    rows = _ROWS if row.ndim == 1 else 1
+    return group.create_array(name, shape=(0, *row.shape), chunks=(rows, *row.shape), dtype=row.dtype)
+
+
+ZARR = ExportFormat(write_episode, join_episodes, ahead=1)
