@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+NOT_RECORDED = 3  # exit code of a run that ended well, and whose recording did not
+
 
 class Q2R2Error(Exception):
     """Root of all errors that q2r2_control raises on purpose."""

@@ -28,7 +28,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from q2r2_control import Pipeline, Robot, load_config
 from q2r2_control.config.cell import Config
 from q2r2_control.demo.assembly_tasks import TaskWatch, tasks_named
-from q2r2_control.export.lerobot import SOURCES
+from q2r2_control.export.dataset_card import SOURCES
 from q2r2_control.inputs.assembly import GRASP
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.policy import ActionSpace, PolicyInput

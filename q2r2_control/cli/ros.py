@@ -19,6 +19,7 @@ from typer.core import TyperCommand
 
 from q2r2_control.cli.output import (
     DEMO_CONFIG,
+    Anonymous,
     Json,
     Operator,
     Task,
@@ -30,6 +31,7 @@ from q2r2_control.cli.output import (
     say,
 )
 from q2r2_control.config.cell import Config, load_config
+from q2r2_control.errors import ConfigError
 from q2r2_control.process.scheduling import StopRequest, check_folder, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
 from q2r2_control.ros.launch.processes import check_rclpy, in_ros, nodes_of, run_together
@@ -241,6 +243,7 @@ def up(
     web_port: WebPort = 8080,
     task: Task = None,
     operator: Operator = None,
+    anonymous: Anonymous = False,
     namespace: Annotated[str | None, Option(metavar="NAME", help="Of all nodes, such as /cell.")] = None,
     sim_time: Annotated[bool, Option("--sim-time", help="Take the time from /clock: use_sim_time.")] = False,
 ) -> None:
@@ -248,12 +251,16 @@ def up(
 
     With controller: external the robot and its controllers are yours. The arms' teleop and an input run here, and in
     mode filtered the built-in controller between both. A node that ends by itself is reported, and all others are
-    stopped: exit 1. Words after --ros-args are for all nodes: remappings, and parameters as NODE:NAME:=VALUE.
+    stopped: exit 1. Exit 3 when the recording failed. Words after --ros-args are for all nodes: remappings, and
+    parameters as NODE:NAME:=VALUE.
     """
     notes = notes_of(task, operator, record)
     if record is not None:
         check_folder(Path(record), "--record")
-    recording = None if record is None else {"folder": record, **notes}
+    if anonymous and record is None:
+        raise ConfigError("--anonymous needs --record")
+    leaves_out: dict[str, str | float] = {"anonymous": True} if anonymous else {}
+    recording = None if record is None else {"folder": record, **notes, **leaves_out}
     page = (web_host, web_port) if web else None
     if web:
         check_viser()  # before any node starts

@@ -51,7 +51,7 @@ from q2r2_control.demo.assembly_tasks import (
     with_parts_at,
 )
 from q2r2_control.demo.trials import try_tasks
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import NOT_RECORDED, ConfigError
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
@@ -64,7 +64,6 @@ from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
 LARGEST_SPREAD = 0.03  # [m], within which all tasks reach their parts
-NOT_RECORDED = 3  # exit code of a run that ended well, and whose recording did not
 _FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())

@@ -1,4 +1,4 @@
-"""What a format of ``q2r2 export`` is; other packages declare theirs as entry points of ``q2r2_control.exports``."""
+"""A format of ``q2r2 export``. Other packages declare theirs as entry points of ``q2r2_control.exports``."""
 
 from __future__ import annotations
 

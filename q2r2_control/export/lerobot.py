@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.export.dataset_card import POSITION, SOURCES, write_card
 from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.policy import ActionSpace
 
-POSITION = ".pos"  # which lerobot looks for at the end of what a policy sees and commands
-SOURCES = "meta/recordings.json"  # which recording an episode is of; lerobot itself does not read it
 _NAME = "q2r2/recordings"  # datasets have one on the hub, where these are never sent
 # The package asks no hub, and what it and the encoder of videos print are no results of a command.
 _ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1", "SVT_LOG": "1"}
@@ -87,7 +86,8 @@ def _as_lerobot(feature: str, labels: Sequence[str]) -> list[str]:
 def join_shards(shards: Sequence[Path], folder: Path) -> None:
     """Join datasets, at least one, in a new ``folder``. Raises :class:`RecordingError` where their features differ."""
     sources = [source for shard in shards for source in json.loads((shard / SOURCES).read_text())]
-    check_alike([json.loads((shard / "meta/info.json").read_text()) for shard in shards], sources)
+    infos = [json.loads((shard / "meta/info.json").read_text()) for shard in shards]
+    check_alike(infos, sources)
     os.environ.update(_ENVIRONMENT)
     import datasets
     from lerobot.datasets.aggregate import aggregate_datasets
@@ -100,6 +100,7 @@ def join_shards(shards: Sequence[Path], folder: Path) -> None:
         shutil.rmtree(datasets.config.HF_DATASETS_CACHE, ignore_errors=True)
         datasets.config.HF_DATASETS_CACHE = cache
     write_sources(sources, folder)
+    write_card(infos[0], sources, folder)
 
 
 def check_alike(infos: Sequence[dict[str, Any]], sources: Sequence[dict[str, Any]]) -> None:

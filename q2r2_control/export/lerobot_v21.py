@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError
+from q2r2_control.export.dataset_card import write_card
 from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.lerobot import check_alike, source_of, video_key, write_sources
 from q2r2_control.export.sampling import CameraFrames, Names
@@ -139,6 +140,7 @@ def join_v21(shards: Sequence[Path], folder: Path) -> None:
         text = "".join(f"{json.dumps(line, ensure_ascii=False)}\n" for line in lines)
         (meta / f"{name}.jsonl").write_text(text, encoding="utf-8")
     write_sources(sources, folder)
+    write_card(info, sources, folder)
 
 
 def openpi_config(folder: Path) -> str:

@@ -14,9 +14,10 @@ import pytest
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.export import lerobot
+from q2r2_control.export.dataset_card import SOURCES
 from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.formats import FORMATS, ROBOMIMIC
-from q2r2_control.export.lerobot import SOURCES, join_shards, video_key
+from q2r2_control.export.lerobot import join_shards, video_key
 from q2r2_control.extras import install_line
 from tests.cli.command import q2r2
 from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures

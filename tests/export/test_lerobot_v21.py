@@ -17,6 +17,7 @@ import pytest
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.export import lerobot_v21
+from q2r2_control.export.dataset_card import CARD, write_card
 from q2r2_control.export.lerobot_v21 import DESCRIPTION, openpi_config, openpi_names
 from q2r2_control.extras import install_line
 from tests.cli.command import q2r2
@@ -71,6 +72,35 @@ def test_every_episode_has_a_table_of_its_numbers_and_tasks_are_numbered_over_al
     info = json.loads((dataset / "meta/info.json").read_text())
     assert (info["codebase_version"], info["total_frames"], info["total_videos"]) == ("v2.1", 125, 6)
     assert set(table) == {name for name, feature in info["features"].items() if feature["dtype"] != "video"}
+
+
+def test_the_readme_says_the_unit_of_every_number(dataset: Path) -> None:
+    card = (dataset / "README.md").read_text()
+    joints = "left_A1, left_A2, right_A1, right_A2 [rad]; left_gripper, right_gripper [0 closed .. 1 open]"
+    assert f"| `action` | {joints} |" in card
+    assert "| `intervention` | left, right [0 or 1] |" in card
+    assert "3 episodes at 30 frames a second" in card
+    assert "timestamp" not in card
+
+
+def test_the_readme_knows_lerobots_names_and_actions_of_later_frames(tmp_path: Path) -> None:
+    features = {
+        "action": {"dtype": "float32", "names": ["left_A1.pos", "left_gripper.pos"]},
+        "action.tool": {"dtype": "float32", "names": ["left_x", "left_qw"]},
+        "action.tool_delta": {"dtype": "float32", "names": ["left_x", "left_rx"]},
+        "observation.effort": {"dtype": "float32", "names": ["left_A1"]},
+        "timestamp": {"dtype": "float32", "names": None},
+    }
+    write_card({"robot_type": "two_arms", "fps": 10, "features": features}, [{"action_ahead_frames": 2}], tmp_path)
+    card = (tmp_path / CARD).read_text()
+    for row in (
+        "`action` | left_A1.pos [rad]; left_gripper.pos [0 closed .. 1 open]",
+        "`action.tool` | left_x [m]; left_qw [quaternion]",
+        "`action.tool_delta` | left_x [m]; left_rx [rad]",
+        "`observation.effort` | left_A1 [Nm]",
+        "`action` and `action.tool` of frame k + 2",
+    ):
+        assert row in card
 
 
 def test_every_frame_is_at_its_time_in_the_video_of_the_camera_under_openpis_name(dataset: Path) -> None:

@@ -141,7 +141,7 @@ def test_a_policy_is_asked_on_its_own_thread_and_again_when_half_of_its_actions_
 
 
 def asked(policy: PolicyInput, time: float = 1.0) -> str:
-    """What the fault says that comes of asking the policy in simulated time."""
+    """The sentence of the fault that comes of asking the policy in simulated time."""
     policy.observe(observed(time))
     (chunk,) = policy.chunks()
     assert chunk.fault is not None

@@ -20,7 +20,8 @@ pytest.importorskip("lerobot", reason="make test-lerobot installs it")
 import pyarrow.parquet
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from q2r2_control.export.lerobot import SOURCES, join_shards, video_key, write_shard
+from q2r2_control.export.dataset_card import SOURCES
+from q2r2_control.export.lerobot import join_shards, video_key, write_shard
 from q2r2_control.export.sampling import Pixels
 from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, contents, record_two, with_pictures
 from tests.export.test_formats import export

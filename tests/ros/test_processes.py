@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from q2r2_control import Robot
+from q2r2_control.errors import NOT_RECORDED
 from q2r2_control.ros.launch import executables
 from q2r2_control.ros.launch.processes import NO_INPUT, NodeProcess, nodes_of
 from q2r2_control.types import SIDES
@@ -67,6 +68,14 @@ def test_a_process_that_dies_is_reported_and_ends_the_others(pair: RosProcess) -
     assert f"first (process {first}) was ended by SIGKILL" in pair.wait_for("[up] ")
     assert pair.wait(30.0) == 1
     assert not alive(second)
+
+
+def test_a_set_whose_recording_failed_says_so_by_its_exit_code(processes: Processes) -> None:
+    process = processes.start(sys.executable, "-c", PAIR.replace("sys.exit(0)", f"sys.exit({NOT_RECORDED})"), name="up")
+    for name in ("first", "second"):
+        process.wait_for(f"[{name}] ready")
+    assert process.interrupt(30.0) == NOT_RECORDED
+    assert "all stopped, but the recording of first failed" in process.output
 
 
 def test_a_process_that_does_not_end_is_killed(pair: RosProcess) -> None:
@@ -149,6 +158,10 @@ def test_the_command_adds_a_recorder_first_and_a_page_last(monkeypatch: pytest.M
     assert started[0].parameters == {"config": CONFIG, "folder": "DIR"}
     assert started[-1].parameters["web_port"] == 0
     assert started[-1].parameters["recorded"]
+    started.clear()
+    assert q2r2(*f"ros up {CONFIG} --input scripted --record DIR --operator Ada --anonymous".split()).exit_code == 0
+    assert started[0].parameters == {"config": CONFIG, "folder": "DIR", "operator": "Ada", "anonymous": True}
+    assert "--anonymous needs --record" in q2r2(*f"ros up {CONFIG} --anonymous".split()).stderr
 
 
 def test_what_the_command_is_given_for_ros_reaches_every_node(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import signal
 import sys
 import time
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from q2r2_control.errors import NOT_RECORDED
 from q2r2_control.events import Event, ReasonKind
 from tests.ros.conftest import need_ros
 from tests.ros.processes import CONFIG, Processes
@@ -186,7 +188,20 @@ def test_a_folder_that_cannot_be_written_is_an_error(node: Any, processes: Proce
     recorder = RunningRecorder(node, processes, tmp_path / "file")
     recorder.state(level="error", records=False)
     assert not call(node, "/recorder/start").success
-    assert recorder.process.interrupt(60.0) == 0
+    assert recorder.process.interrupt(60.0) == NOT_RECORDED
+
+
+def test_an_anonymous_recording_names_neither_the_operator_nor_the_computer(
+    processes: Processes, tmp_path: Path
+) -> None:
+    notes = ("operator:=Ada", "anonymous:=true")
+    process = processes.start_node("recorder", f"config:={CONFIG}", f"folder:={tmp_path}", *notes)
+    process.wait_for("records to")
+    assert process.interrupt(60.0) == 0
+    about = open_recording(next(tmp_path.rglob("*.mcap"))).about
+    assert "operator" not in about.notes
+    assert platform.node() not in about.notes["machine"]
+    assert "version" in about.notes
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from lerobot_robot_q2r2.hands import HandsDoor
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.export.lerobot import POSITION
+from q2r2_control.export.dataset_card import POSITION
 from q2r2_control.inputs.policy import ActionSpace, PolicyInput, action_names
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import make_plant

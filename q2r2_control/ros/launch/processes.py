@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
-from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.errors import NOT_RECORDED, ConfigError, Q2R2Error
 from q2r2_control.extras import install_line
 from q2r2_control.plugins import INPUTS, load_class
 from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_signals
@@ -58,7 +58,7 @@ def nodes_of(
     path: str,
     source: str | None = None,
     robot: str = "auto",
-    recording: Mapping[str, str] | None = None,
+    recording: Mapping[str, str | float] | None = None,
     separate: bool = False,
     page: tuple[str, int] | None = None,
 ) -> list[NodeProcess]:
@@ -135,8 +135,8 @@ class UpError(Q2R2Error):
 def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> int:
     """Start ``nodes`` and pass each line that they print to ``say``, after the node's name; returns the exit code.
 
-    Ctrl-C or SIGTERM ends all of them: 0. A node that ends by itself is reported at once and ends the others: 1. None
-    is restarted. Each is a session of its own, so that Ctrl-C in a terminal reaches it only from here, in order. If
+    Ctrl-C or SIGTERM ends all of them: 0, or 3 if a node says by this code that its recording failed. A node that ends
+    by itself is reported at once and ends the others: 1. None is restarted. Each is a session of its own, so that Ctrl-C in a terminal reaches it only from here, in order. If
     this process is killed, Linux interrupts them all: arms must not move in a teleoperation that cannot be ended.
     ``say`` is called by several threads, one at a time. Message packages that are missing are built first. Raises
     :class:`UpError`, and :class:`BuildError` where these cannot be built.
@@ -163,8 +163,12 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
             _end(running, say_alone)
             for reader in readers:
                 reader.join(1.0)
-    say_alone(f"[up] {dead} ended by itself; all others have been stopped" if dead else "[up] all stopped")
-    return 1 if dead else 0
+    if dead:
+        say_alone(f"[up] {dead} ended by itself; all others have been stopped")
+        return 1
+    failed = [name for name, process in running.items() if process.returncode == NOT_RECORDED]
+    say_alone(f"[up] all stopped, but the recording of {failed[0]} failed" if failed else "[up] all stopped")
+    return NOT_RECORDED if failed else 0
 
 
 def check_rclpy() -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -22,10 +23,10 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from q2r2_control.config.cell import load_config
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import NOT_RECORDED, ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
-from q2r2_control.recording.about import ROS, About, as_yaml, program
+from q2r2_control.recording.about import ROS, About, anonymous, as_yaml, program
 from q2r2_control.recording.messages import (
     RECORDER_EVENTS,
     Message,
@@ -69,6 +70,7 @@ class RecorderNode(BaseNode):
             name: self.parameter(name, "", f"{what}, noted in the recording; empty: not")
             for name, what in (("task", "what is done"), ("operator", "whose hands"))
         }
+        leaves_out = self.parameter("anonymous", False, "without the operator and the name of this computer")
         if not folder:
             raise ConfigError("parameter folder: empty; allowed: a folder")
         cameras = {name: camera.topic for name, camera in config.cameras.items() if camera.topic is not None}
@@ -96,6 +98,8 @@ class RecorderNode(BaseNode):
             source=ROS,
             notes={**program(), **{name: text for name, text in notes.items() if text}},
         )
+        if leaves_out:
+            about = replace(about, notes=anonymous(about.notes))
         self._recorder.begin(about, topics)
         self._listen(topics, {arm_events(arm) for arm in robot.arms}, cameras.values())
         for name, kind in _SERVICES.items():
@@ -194,11 +198,13 @@ class RecorderNode(BaseNode):
         return OK, f"records to {recorder.file}", values
 
     def close(self) -> None:
-        """Write what there is, and say what became of it."""
+        """Write what there is, and say what became of it: by the exit code too, if the recording failed."""
         recorder = self._recorder
         self._judge.close()
         recorder.record(self._waiting)
         recorder.finish()
+        if recorder.fault is not None:
+            self.exit_code = NOT_RECORDED
         lost = recorder.count - recorder.written.messages
         if recorder.file is not None:
             written = f"{recorder.file}: {recorder.written.messages} messages"
