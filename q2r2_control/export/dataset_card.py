@@ -23,7 +23,7 @@ def write_card(info: Mapping[str, Any], sources: Sequence[Mapping[str, Any]], fo
         "---\ntags:\n- LeRobot\n- q2r2_control\n---\n",
         f"# {info['robot_type']}\n",
         f"{len(sources)} episodes at {info['fps']} frames a second, made by `q2r2 export`.{later}",
-        f"`{SOURCES}` says which recording each episode is of. `lerobot-edit-dataset` makes datasets without that file.\n",
+        f"`{SOURCES}` says which recording each episode is of. `lerobot-edit-dataset` makes datasets without it.\n",
         "| feature | numbers, in their order, with their units |",
         "|---|---|",
         *(f"| `{feature}` | {_numbers(feature, labels)} |" for feature, labels in vectors.items()),

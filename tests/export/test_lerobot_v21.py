@@ -23,7 +23,9 @@ from q2r2_control.extras import install_line
 from tests.cli.command import q2r2
 from tests.export.files import EPISODES, HEIGHT, WIDTH, Waves
 from tests.export.test_formats import export
+from tests.support.modules import load_script
 
+pa = pytest.importorskip("pyarrow", reason="the extra export is not installed")
 parquet = pytest.importorskip("pyarrow.parquet", reason="the extra export is not installed")
 av = pytest.importorskip("av", reason="the extra export is not installed")
 
@@ -174,3 +176,24 @@ def test_without_pyarrow_one_line_says_how_to_install_it(tmp_path: Path, monkeyp
     result = q2r2("export", "lerobot-v2.1", str(tmp_path / "a.mcap"), "--output", str(tmp_path / "out"))
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
     assert install_line("export") in result.stderr
+
+
+def test_the_example_moves_the_actions_of_each_episode_and_nothing_else(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["ahead.py", str(dataset), str(tmp_path / "ahead")])
+    load_script("examples/learning/ahead.py").main()
+    for number, episode in enumerate(SEEN):
+        name = f"data/chunk-000/episode_{number:06d}.parquet"
+        before, after = (parquet.read_table(folder / name) for folder in (dataset, tmp_path / "ahead"))
+        rows = episode.vectors["action"]
+        np.testing.assert_array_equal(np.array(after["action"].to_pylist(), np.float32), [*rows[1:], rows[-1]])
+        assert before.drop(["action"]).equals(after.drop(["action"]))
+        assert before.schema == after.schema
+
+
+def test_the_example_repeats_the_last_action_of_each_episode_in_a_table_of_several() -> None:
+    table = pa.table({"action": [0, 1, 2, 10, 11], "episode_index": [0, 0, 0, 1, 1]})
+    shifted = load_script("examples/learning/ahead.py").shifted
+    assert shifted(table, 1)["action"].to_pylist() == [1, 2, 2, 11, 11]
+    assert shifted(table, 5)["action"].to_pylist() == [2, 2, 2, 11, 11]

@@ -136,10 +136,11 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
     """Start ``nodes`` and pass each line that they print to ``say``, after the node's name; returns the exit code.
 
     Ctrl-C or SIGTERM ends all of them: 0, or 3 if a node says by this code that its recording failed. A node that ends
-    by itself is reported at once and ends the others: 1. None is restarted. Each is a session of its own, so that Ctrl-C in a terminal reaches it only from here, in order. If
-    this process is killed, Linux interrupts them all: arms must not move in a teleoperation that cannot be ended.
-    ``say`` is called by several threads, one at a time. Message packages that are missing are built first. Raises
-    :class:`UpError`, and :class:`BuildError` where these cannot be built.
+    by itself is reported at once and ends the others: 1. None is restarted. Each is a session of its own, so that
+    Ctrl-C in a terminal reaches it only from here, in order. If this process is killed, Linux interrupts them all:
+    arms must not move in a teleoperation that cannot be ended. ``say`` is called by several threads,
+    one at a time. Message packages that are missing are built first. Raises :class:`UpError`, and :class:`BuildError`
+    where these cannot be built.
     """
     check_rclpy()
     build_missing(say)
