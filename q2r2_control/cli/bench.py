@@ -54,7 +54,9 @@ def bench(
     rounds: Annotated[int | None, Option(min=1, help=f"How often: {_ROUNDS}, with --work 1.")] = None,
     peers: Annotated[bool, Option(help="Measure roboplan, mink, pink and embodik too, where installed.")] = True,
     work: Annotated[bool, Option("--work", help="Two-armed work motions instead of circle and contact.")] = False,
-    motion: Annotated[list[str] | None, Option(help="With --work: only this, or such as begin so; repeatable.")] = None,
+    motion: Annotated[
+        list[str] | None, Option(metavar="NAME", help="With --work: only this, or such as begin so; repeatable.")
+    ] = None,
     solver: Solver = None,
     json: Json = False,
 ) -> None:

@@ -17,10 +17,10 @@ from q2r2_control.cli.output import (
     notice_of_compiling,
     recording_line,
     say,
-    summary_table,
     task_line,
     verdict_markup,
 )
+from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, held_to_promises
@@ -215,8 +215,8 @@ def _run_pipeline(
     return CellRun(summary, results)
 
 
-def print_summary(run: CellRun, json: bool) -> None:
-    """Print the summary of a run on stdout, as a table or as one JSON object, and the verdict on its recording."""
+def print_summary(run: CellRun, json: bool, verbose: bool = False) -> None:
+    """Print a run on stdout: its verdict, those on its tasks and its recording, and figures; or one JSON object."""
     if json:
         data = run.summary.as_json()
         if run.tasks:
@@ -228,12 +228,12 @@ def print_summary(run: CellRun, json: bool) -> None:
         print(as_json_text(data))
         return
     console = Console()
-    print_table(summary_table(run.summary), console)
-    _print_lines(console, map(task_line, run.tasks))
+    _print_lines(console, [verdict_line(run.summary), *map(task_line, run.tasks)])
     if (late := late_line(run.summary, run.tasks)) is not None:
         _print_lines(console, [late])
     if run.recording is not None:
         _print_lines(console, _recording_lines(run.recording))
+    print_table(summary_table(run.summary, verbose), console)
 
 
 def _print_lines(console: Console, lines: Iterable[str]) -> None:

@@ -1,4 +1,4 @@
-"""Output of commands: JSON on stdout, the summary of a run, and all else on stderr or as tables."""
+"""Output of commands: JSON on stdout, lines on a run, and all else on stderr or as tables."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
-from rich.text import Text
 from typer import Argument, Option
 
 from q2r2_control.config.cell import Config
@@ -22,13 +21,10 @@ from q2r2_control.control.jit import compiling
 from q2r2_control.control.solvers.registry import check_installed
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import ReasonKind
 from q2r2_control.judging.judge import Verdict
 from q2r2_control.recording.recorder import RecordingSummary
-from q2r2_control.summary.run_summary import ArmSummary, Percentiles, RunSummary, TorqueSummary
-from q2r2_control.teleop.arm_states import ArmState, is_fault
-from q2r2_control.viewer.tables import figure_table, print_table
-from q2r2_control.wording import sentence
+from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.viewer.tables import print_table
 
 # A loop that was late by more [us], or by over a period in a larger share of its ticks, may be why a task failed.
 _LATE, _OFTEN = 2e4, 0.2
@@ -47,6 +43,7 @@ Wait = Annotated[
         min=0, metavar="SECONDS", help="For KUKA's cabinets to be there; by default 60, and without end at a terminal."
     ),
 ]
+Verbose = Annotated[bool, Option("--verbose", help="All figures of the summary, not only those of the result.")]
 Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
 Task = Annotated[str | None, Option(help="With --record: what is done, noted in the recording.")]
 Solver = Annotated[
@@ -152,68 +149,6 @@ def longest_wait(asked: float | None) -> float:
     return math.inf if sys.stderr.isatty() else SCRIPTS_WAIT_S
 
 
-def summary_table(summary: RunSummary) -> Table:
-    """The figures of a run."""
-    rows = ((name, Text.from_markup(figures)) for name, figures in _rows(summary))
-    return figure_table("summary", ("figure", "value"), rows)
-
-
-def _rows(summary: RunSummary) -> Iterator[tuple[str, str]]:
-    factor = "" if summary.real_time_factor is None else f", {summary.real_time_factor:.1f} x real time"
-    yield "duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {summary.loop_rate_hz:.0f} Hz{factor}"
-    yield "tick", _percentiles(summary.tick_us, "us", 0)
-    if summary.lateness_us.max is not None:
-        late = _percentiles(summary.lateness_us, "us", 0)
-        yield "ticks late by", f"{late}; {summary.overruns} by more than a period"
-    yield "input to command", _percentiles(summary.input_to_command_ms, "ms", 2)
-    for name, arm in summary.arms.items():
-        yield f"{name} arm", ", ".join(_arm_figures(arm))
-        if not arm.followed:
-            yield (
-                f"{name} arm at the end",
-                f"[red]{arm.end_error_mm:.0f} mm from its reference[/]: the tool did not follow",
-            )
-        if arm.policy_s > 0.0 or arm.interventions:
-            taken_over = f"{arm.interventions} interventions, {arm.intervention_s:.2f} s"
-            yield f"{name} arm by the policy", f"{arm.policy_s:.2f} s; {taken_over}"
-        if arm.gripper_held_by is not None:
-            yield f"{name} gripper held for", f"{arm.gripper_held_s:.2f} s, by {' | '.join(arm.gripper_held_by)}"
-        if arm.object_held_s is not None:
-            yield f"{name} object part of the tool for", f"{arm.object_held_s:.2f} s"
-    if summary.min_distance_mm is not None and summary.closest_pair is not None:
-        yield "nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}"
-    velocity, acceleration = (100.0 * ratio for ratio in (summary.max_velocity_ratio, summary.max_acceleration_ratio))
-    yield "velocity, acceleration", f"{velocity:.0f} % of the limits at most, {acceleration:.0f} %"
-    yield "room to position limits", f"{summary.min_position_margin_rad:.3f} rad at least"
-    uncertified = f"{summary.uncertified_ticks} ticks without a certificate"
-    uncertified = f"[red]{uncertified}[/]" if summary.uncertified_ticks else uncertified
-    yield "certified stops executed", f"{summary.fallback_ticks} ticks; {uncertified}"
-    yield "targets rejected", str(summary.rejected_targets)
-    if summary.missed_ticks:
-        yield "ticks missed", f"{summary.missed_ticks}, which made the motion {summary.stretched_s:.2f} s late in all"
-    # The last event of each arm, if something else than its button paused it, or kept it from being engaged.
-    between = (ArmState.PAUSING, ArmState.ALIGNING)
-    last = {event.arm: event for event in summary.events if event.destination not in between}
-    for name, event in last.items():
-        if is_fault(event):
-            label = f"{name} arm" if event.kind is ReasonKind.NOT_ENGAGED else f"{name} arm paused by"
-            yield label, f"[yellow]{escape(sentence(event.reason))}[/], at {event.t:.2f} s"
-    if summary.torque is not None:
-        yield from _torque_rows(summary.torque)
-    yield "arms at the end", "at rest" if summary.at_rest else "[red]moving[/]"
-
-
-def _arm_figures(arm: ArmSummary) -> Iterator[str]:
-    yield f"engaged {arm.engaged_s:.2f} s"
-    if arm.position_error_mm_rms is not None and arm.rotation_error_deg_rms is not None:
-        yield f"error {arm.position_error_mm_rms:.2f} mm, {arm.rotation_error_deg_rms:.2f} deg RMS"
-    if arm.slip_mm_max > 0.0 or arm.slip_deg_max > 0.0:
-        yield f"target slipped {arm.slip_mm_max:.0f} mm, {arm.slip_deg_max:.0f} deg"
-    if arm.yielded_mm_max > 0.0 or arm.yielded_deg_max > 0.0:
-        yield f"yielded {arm.yielded_mm_max:.0f} mm, {arm.yielded_deg_max:.0f} deg"
-    yield f"gripper changes {arm.gripper_changes}"
-
-
 def task_line(task: TaskResult) -> str:
     """One line of markup: whether a task succeeded, and what was measured of it."""
     figures = ", ".join(
@@ -253,25 +188,3 @@ def verdict_markup(verdict: Verdict) -> str:
     """One line of markup: whether an episode is kept, and why not."""
     colour = "green" if verdict.keep else "red"
     return f"[{colour}]{verdict.word}[/]{escape(verdict.line.removeprefix(verdict.word))}"
-
-
-def _torque_rows(torque: TorqueSummary) -> Iterator[tuple[str, str]]:
-    if torque.min_measured_distance_mm is not None and torque.measured_closest_pair is not None:
-        pair = " | ".join(torque.measured_closest_pair)
-        found = f"{torque.min_measured_distance_mm:.1f} mm, {pair}"
-        met = f"[red]measured links met: {found}; what was measured broke what was promised[/]"
-        yield "nearest measured pair", met if torque.met else found
-    pressed = ", ".join(" | ".join(pair) for pair in torque.pressed_pairs)
-    force = f": {torque.max_wall_force_n:.0f} N at most" if pressed else ""
-    yield "wall pressed by", f"{pressed or 'no pair'}{force}"
-    limits = f"{torque.saturated_ticks} ticks at a limit, {torque.rate_limited_ticks} at the rate limit"
-    yield "torque", f"{limits}, {torque.held_ticks} held without a measurement"
-    for arm, off_s in torque.off_reference_s.items():
-        if off_s > 0.0:
-            yield f"{arm} arm off its reference", f"[red]{off_s:.2f} s[/] beyond the impedance's error clip"
-
-
-def _percentiles(values: Percentiles, unit: str, digits: int) -> str:
-    if values.p50 is None or values.p99 is None or values.max is None:
-        return "-"
-    return f"median {values.p50:.{digits}f} {unit}, p99 {values.p99:.{digits}f}, max {values.max:.{digits}f}"

@@ -16,15 +16,16 @@ from q2r2_control.cli.cell_run import check_window, show_window
 from q2r2_control.cli.output import (
     Anonymous,
     Json,
+    Verbose,
     WebHost,
     WebPort,
     as_json_text,
     counting,
     notice_of_compiling,
     say,
-    summary_table,
     verdict_markup,
 )
+from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import FASTEST, FrameSampling, Output, keep_episodes
@@ -53,6 +54,7 @@ def replay(
     web: Annotated[bool, Option("--web", help="Show it in a browser with a time line; the extra `web`.")] = False,
     web_host: WebHost = "127.0.0.1",
     web_port: WebPort = 8080,
+    verbose: Verbose = False,
     json: Json = False,
 ) -> None:
     """Give a recorded run's hand samples and measured states to the same loop again, tick by tick.
@@ -94,7 +96,9 @@ def replay(
         if compare:
             print("identical" if result.difference is None else f"first difference at {result.difference}")
         elif result.summary is not None:
-            Console().print(summary_table(result.summary))
+            console = Console()
+            console.print(verdict_line(result.summary), soft_wrap=True, highlight=False)
+            console.print(summary_table(result.summary, verbose))
         for name, arm in result.arms.items():
             off = f"{arm.position_mm_rms:.3f} mm RMS, {arm.position_mm_max:.3f} mm and {arm.rotation_deg_max:.3f} deg"
             print(f"{name} arm: tool {off} at most from where it was when recorded")

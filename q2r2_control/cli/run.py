@@ -26,6 +26,7 @@ from q2r2_control.cli.output import (
     RealTime,
     Solver,
     Task,
+    Verbose,
     Wait,
     WebHost,
     WebPort,
@@ -113,6 +114,7 @@ def run(
     i_know: Annotated[bool, Option("--i-know", help="Run real cabinets without q2r2 commission.")] = False,
     full_speed: Annotated[bool, Option("--full-speed", help="Run real cabinets faster than a tenth.")] = False,
     wait: Wait = None,
+    verbose: Verbose = False,
     json: Json = False,
 ) -> None:
     """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
@@ -166,7 +168,7 @@ def run(
         longest_wait=longest_wait(wait),
     )
     done = run_cell(cell, options)
-    print_summary(done, json)
+    print_summary(done, json, verbose)
     if not done.summary.followed or (done.summary.torque is not None and done.summary.torque.met):
         raise Exit(1)
     if not done.was_recorded:
@@ -210,6 +212,7 @@ def demo(
     anonymous: Anonymous = False,
     rt: RealTime = False,
     solver: Solver = None,
+    verbose: Verbose = False,
     json: Json = False,
 ) -> None:
     """Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted hands.
@@ -274,7 +277,7 @@ def demo(
     else:
         cell = with_parts_at(with_controls(load_config(DEMO_CONFIG)), chosen, place)
         done = run_cell(with_solver(cell, solver), options)
-    print_summary(done, json)
+    print_summary(done, json, verbose)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)
     if not done.was_recorded:

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from q2r2_control import Pipeline, RunSummary
-from q2r2_control.cli.output import late_line, summary_table
+from q2r2_control.cli.output import late_line
+from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.demo.assembly_tasks import TaskResult, held_to_promises
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.summary.run_summary import Percentiles, TorqueSummary
@@ -59,8 +60,38 @@ def summary() -> RunSummary:
     return Pipeline.from_config(config, input=HandsInput(), plant="kinematic").run(0.5, realtime=False)
 
 
-def text_of(summary: RunSummary) -> str:
-    return printed(summary_table(summary), width=160)
+def text_of(summary: RunSummary, verbose: bool = True) -> str:
+    return printed(summary_table(summary, verbose), width=160)
+
+
+def test_the_verdict_says_what_is_wrong_or_that_nothing_is(summary: RunSummary) -> None:
+    still = {name: replace(arm, engaged_s=0.0) for name, arm in summary.arms.items()}
+    good = replace(summary, arms=still | {"left": replace(still["left"], engaged_s=0.4)}, events=[])
+    assert verdict_line(good) == "[green]as it should be[/]: left followed, every tick certified, at rest at the end"
+    assert verdict_line(replace(good, arms=still)).startswith("[yellow]no arm was engaged[/]")
+    reason = Reason.of(ReasonKind.LOOP_STALLED, duration=0.4)
+    stopped = verdict_line(replace(good, events=[Event(0.3, "left", "engaged", "lost", reason)]))
+    assert stopped == f"[yellow]an arm was stopped or refused[/]: left arm {sentence(reason)}"
+    off = good.arms | {"right": replace(good.arms["right"], end_error_mm=130.0)}
+    bad = verdict_line(replace(good, uncertified_ticks=3, at_rest=False, arms=off))
+    assert bad == (
+        "[red]not as it should be[/]: right arm is 130 mm from its reference at the end; "
+        "3 ticks without a certificate; arms move at the end"
+    )
+
+
+def test_the_summary_is_short_unless_all_is_asked_for_and_never_hides_what_is_wrong(summary: RunSummary) -> None:
+    short, whole = text_of(summary, verbose=False), text_of(summary)
+    for figure in ("input to command", "room to position limits", "velocity, acceleration", "certified stops"):
+        assert figure not in short
+        assert figure in whole
+    for figure in ("duration", "left arm", "nearest pair", "arms at the end"):
+        assert figure in short
+        assert figure in whole
+    torque = TorqueSummary({"left": 0.5}, min_measured_distance_mm=-2.0, measured_closest_pair=("a", "b"))
+    wrong = text_of(replace(summary, fallback_ticks=4, rejected_targets=2, torque=torque), verbose=False)
+    for figure in ("certified stops executed", "targets rejected", "measured links met: -2.0 mm", "off its reference"):
+        assert figure in wrong
 
 
 def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_the_reason(
