@@ -5,8 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import typer
-
+from q2r2_control.cli.answers import RememberedAnswers
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.description import MJCF_ENDS
@@ -23,7 +22,9 @@ def named_values(given: list[str]) -> dict[str, str]:
     return {name: value for name, _, value in (text.partition("=") for text in given)}
 
 
-def without_mjcf(models: dict[str, str], name: str, velocity: float | None, yes: bool) -> dict[str, str]:
+def without_mjcf(
+    models: dict[str, str], name: str, velocity: float | None, yes: bool, answers: RememberedAnswers
+) -> dict[str, str]:
     """The models, with a URDF that is written here in place of each MJCF file. Raises :class:`Q2R2Error`."""
     sides = {model: side for side, model in reversed(models.items()) if model.endswith(MJCF_ENDS)}
     files = {model: Path(f"{name}_{side}.urdf") for model, side in sides.items()}
@@ -38,7 +39,7 @@ def without_mjcf(models: dict[str, str], name: str, velocity: float | None, yes:
         raise ConfigError("--velocity: an MJCF has no limits of speed; allowed: what each joint bears [rad/s]")
     if velocity is None:
         question = "limit of the joints' speed, which an MJCF does not have, in rad/s"
-        velocity = asked(question, 1.0, yes)
+        velocity = answers.ask(question, 1.0)
         if not SPEEDS[0] <= velocity <= SPEEDS[1]:
             raise ConfigError(f"{question} = {velocity:g}: allowed: {SPEEDS[0]:g} .. {SPEEDS[1]:g}")
     urdfs = {model: urdf_of_mjcf(find_resource(model), file.parent, velocity) for model, file in files.items()}
@@ -46,7 +47,3 @@ def without_mjcf(models: dict[str, str], name: str, velocity: float | None, yes:
         ET.indent(urdf)
         files[model].write_text(ET.tostring(urdf, encoding="unicode"), encoding="utf-8")
     return {side: str(files.get(model, model)) for side, model in models.items()}
-
-
-def asked(question: str, usual: float, yes: bool) -> float:
-    return usual if yes else float(typer.prompt(question, default=usual, type=float))

@@ -10,14 +10,14 @@ from typing import Annotated, Any
 
 import numpy as np
 import pinocchio as pin
-import typer
 import yaml
 from rich.console import Console
 from typer import Argument, Exit, Option
 
+from q2r2_control.cli.answers import RememberedAnswers
 from q2r2_control.cli.cell_report import check_cell
 from q2r2_control.cli.cell_yaml import commented_yaml
-from q2r2_control.cli.model_arguments import SPEEDS, asked, named_values, without_mjcf
+from q2r2_control.cli.model_arguments import SPEEDS, named_values, without_mjcf
 from q2r2_control.cli.output import Json, as_json_text, counting, say
 from q2r2_control.config.cell import Config, load_config, parse_config
 from q2r2_control.errors import ConfigError, Q2R2Error
@@ -36,6 +36,7 @@ from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
 
+_ANSWERS = Path("new-cell.answers.json")  # in the folder that the cell is written to
 _FITS = 8  # capsules in the table
 _LEAST_JOINTS = 3  # of an arm
 _OFF_FLOOR = 0.03  # that each link can get at least [m]
@@ -89,7 +90,8 @@ def new_cell(
 ) -> None:
     """Write the YAML of a cell for models of your own: tips, grippers, mounts, a home, pairs of links, accelerations.
 
-    Exit 1 where q2r2 check still finds faults in it, which are listed.
+    Exit 1 where q2r2 check still finds faults in it, which are listed. Answers are kept in new-cell.answers.json until
+    it finds none, so that the next try offers them.
     """
     file, srdf = Path(f"{name}.yaml"), Path(f"{name}.srdf")
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
@@ -104,11 +106,14 @@ def new_cell(
         raise ConfigError("--xacro-arg: allowed with a model that ends in .xacro")
     tips = {"left": left_tip, "right": right_tip}
     given = {side: model for side, model in (("left", left), ("right", right), ("robot", robot)) if model is not None}
-    models = without_mjcf(given, name, velocity, yes)
+    answers = RememberedAnswers(_ANSWERS, given, yes)
+    if answers.any:
+        say(f"the answers of the last try are offered, from {_ANSWERS}")
+    models = without_mjcf(given, name, velocity, yes, answers)
     robot = models.get("robot")
     _survey(draft, dict.fromkeys(tips, robot) if robot else models, tips, shared=robot)
-    _mount(draft, distance, height, yes)
-    _place(draft, yes)
+    _mount(draft, distance, height, answers)
+    _place(draft, answers)
     with counting() as progress:
         found = draft.config()
         cell = Robot.from_config(found)
@@ -134,6 +139,8 @@ def new_cell(
         print(as_json_text({"file": str(file), "capsules": draft.fits, "notes": notes, "faults": faults}))
     else:
         _print(draft, notes, faults)
+    if not faults:
+        answers.forget()
     raise Exit(1 if faults else 0)
 
 
@@ -201,17 +208,17 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         draft.data["capsules"] = capsules
 
 
-def _mount(draft: _Draft, distance: float | None, height: float | None, yes: bool) -> None:
+def _mount(draft: _Draft, distance: float | None, height: float | None, answers: RememberedAnswers) -> None:
     """Where the bases stand, which only the user knows."""
     arms, shared = draft.data["arms"], draft.data.get("robot")
     length = max(compose(draft.config()).arm_lengths().values())
     usual = round(min(max(length, 0.3), 1.0), 1)
     if distance is None:
         apart = len(arms) == 2 and shared is None
-        distance = asked("metres between the bases of both arms", usual, yes) if apart else 0.0
+        distance = answers.ask("metres between the bases of both arms", usual) if apart else 0.0
     if height is None:
         stand = _stand(Robot.from_config(draft.config()), has_feet=shared is not None)
-        height = asked("height of the base above the floor in metres", stand, yes)
+        height = answers.ask("height of the base above the floor in metres", stand)
     for side, part in {"robot": shared}.items() if shared is not None else arms.items():
         y = 0.0 if side == "robot" or len(arms) == 1 else distance / 2 if side == "left" else -distance / 2
         part["mount"]["position"] = [0.0, round(y, 4), height]
@@ -233,7 +240,7 @@ def _stand(robot: Robot, has_feet: bool) -> float:
     return math.ceil(100.0 * max(-min(lowest), _OFF_FLOOR - farthest)) / 100.0
 
 
-def _place(draft: _Draft, yes: bool) -> None:
+def _place(draft: _Draft, answers: RememberedAnswers) -> None:
     """A home for each arm, apart from pairs that never part, which get a distance of their own or none."""
     config = draft.config()
     robot = Robot.from_config(config)
@@ -264,7 +271,7 @@ def _place(draft: _Draft, yes: bool) -> None:
             like = mirrored_home(robot, side, twins[0], q)
         found: Array = find_home(robot, side, q, kept, placed, like).round(3)
         text = " ".join(f"{value:g}" for value in found)
-        answer = text if yes else typer.prompt(f"home of the {side} arm, found; or yours in radians", default=text)
+        answer = answers.ask(f"home of the {side} arm, found; or yours in radians", text)
         try:
             home = [float(part) for part in re.split(r"[,\s]+", answer.strip(" []"))]
         except ValueError:

@@ -1,0 +1,77 @@
+"""Answers outlast a command that was interrupted or failed, and are offered about the same things only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from q2r2_control.cli import answers
+from q2r2_control.cli.answers import RememberedAnswers
+
+ABOUT = {"left": "iiwa7"}
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "answers.json"
+
+
+def offered(monkeypatch: pytest.MonkeyPatch, *typed: Any) -> list[Any]:
+    """The defaults that are offered from now on, while ``typed`` is answered; None: what is offered is accepted."""
+    seen: list[Any] = []
+    left = list(typed)
+
+    def prompt(question: str, default: Any, type: Any) -> Any:
+        seen.append(default)
+        answer = left.pop(0)
+        return default if answer is None else answer
+
+    monkeypatch.setattr(answers.typer, "prompt", prompt)
+    return seen
+
+
+def test_the_next_try_offers_what_was_answered_and_not_what_was_accepted(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = offered(monkeypatch, 0.4, None, None, None)
+    first = RememberedAnswers(file, ABOUT)
+    assert not first.any
+    assert (first.ask("height", 0.1), first.ask("home", "0 1")) == (0.4, "0 1")
+    again = RememberedAnswers(file, ABOUT)
+    assert again.any
+    assert again.ask("height", 0.2) == 0.4
+    assert again.ask("home", "0 2") == "0 2", "a home that was found is found anew"
+    assert seen == [0.1, "0 1", 0.4, "0 2"]
+    again.forget()
+    assert not file.exists()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"about": {"left": "panda"}, "answers": {"height": 3.0}}'])
+def test_a_file_about_something_else_or_a_damaged_one_is_not_offered(
+    text: str, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.write_text(text)
+    seen = offered(monkeypatch, None)
+    assert RememberedAnswers(file, ABOUT).ask("height", 0.1) == 0.1
+    assert seen == [0.1]
+
+
+def test_an_answer_of_another_kind_is_not_offered(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file.write_text('{"about": {"left": "iiwa7"}, "answers": {"height": "high"}}')
+    seen = offered(monkeypatch, None)
+    assert RememberedAnswers(file, ABOUT).ask("height", 0.1) == 0.1
+    assert seen == [0.1]
+
+
+def test_nothing_is_asked_offered_or_kept_where_all_is_taken_as_found(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offered(monkeypatch, 0.4)
+    RememberedAnswers(file, ABOUT).ask("height", 0.1)
+    seen = offered(monkeypatch)
+    before = file.read_text()
+    assert RememberedAnswers(file, ABOUT, yes=True).ask("height", 0.1) == 0.1
+    assert seen == []
+    assert file.read_text() == before
