@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-NOT_RECORDED = 3  # exit code of a run that ended well, and whose recording did not
-
 
 class Q2R2Error(Exception):
     """Root of all errors that q2r2_control raises on purpose."""
@@ -31,6 +29,9 @@ class PlantError(Q2R2Error):
 
 class RecordingError(Q2R2Error):
     """A recording cannot be read or replayed; the message names the file, what is wrong and what is allowed."""
+
+
+NOT_RECORDED = 3  # exit code of a run that ended well, and whose recording did not
 
 
 def shown(value: object, length: int = 60) -> str:

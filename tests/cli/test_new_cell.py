@@ -70,6 +70,17 @@ def test_links_without_masses_are_left_to_do() -> None:
 
 
 @pytest.mark.slow
+def test_answers_are_those_of_the_user(tmp_path: Path) -> None:
+    typed = "0.9\n0.1\n0 0.4 0 -1.6 0 1.1 0\n\n"
+    models = ("--left", "iiwa7", "--right", "iiwa7")
+    result = q2r2("new-cell", "cell", *models, "--samples", "100", typed=typed)
+    assert result.exit_code == 0, result.output
+    left, right = load_config(tmp_path / "cell.yaml").arms.values()
+    assert (left.mount.position, right.mount.position) == ((0.0, 0.45, 0.1), (0.0, -0.45, 0.1))
+    assert left.home == right.home == (0.0, 0.4, 0.0, -1.6, 0.0, 1.1, 0.0), "a twin's home is taken"
+
+
+@pytest.mark.slow
 def test_a_try_that_was_interrupted_leaves_its_answers_to_the_next_one() -> None:
     command = ("new-cell", "cell", "--left", "iiwa7", "--right", "iiwa7", "--samples", "100")
     interrupted = q2r2(*command, typed="0.9\n0.1\n")  # the terminal ends at the third question
@@ -81,17 +92,6 @@ def test_a_try_that_was_interrupted_leaves_its_answers_to_the_next_one() -> None
     left, right = load_config("cell.yaml").arms.values()
     assert (left.mount.position, right.mount.position) == ((0.0, 0.45, 0.1), (0.0, -0.45, 0.1))
     assert not Path("new-cell.answers.json").exists(), "nothing is left to do"
-
-
-@pytest.mark.slow
-def test_answers_are_those_of_the_user(tmp_path: Path) -> None:
-    typed = "0.9\n0.1\n0 0.4 0 -1.6 0 1.1 0\n\n"
-    models = ("--left", "iiwa7", "--right", "iiwa7")
-    result = q2r2("new-cell", "cell", *models, "--samples", "100", typed=typed)
-    assert result.exit_code == 0, result.output
-    left, right = load_config(tmp_path / "cell.yaml").arms.values()
-    assert (left.mount.position, right.mount.position) == ((0.0, 0.45, 0.1), (0.0, -0.45, 0.1))
-    assert left.home == right.home == (0.0, 0.4, 0.0, -1.6, 0.0, 1.1, 0.0), "a twin's home is taken"
 
 
 @pytest.mark.slow
