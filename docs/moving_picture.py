@@ -1,4 +1,4 @@
-"""Draw docs/demo.webp, the README's moving picture: the demo's hand-over and stack as MuJoCo simulates them."""
+"""Draw docs/demo.webp, the README's moving picture: three tasks of the demo as MuJoCo simulates them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
 
 ROOT = Path(__file__).resolve().parents[1]
-TASKS = "handover+stack"
-WIDTH, HEIGHT = 480, 300
+TASKS = "handover+stack+peg"
+WIDTH, HEIGHT = 960, 540
 SPEED, RATE = 4.0, 10.0  # of the playback, in pictures a second
 
 
 def camera() -> mujoco.MjvCamera:
     view = mujoco.MjvCamera()
-    view.lookat, view.distance, view.azimuth, view.elevation = (0.45, 0.0, 0.4), 1.9, 150.0, -22.0
+    view.lookat, view.distance, view.azimuth, view.elevation = (0.5, 0.0, 0.44), 1.0, 165.0, -22.0
     return view
 
 
@@ -30,7 +30,7 @@ def main() -> None:
     )
     plant = pipeline.plant
     assert isinstance(plant, MujocoPlant)
-    plant.model.vis.quality.shadowsize = 1024  # of 8192, which takes long without a graphics card
+    plant.model.vis.quality.shadowsize = 2048  # of 8192, which takes long without a graphics card
     renderer, view = mujoco.Renderer(plant.model, HEIGHT, WIDTH), camera()
     pictures: list[Image.Image] = []
 
