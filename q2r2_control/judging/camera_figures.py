@@ -24,6 +24,7 @@ LARGEST_LAG = 0.4  # that is looked for [s]
 _LAG_STEP = 0.02  # [s]
 _IN_TIME = 0.1  # a lag up to this one is believed where it explains the motion nearly as well as the best one [s]
 _NEARLY = 0.05  # of the motion in the pictures
+_LEFT = 0.65  # of the motion that lags near zero leave unexplained, another lag leaves this share at most
 _LEAST_FIT = 0.35  # of the motion in the pictures that the arms' explains
 _FEWEST = 20  # pictures of which a lag or an arm can be told
 _LEAST_TRAVEL = 0.5  # of an arm's joints in the whole episode, of which its camera can be told [rad]
@@ -118,7 +119,7 @@ class _CameraLook:
         """The lag at which the arms' speeds explain the change of the pictures best, as c_1 s_1 + c_2 s_2 + c_0 >= 0.
 
         Other lags are believed only where they explain it clearly better than those near zero: an arm that goes to and
-        fro has the same speed again later.
+        fro has the same speed again later, and one that goes round looks faster where it is nearer to the camera.
         """
         change, lags = self._change, np.arange(-LARGEST_LAG, LARGEST_LAG + _LAG_STEP, _LAG_STEP)
         energy = float(np.sum((change - change.mean()) ** 2)) if len(change) >= _FEWEST else 0.0
@@ -129,7 +130,8 @@ class _CameraLook:
             speeds = np.stack([*(self.travel(arm, lag) for arm in self._joints), np.ones(len(change))], axis=1)
             fits[index] = 1.0 - nnls(speeds, change)[1] ** 2 / energy
         near = np.where(np.abs(lags) <= _IN_TIME, fits, -np.inf)
-        best = near if near.max() >= fits.max() - _NEARLY else fits
+        is_clear = near.max() < fits.max() - _NEARLY and 1.0 - fits.max() <= _LEFT * (1.0 - near.max())
+        best = fits if is_clear else near
         return float(lags[np.argmax(best)]) if fits.max() >= _LEAST_FIT else None
 
     def correlation(self, arm: str) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config.recording import JudgeSettings
+from q2r2_control.config.recording import CameraConfig, JudgeSettings
 from q2r2_control.judging.camera_figures import arm_of_link
 from q2r2_control.judging.judge import judge
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -15,7 +15,7 @@ from q2r2_control.recording.reader import Recording
 from q2r2_control.robot.robot import Robot
 from tests.judging.episodes import hands, loop_of, record_episode
 from tests.judging.spoilers import CAMERAS, NUMBERS, Contents, Spoiler, empty, retitled, spoiled
-from tests.recording.runs import file_of, record
+from tests.recording.runs import file_of, pipeline, record
 from tests.support.pictures import needs_opengl
 from tests.support.processes import cell
 
@@ -62,6 +62,15 @@ def test_an_episode_with_pictures_is_kept_and_its_cameras_are_in_time(filmed: Pa
         assert camera.lag_ms == pytest.approx(0.0, abs=60.0)
         assert camera.rate_share == pytest.approx(1.0, abs=0.03)
         assert camera.frozen_share == camera.black_share == camera.bad_pictures == 0
+
+
+def test_a_smooth_circle_before_a_small_camera_is_kept(tmp_path: Path) -> None:
+    """Its speed hardly changes, so many lags explain its pictures nearly as well."""
+    needs_opengl()
+    front = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48, rate=30.0)
+    loop = pipeline("circle", "mujoco", cameras={"front": front})
+    (found,) = judge(Recording(file_of(record(tmp_path, loop, 10.0))))
+    assert found.verdict.line == "keep"
 
 
 @pytest.mark.parametrize("what", NUMBERS)
