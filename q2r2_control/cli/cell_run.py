@@ -228,7 +228,9 @@ def print_summary(run: CellRun, json: bool, verbose: bool = False) -> None:
         print(as_json_text(data))
         return
     console = Console()
-    _print_lines(console, [verdict_line(run.summary), *map(task_line, run.tasks)])
+    failed = [f"task {task.name} failed" for task in run.tasks if not task.succeeded]
+    failed += [] if run.was_recorded else ["the recording ended before the run"]
+    _print_lines(console, [verdict_line(run.summary, failed), *map(task_line, run.tasks)])
     if (late := late_line(run.summary, run.tasks)) is not None:
         _print_lines(console, [late])
     if run.recording is not None:

@@ -219,7 +219,7 @@ def demo(
 
     At a terminal the arms are shown in MuJoCo's window, or in a browser where there is no display. With --plant fri all
     processes have real-time priority where that is permitted, as with --rt: cabinets do not wait for a busy computer.
-    Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
+    The summary has a line for each task, as the simulation measured it. Exit code 1 where one did not succeed.
     With --record, whether all succeeded is in the recording, of which q2r2 report makes plots. Exit code 3 where the
     recording ended before the run did.
     With --seeds, exit code 1 where a task succeeded in less than 19 of 20 trials.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from rich.markup import escape
 from rich.table import Table
@@ -15,9 +15,12 @@ from q2r2_control.viewer.tables import figure_table
 from q2r2_control.wording import sentence
 
 
-def verdict_line(summary: RunSummary) -> str:
-    """One line of markup: whether the run kept what was promised and the arms did what was asked, or what is wrong."""
-    wrong = list(_broken(summary))
+def verdict_line(summary: RunSummary, failed: Iterable[str] = ()) -> str:
+    """One line of markup: whether the run kept what was promised and the arms did what was asked, or what is wrong.
+
+    ``failed`` says what else failed, such as tasks.
+    """
+    wrong = [*_broken(summary), *failed]
     if wrong:
         return f"[red]not as it should be[/]: {'; '.join(wrong)}"
     if stops := _last_faults(summary):

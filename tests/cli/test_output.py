@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from q2r2_control import Pipeline, RunSummary
+from q2r2_control.cli.cell_run import CellRun, print_summary
 from q2r2_control.cli.output import late_line
 from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.demo.assembly_tasks import TaskResult, held_to_promises
@@ -68,6 +69,7 @@ def test_the_verdict_says_what_is_wrong_or_that_nothing_is(summary: RunSummary) 
     still = {name: replace(arm, engaged_s=0.0) for name, arm in summary.arms.items()}
     good = replace(summary, arms=still | {"left": replace(still["left"], engaged_s=0.4)}, events=[])
     assert verdict_line(good) == "[green]as it should be[/]: left followed, every tick certified, at rest at the end"
+    assert verdict_line(good, ["task stack failed"]) == "[red]not as it should be[/]: task stack failed"
     assert verdict_line(replace(good, arms=still)).startswith("[yellow]no arm was engaged[/]")
     reason = Reason.of(ReasonKind.LOOP_STALLED, duration=0.4)
     stopped = verdict_line(replace(good, events=[Event(0.3, "left", "engaged", "lost", reason)]))
@@ -78,6 +80,17 @@ def test_the_verdict_says_what_is_wrong_or_that_nothing_is(summary: RunSummary) 
         "[red]not as it should be[/]: right arm is 130 mm from its reference at the end; "
         "3 ticks without a certificate; arms move at the end"
     )
+
+
+def test_what_is_printed_of_a_run_begins_with_its_verdict_and_those_on_its_tasks(
+    summary: RunSummary, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tasks = (TaskResult("grasp", True, {}, ""), TaskResult("stack", False, {}, "it fell"))
+    print_summary(CellRun(replace(summary, events=[]), tasks), json=False)
+    verdict, grasp, stack, *figures = capsys.readouterr().out.splitlines()
+    assert verdict == "not as it should be: task stack failed"
+    assert (grasp, stack) == ("grasp succeeded ()", "stack failed: it fell ()")
+    assert any("duration" in line for line in figures)
 
 
 def test_the_summary_is_short_unless_all_is_asked_for_and_never_hides_what_is_wrong(summary: RunSummary) -> None:
