@@ -100,12 +100,12 @@ class TestARunThatIsRecorded:
         with AnyReader([kept.parent]) as bag:  # is one still
             assert bag.message_count > 0
 
-    def test_says_it_in_one_line_after_the_summary(self, tmp_path: Path) -> None:
+    def test_says_it_in_one_line_before_the_figures(self, tmp_path: Path) -> None:
         options = [option for option in (*FAST, *self.OPTIONS) if option != "--json"]
         cell = changed_cell(tmp_path, IDLE, "max_idle_share: 0.01 ")
         result = q2r2(options[0], cell, *options[2:], "--record", str(tmp_path / "here"))
         assert result.exit_code == 0
-        *_, recording, verdict = result.stdout.splitlines()
+        _, recording, verdict, *_ = result.stdout.splitlines()
         assert recording.startswith("recording: ")
         (judged,) = judge(Recording(tmp_path / "here"))
         assert [reason.name for reason in judged.verdict.reasons] == ["max_idle_share"]

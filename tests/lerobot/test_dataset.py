@@ -20,7 +20,7 @@ pytest.importorskip("lerobot", reason="make test-lerobot installs it")
 import pyarrow.parquet
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from q2r2_control.export.dataset_card import SOURCES
+from q2r2_control.export.dataset_card import CARD, SOURCES
 from q2r2_control.export.lerobot import join_shards, video_key, write_shard
 from q2r2_control.export.sampling import Pixels
 from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, contents, record_two, with_pictures
@@ -60,6 +60,14 @@ def test_info_names_every_number_and_says_what_is_in_it(dataset: Path) -> None:
         assert info["features"][name] == {"dtype": "float32", "shape": [len(labels)], "names": known}
     for name in ("next.done", "next.success"):
         assert info["features"][name] == {"dtype": "bool", "shape": [1], "names": None}
+
+
+def test_the_readme_has_the_unit_of_every_number_under_its_name_in_the_dataset(dataset: Path) -> None:
+    card, info = (dataset / CARD).read_text(), json.loads((dataset / "meta" / "info.json").read_text())
+    for name in NAMES:
+        (row,) = (line for line in card.splitlines() if line.startswith(f"| `{name}` |"))
+        assert all(label in row for label in info["features"][name]["names"])
+        assert row.endswith("] |")
 
 
 def test_every_episode_has_its_frames_its_task_and_its_recording(dataset: Path) -> None:
