@@ -141,8 +141,9 @@ def test_a_set_has_the_controller_that_its_preset_needs_with_its_topics_and_fram
         assert parameters[f"{arm}.target_frame_id"] == "bh_robot_base"
 
 
-def test_the_command_adds_a_recorder_first_and_a_page_last(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_adds_a_recorder_first_and_a_page_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("viser", reason="the extra web brings it")
+    monkeypatch.chdir(tmp_path)  # where the folder of recordings is made
     started: list[NodeProcess] = []
 
     def start(nodes: list[NodeProcess], say: object) -> int:
