@@ -1,4 +1,4 @@
-"""Inputs, plants and presets by name: entry points that any installed package may declare.
+"""Find inputs, plants and presets by name. They are entry points, which any installed package may declare.
 
 [project.entry-points."q2r2_control.inputs"]
 gamepad = "my_package.gamepad:Gamepad"
@@ -17,14 +17,15 @@ PRESETS = "q2r2_control.presets"
 
 
 def names_of(group: str) -> tuple[str, ...]:
-    """The names that installed packages declare, in the order of the alphabet."""
+    """Return the names that installed packages declare, in alphabetical order."""
     return tuple(sorted({point.name for point in entry_points(group=group)}))
 
 
 def load_class(group: str, name: str) -> Any:
-    """The class, or preset, called ``name``.
+    """Return the class, or the preset, called ``name``.
 
-    Raises :class:`ConfigError` where there is none, or it cannot be imported.
+    Raises:
+        ConfigError: If there is no such name, or if it cannot be imported.
     """
     found = {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
     if name not in found:
