@@ -309,8 +309,8 @@ TWO_ARMS = (
     Mutation(
         "a lag is found where the driver tells none",
         SUPERVISION + "measured_lags.py",
-        "times[off <= off.min() + _SAME_PLACE], 0.0)",
-        "times[off <= off.min() + _SAME_PLACE], 0.0) * 0.0",
+        "times[off <= off.min() + _SAME_FIT], 0.0)",
+        "times[off <= off.min() + _SAME_FIT], 0.0) * 0.0",
     ),
     Mutation(
         "linked arms that a policy's fault stopped begin together",

@@ -177,8 +177,8 @@ def main() -> None:
         return
     print(f"{options.room}: {dict(counts)}, of {len(mutants)} mutants, seed {options.seed}")
     for mutant, outcome in results:
-        if outcome == "survived":
-            print(f"  survived: {mutant.path}:{mutant.line} {mutant.operator.rpartition('/')[2]}")
+        if outcome != "killed":
+            print(f"  {outcome}: {mutant.path}:{mutant.line} {mutant.operator.rpartition('/')[2]}")
 
 
 if __name__ == "__main__":

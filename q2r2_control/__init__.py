@@ -1,7 +1,7 @@
 """Bimanual VR teleoperation and Cartesian control with a safe QP controller.
 
-The fixed API; everything else may move between versions. A name is imported when it is first asked for. A ROS node that
-passes messages on then need not wait for the solver and its compiled kernels.
+These names are the fixed API. Everything else may move between versions. A name is imported when it is first used, so
+that a ROS node that only passes messages on need not wait for the solver and its compiled kernels.
 """
 
 from __future__ import annotations

@@ -1,50 +1,50 @@
-"""The one exception root: every error the package raises on purpose says what, where and what is allowed."""
+"""The exceptions of this package. Every message says what is wrong, where, and what is allowed."""
 
 from __future__ import annotations
 
 
 class Q2R2Error(Exception):
-    """Root of all errors that q2r2_control raises on purpose."""
+    """Base class of all errors that q2r2_control raises on purpose."""
 
 
 class ConfigError(Q2R2Error):
-    """A configuration cannot be used; the message names file, key, value and what is allowed."""
+    """A configuration cannot be used. The message names file, key and value, and says what is allowed."""
 
 
 class RobotError(Q2R2Error):
-    """A robot description cannot be loaded or does not have what the controller needs."""
+    """A robot description cannot be loaded, or lacks something that the controller needs."""
 
 
 class ProtocolError(Q2R2Error):
-    """A peer sent bytes that its protocol does not allow; the message says which and what is allowed."""
+    """A peer sent bytes that its protocol does not allow. The message says which, and what is allowed."""
 
 
 class InputError(Q2R2Error):
-    """An input cannot be opened; the message says which and why."""
+    """An input cannot be opened. The message says which and why."""
 
 
 class PlantError(Q2R2Error):
-    """A plant cannot be built or driven as asked; the message says what was wrong and what is allowed."""
+    """A plant cannot be built or driven. The message says what is wrong and what is allowed."""
 
 
 class RecordingError(Q2R2Error):
-    """A recording cannot be read or replayed; the message names the file, what is wrong and what is allowed."""
+    """A recording cannot be read or replayed. The message names the file, what is wrong, and what is allowed."""
 
 
 NOT_RECORDED = 3  # exit code of a run that ended well, and whose recording did not
 
 
 def shown(value: object, length: int = 60) -> str:
-    """``value`` for an error: one line of at most ``length`` characters."""
+    """Return ``value`` as one line of at most ``length`` characters, for an error message."""
     try:
         text = repr(value)
-    except Exception:  # an integer of thousands of digits, or an object of somebody else's
+    except Exception:  # The value is an integer of thousands of digits, or an object whose repr fails.
         text = f"a value of type {type(value).__name__} that cannot be shown"
     return " ".join(text.split())[:length]
 
 
 def raised(error: BaseException, length: int = 200) -> str:
-    """One line about an exception of a stranger's code: its kind, and its text, where that can be printed."""
+    """Return one line about an exception of foreign code: its class, and its text if that can be printed."""
     try:
         said = " ".join(str(error).split())[:length]
     except Exception:
@@ -55,6 +55,6 @@ def raised(error: BaseException, length: int = 200) -> str:
 def check_kind(
     name: str, value: object, kind: type | tuple[type, ...], allowed: str, error: type[Q2R2Error] = ConfigError
 ) -> None:
-    """Raise an ``error`` that says what is ``allowed`` unless ``value`` is of a ``kind``."""
+    """Raise an ``error`` that says what is ``allowed``, unless ``value`` is an instance of ``kind``."""
     if not isinstance(value, kind):
         raise error(f"{name} = {shown(value)}: allowed: {allowed}")

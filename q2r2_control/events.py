@@ -1,4 +1,4 @@
-"""Events of the arms, as data: a kind and its payload. Code decides by these; :mod:`wording` makes sentences."""
+"""Events of the arms as data: a kind and its details. Code decides by the kind; :mod:`wording` makes sentences."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any
 
 
 class ReasonKind(StrEnum):
-    """Why an arm changed its state, or did not; what became of a request; what is wrong. Values are stable.
+    """The kinds of reasons: for a change of an arm's state, for a refusal, for a result, or for a fault.
 
-    Each has the ``template`` of its sentence: fields of the reason's detail, and ``cause``, the sentence of its cause.
+    The values never change, so that old recordings stay readable. Each kind has the ``template`` of its sentence. The
+    fields of the template are the details of the reason, and ``cause`` is the sentence of its cause.
     """
 
     template: str
@@ -23,7 +24,7 @@ class ReasonKind(StrEnum):
 
     # An operator's controls.
     PRESSED = "pressed", "{control}"
-    COMMANDED = "commanded", "{action} ({control})"  # an action that is for both arms
+    COMMANDED = "commanded", "{action} ({control})"  # The action concerns both arms.
     DEAD_MAN_HELD = "dead_man_held", "dead man held"
     DEAD_MAN_RELEASED = "dead_man_released", "dead man let go"
     ALIGNMENT_CHORD = "alignment_chord", "alignment chord"
@@ -223,7 +224,7 @@ class ReasonKind(StrEnum):
     STOP_SERVICE = "stop_service", "the stop service was called"
     ACTIVATED = "activated", "active: the reference starts at the measured posture"
     HOMING_OUTCOME = "homing_outcome", "homing ended: {cause}"
-    CONTROLLER_PHASE = "controller_phase", "the controller is {phase}"  # in which it follows no targets
+    CONTROLLER_PHASE = "controller_phase", "the controller is {phase}"  # It follows no targets in this phase.
     CONTROLLER_PAUSED = "controller_paused", "the controller is paused"
     ARMS_HOMING = "arms_homing", "the arms are on their way home"
     ARMS_BRAKING = "arms_braking", "the arms are braking"
@@ -239,33 +240,34 @@ class ReasonKind(StrEnum):
     TARGET_LATE = "target_late", "{late:.2f} s late; its sender or this node stood still"
     TARGET_FRAME = "target_frame", "frame_id {frame!r}; allowed: {allowed!r}"
     TARGET_NOT_A_POSE = "target_not_a_pose", "not a finite pose with a unit quaternion"
-    OTHER = "other", "{text}"  # a sentence made elsewhere, which nothing decides by
+    OTHER = "other", "{text}"  # The sentence was made elsewhere, and no code decides by it.
 
 
 _K = ReasonKind
 _NOT_DONE = {_K.NOT_ENGAGED, _K.NOT_HOMING, _K.NOT_CARRIED, _K.NOT_CHANGED, _K.POLICY_REFUSED}
 REFUSALS = frozenset({*_NOT_DONE, _K.NO_RECORDING, _K.RECORDING_ENDED, _K.NO_EPISODE})
 _WAY_HOME = {_K.HOMING, _K.HOMING_ARRIVED, _K.HOMING_HELD_UP, _K.HOMING_NO_WAY, _K.HOMING_INTERRUPTED, _K.HOMING_ENDED}
-ROUTINE = frozenset({_K.ACTIVATED, _K.HOMING_ARRIVED, _K.NODE_ENDS})  # nothing is wrong
-HOLD_REQUESTS = frozenset({_K.PAUSE_SERVICE, _K.RESET_SERVICE, *_WAY_HOME})  # and how a way home ended
+ROUTINE = frozenset({_K.ACTIVATED, _K.HOMING_ARRIVED, _K.NODE_ENDS})  # Kinds that tell of no fault.
+# Requests to hold, and the results of a way home.
+HOLD_REQUESTS = frozenset({_K.PAUSE_SERVICE, _K.RESET_SERVICE, *_WAY_HOME})
 
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A kind and what belongs to it; ``detail`` holds numbers, texts, names and lists of these, in SI units."""
+    """A kind with its details, which are numbers in SI units, texts, names, and lists of these."""
 
     kind: ReasonKind
     detail: Mapping[str, Any] = field(default_factory=dict)
-    cause: Reason | None = None  # what it follows from
+    cause: Reason | None = None  # The reason from which this one follows.
 
     @classmethod
     def of(cls, kind: ReasonKind, cause: Reason | None = None, **detail: Any) -> Reason:
-        """With its ``detail`` by name."""
+        """Make a reason, with its details as keyword arguments."""
         return cls(kind, detail, cause)
 
     @classmethod
     def in_words(cls, text: str) -> Reason:
-        """A sentence that nothing decides by."""
+        """Make a reason of a sentence by which no code decides."""
         return cls(ReasonKind.OTHER, {"text": text})
 
     @property
@@ -273,7 +275,7 @@ class Reason:
         return self if self.cause is None else self.cause.root
 
     def as_json(self) -> dict[str, Any]:
-        """Data for ``json.dumps``; what is empty is left out."""
+        """Return data for ``json.dumps``. Empty fields are left out."""
         data: dict[str, Any] = {"kind": str(self.kind)}
         if self.detail:
             data["detail"] = dict(self.detail)
@@ -283,19 +285,23 @@ class Reason:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Reason:
-        """The reason that :meth:`as_json` made data of. Raises ValueError, KeyError or TypeError for other data."""
+        """Make the reason from the data of :meth:`as_json`.
+
+        Raises:
+            ValueError, KeyError, TypeError: For other data.
+        """
         cause = cls.from_json(data["cause"]) if "cause" in data else None
         return cls(ReasonKind(data["kind"]), dict(data.get("detail", {})), cause)
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A change of an arm's teleop state, or, where both states are the same, what its operator should know."""
+    """A change of an arm's state; or news for its operator, if both states are the same."""
 
     t: float  # [s]
     arm: str
-    source: str  # state before
-    destination: str  # state after
+    source: str  # The state before.
+    destination: str  # The state after.
     reason: Reason
 
     @property
@@ -303,11 +309,15 @@ class Event:
         return self.reason.kind
 
     def as_json(self) -> dict[str, Any]:
-        """Data for ``json.dumps``: ``t``, ``arm``, ``from``, ``to``, ``kind``, and ``detail`` and ``cause`` if any."""
+        """Return data for ``json.dumps``: ``t``, ``arm``, ``from``, ``to``, ``kind``, and ``detail`` and ``cause``."""
         states = {"from": str(self.source), "to": str(self.destination)}
         return {"t": self.t, "arm": self.arm, **states, **self.reason.as_json()}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Event:
-        """The event that :meth:`as_json` made data of. Raises ValueError, KeyError or TypeError for other data."""
+        """Make the event from the data of :meth:`as_json`.
+
+        Raises:
+            ValueError, KeyError, TypeError: For other data.
+        """
         return cls(float(data["t"]), data["arm"], data["from"], data["to"], Reason.from_json(data))

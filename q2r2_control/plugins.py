@@ -1,4 +1,4 @@
-"""Inputs, plants, presets and formats of exports by name: entry points that any installed package may declare.
+"""Find inputs, plants, presets and formats of exports by name. They are entry points of any installed package.
 
 [project.entry-points."q2r2_control.inputs"]
 gamepad = "my_package.gamepad:Gamepad"
@@ -18,14 +18,15 @@ EXPORTS = "q2r2_control.exports"
 
 
 def names_of(group: str) -> tuple[str, ...]:
-    """The names that installed packages declare, in the order of the alphabet."""
+    """Return the names that installed packages declare, in alphabetical order."""
     return tuple(sorted({point.name for point in entry_points(group=group)}))
 
 
 def load_class(group: str, name: str) -> Any:
-    """The class, preset or format called ``name``.
+    """Return the class, the preset or the format called ``name``.
 
-    Raises :class:`ConfigError` where there is none, or it cannot be imported.
+    Raises:
+        ConfigError: If there is no such name, or if it cannot be imported.
     """
     found = {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
     if name not in found:

@@ -1,7 +1,7 @@
-"""The dataclasses that cross a border between layers: input, teleop, control, plant.
+"""The dataclasses that the layers hand to each other: input, teleop, control, plant.
 
-SI units, radians, quaternions x y z w, right-handed frames with z up (REP-103). Stamps are seconds on one monotonic
-clock that is passed in. An arm or hand is named ``"left"`` or ``"right"``.
+Units are SI units and radians. Quaternions are x y z w. Frames are right-handed with z up (REP-103). Stamps are seconds
+of one monotonic clock, which the caller reads. Arms and hands are named ``"left"`` or ``"right"``.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 SIDES = ("left", "right")
-Interval = tuple[float, float]  # least and greatest
-Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]  # position [m], quaternion x y z w
-ALL_OF_THE_WAY: Interval = (0.0, 1.0)  # of a gripper's opening, 0 closed .. 1 fully open
+Interval = tuple[float, float]  # The least and the greatest value.
+Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]  # Position [m], quaternion x y z w.
+ALL_OF_THE_WAY: Interval = (0.0, 1.0)  # All openings of a gripper, from 0 for closed to 1 for fully open.
 
-LONGEST_DT = 0.1  # [s] of a tick; after a longer gap nothing moves further than in this time
+LONGEST_DT = 0.1  # The longest tick [s]. After a longer gap nothing moves farther than in this time.
 _IDENTITY = pin.SE3.Identity()
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether ``value`` is a real number that is finite as a float; a truth value is none."""
+    """Return whether ``value`` is a real number that is finite as a float. True and False are not numbers."""
     if not isinstance(value, float | int | np.floating | np.integer) or isinstance(value, bool):
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # an integer that no float can hold
+    except OverflowError:  # The integer is too large for a float.
         return False
 
 
 def pose_of(rotation: Array, translation: Array) -> pin.SE3:
-    """The pose of a rotation (3, 3) and a translation (3,) [m], faster than ``pin.SE3``."""
+    """Return the pose of a rotation (3, 3) and a translation (3,) [m]. It is faster than ``pin.SE3``."""
     pose = _IDENTITY.copy()
     pose.rotation, pose.translation = rotation, translation
     return pose
 
 
 def moved_by(pose: pin.SE3, way: Array) -> pin.SE3:
-    """The pose with its origin elsewhere, by ``way`` (3,) [m] in the frame that the pose is told in."""
+    """Return the pose with its origin moved by ``way`` (3,) [m], in the frame in which the pose is given."""
     moved = pose.copy()
     moved.translation = moved.translation + way
     return moved
@@ -59,10 +59,11 @@ def moved_by(pose: pin.SE3, way: Array) -> pin.SE3:
 
 @dataclass(frozen=True, slots=True)
 class HandInputs:
-    """Buttons, triggers and stick of one hand controller, as the headset names them, and those of other devices.
+    """Buttons, triggers and stick of one hand controller.
 
-    ``button_lower`` is A (right) or X (left), ``button_upper`` B or Y; triggers 0..1, sticks -1..1. ``more`` has what
-    a device declares beyond these, by name: 0 at rest, 1 pressed. A name that is left out is at rest.
+    ``button_lower`` is A on the right and X on the left controller, ``button_upper`` is B and Y. Triggers go from 0 to
+    1, and sticks from -1 to 1. ``more`` has further controls of other devices by name, from 0 at rest to 1 for pressed.
+    A name that is missing is at rest.
     """
 
     button_upper: bool = False
@@ -76,7 +77,7 @@ class HandInputs:
 
 @dataclass(frozen=True, slots=True)
 class DeviceControls:
-    """Buttons and axes of each hand of an input device: fields of :class:`HandInputs`, and names of its own."""
+    """The buttons and axes that an input device has for each hand: fields of :class:`HandInputs`, and other names."""
 
     buttons: tuple[str, ...]
     axes: tuple[str, ...]
@@ -93,32 +94,33 @@ QUEST_CONTROLS = DeviceControls(
 
 
 class HandFault(StrEnum):
-    """Faults of a hand whose pose by itself is valid: kinds of :mod:`events`."""
+    """Faults of a hand whose pose alone looks valid. The values are kinds of :mod:`events`."""
 
     FROZEN = "hand_frozen"
-    FRAME_MOVED = "hand_frame_moved"  # both hands moved as one, as when the frame moves that they are measured in
-    UNTRACKED = "hand_untracked"  # the headset says that its pose is none, or a guess
+    FRAME_MOVED = "hand_frame_moved"  # Both hands moved as one, so that their frame has probably moved.
+    UNTRACKED = "hand_untracked"  # The headset reports no pose, or says that it is a guess.
 
 
 @dataclass(frozen=True, slots=True)
 class HandSample:
-    """One reading of one hand. Numbers are as received: nothing has been checked or normalised yet.
+    """One reading of one hand, as it was received. Nothing has been checked or normalised yet.
 
-    Pose and inputs travel in separate messages. Each has its own receipt time, so that a stream that stops is noticed.
+    The pose and the controls arrive in separate messages. Each has its own time of receipt, so that a stream that stops
+    is noticed.
     """
 
     hand: str
-    position: Array  # (3,) [m], in the input's own frame
-    quaternion: Array  # (4,) x y z w, not necessarily normalised
-    pose_stamp: float  # receipt time of the pose [s]
+    position: Array  # (3,) In the input's own frame [m].
+    quaternion: Array  # (4,) x y z w of any length.
+    pose_stamp: float  # Time of receipt of the pose [s].
     inputs: HandInputs = field(default_factory=HandInputs)
-    inputs_stamp: float = float("-inf")  # receipt time of the inputs [s]; -inf: none received yet
-    fault: HandFault | None = None  # why no arm may follow this pose, nor be engaged at it
+    inputs_stamp: float = float("-inf")  # Time of receipt of the controls [s]; -inf if none were received yet.
+    fault: HandFault | None = None  # Why no arm may follow this pose or be engaged at it; None if it may.
 
 
 @dataclass(frozen=True, slots=True)
 class HapticFeedback:
-    """Vibration of one hand controller: frequency and amplitude, both 0..1."""
+    """Vibration of one hand controller, with frequency and amplitude from 0 to 1."""
 
     hand: str
     frequency: float
@@ -127,18 +129,18 @@ class HapticFeedback:
 
 @dataclass(slots=True)
 class RobotState:
-    """Measurements of the plant, in the joint order of ``Robot.model``."""
+    """The measured state of a plant, in the joint order of ``Robot.model``."""
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
-    tau: Array  # (nv,) measured joint torque [Nm]
-    tau_external: Array | None  # (nv,) torque from contacts [Nm]; None where the plant cannot tell
+    tau: Array  # (nv,) Measured joint torque [Nm].
+    tau_external: Array | None  # (nv,) Torque from contacts [Nm]; None if the plant does not measure it.
     stamp: float  # [s]
-    held: Array | None = None  # (nv,) where the plant's own drives hold the arms, if it tells [rad]
+    held: Array | None = None  # (nv,) Where the plant's drives hold the arms [rad]; None if it does not report this.
 
 
 class CommandMode(StrEnum):
-    """How a plant follows a command."""
+    """The quantity of a command that a plant follows."""
 
     POSITION = "position"
     VELOCITY = "velocity"
@@ -151,41 +153,45 @@ class CommandMode(StrEnum):
 
 @dataclass(slots=True)
 class Command:
-    """A command to the plant, in the joint order of ``Robot.model``."""
+    """A command for the plant, in the joint order of ``Robot.model``."""
 
     mode: CommandMode
-    q: Array  # (nv,) [rad]; in velocity and torque mode the reference, for plants that show it
+    q: Array  # (nv,) [rad]. In velocity and torque mode this is the reference, for plants that show it.
     v: Array  # (nv,) [rad/s]
-    tau: Array  # (nv,) [Nm]; of torque mode
-    grippers: dict[str, float]  # arm -> opening, 0 closed .. 1 fully open
-    deceleration: Array | None = None  # (nv,) of the certified stop from q and v [rad/s^2]; None: none is known
-    gravity_only: bool = False  # tau bears the arms at an unsure posture: a plant that measures by itself brakes them
+    tau: Array  # (nv,) The torque of torque mode [Nm].
+    grippers: dict[str, float]  # Openings by arm, from 0 for closed to 1 for fully open.
+    # (nv,) Deceleration of the certified stop from q and v [rad/s^2]; None if no stop is known.
+    deceleration: Array | None = None
+    # True if tau only bears the arms, at a posture that is not sure. A plant with its own sensors then brakes the arms.
+    gravity_only: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """The view that a policy has of one tick: the state before its command, on the loop's clock."""
+    """The view that a policy has of one tick: the state before the command, with the time of the loop's clock."""
 
     time: float  # [s]
     state: RobotState
-    openings: Mapping[str, float]  # measured, of the arms whose plant tells: 0 closed .. 1 fully open
-    tools: Mapping[str, pin.SE3]  # measured tool poses, world frame
+    openings: Mapping[str, float]  # Measured openings by arm, from 0 for closed to 1; only arms that measure them.
+    tools: Mapping[str, pin.SE3]  # Measured poses of the tools, in the world frame.
 
 
 @dataclass(frozen=True, slots=True)
 class ActionChunk:
-    """Actions of a policy at n times, checked and told as tool poses; or the fault that makes all of them unusable."""
+    """Checked actions of a policy at n times, as poses or motions of the tools; or a fault, if they are not usable."""
 
-    times: Array  # (n,) [s] on the loop's clock, ascending
-    period: float  # from one action to the next, also where there is one only [s]
-    tools: Mapping[str, Array] = field(default_factory=dict)  # arm -> (n, 7) x y z qx qy qz qw, world frame
-    motions: Mapping[str, Array] = field(default_factory=dict)  # arm -> (n, 6) to the next target, in its frame
-    grippers: Mapping[str, Array] = field(default_factory=dict)  # arm -> (n,) openings
-    postures: Array | None = None  # (n, nv) of all joints, for what the tools leave free [rad]
+    times: Array  # (n,) Ascending times of the loop's clock [s].
+    period: float  # Time from one action to the next [s]. It is also given for a single action.
+    tools: Mapping[str, Array] = field(default_factory=dict)  # By arm (n, 7): x y z qx qy qz qw in the world frame.
+    motions: Mapping[str, Array] = field(
+        default_factory=dict
+    )  # By arm (n, 6): motions, in the frame of the target before.
+    grippers: Mapping[str, Array] = field(default_factory=dict)  # By arm (n,): openings.
+    postures: Array | None = None  # (n, nv) Positions of all joints, for those that the tools leave free [rad].
     fault: Reason | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """Data for ``json.dumps``, of which :meth:`from_json` makes the same chunk to the bit; made within a tick."""
+        """Return data for ``json.dumps``, from which :meth:`from_json` makes the same chunk to the bit."""
         named = {"tools": self.tools, "motions": self.motions, "grippers": self.grippers}
         data: dict[str, Any] = {
             name: {arm: _packed(values) for arm, values in arms.items()} for name, arms in named.items()
@@ -196,7 +202,11 @@ class ActionChunk:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> ActionChunk:
-        """Raises ValueError, KeyError or TypeError for other data."""
+        """Make the chunk from the data of :meth:`as_json`.
+
+        Raises:
+            ValueError, KeyError, TypeError: For other data.
+        """
         times = _unpacked(data["times"])
         shapes = {"tools": (len(times), 7), "motions": (len(times), 6), "grippers": (len(times),)}
         named = {
@@ -209,7 +219,7 @@ class ActionChunk:
 
 
 def _packed(values: Array) -> str:
-    """The float64 of an array as base64; decimals of a long chunk would take a millisecond."""
+    """Return the float64 values of an array as base64, since decimals of a long chunk would take a millisecond."""
     return b64encode(values.tobytes()).decode("ascii")
 
 
@@ -221,78 +231,78 @@ class StepStatus(StrEnum):
     """The outcome of one control tick."""
 
     OK = "ok"
-    TARGET_REJECTED = "target_rejected"  # a bad target was held
-    DT_REJECTED = "dt_rejected"  # dt was not in (0, 0.1] s
-    RECOVERING = "recovering"  # outside a limit or closer than a pair may be, on the way back
-    FALLBACK = "fallback"  # the stopping motion was executed instead of the QP's solution
+    TARGET_REJECTED = "target_rejected"  # A target was not usable, and its arm holds the last one.
+    DT_REJECTED = "dt_rejected"  # dt was not in (0, 0.1] s.
+    RECOVERING = "recovering"  # A joint is outside a limit, or a pair is too close, and the arms are on the way back.
+    FALLBACK = "fallback"  # The certified stop was executed instead of the solution of the QP, at least in part.
 
 
 class LimitKind(StrEnum):
-    """Kinds of limits that hold a step back."""
+    """The kinds of limits that hold a step back."""
 
     POSITION = "position"
     VELOCITY = "velocity"
     ACCELERATION = "acceleration"
     SEPARATION = "separation"
     TOOL_SPEED = "tool_speed"
-    CONSTRAINT = "constraint"  # of a program's own
+    CONSTRAINT = "constraint"  # One of the user's own constraints.
 
 
 class ActiveLimit(NamedTuple):
-    """A limit that was active at a step's solution."""
+    """A limit that was active in the solution of a step."""
 
     kind: LimitKind
-    names: tuple[str, ...]  # of the joint, both geometries of a pair, the tool's arm, or a constraint's class
+    names: tuple[str, ...]  # The joint, both geometries of a pair, the arm of a tool, or the class of a constraint.
 
 
 @dataclass(slots=True)
 class StepReport:
-    """Outcome and reasons of one control tick. Distances in metres, joints by name."""
+    """The outcome of one control tick. Distances are in metres, and joints are given by name."""
 
     status: StepStatus
-    rejected: tuple[str, ...]  # arms whose target was not usable and is held
-    binding: tuple[ActiveLimit, ...]  # limits active at the solution
-    closest_pair: tuple[str, str]  # geometry names
+    rejected: tuple[str, ...]  # Arms whose target was not usable, and which hold the last one.
+    binding: tuple[ActiveLimit, ...]  # The limits that were active in the solution.
+    closest_pair: tuple[str, str]  # Names of the geometries.
     closest_distance: float  # [m]
-    certified: bool  # a stopping motion that keeps limits and separation is known
+    certified: bool  # Whether a stop is known that keeps all limits and distances.
     fallback: bool
-    slack: float  # largest violation of a row of unit norm [rad/s]
-    solve_time: float  # solver's own time, 0 where none had to be asked [s]
-    tightest_pair: tuple[str, str] = ("", "")  # geometry names of the pair with the least margin
-    margin: float = math.inf  # its distance less the one that it keeps [m]
-    unsolved: int = 0  # bit i: the QP of substep i had no solution, or too late, and the stop went on
-    faults: tuple[str, ...] = ()  # a program's own tasks and constraints whose answer was not used, and why
+    slack: float  # Largest violation of a row of unit norm [rad/s].
+    solve_time: float  # Time of the solver; 0 if it did not have to be asked [s].
+    tightest_pair: tuple[str, str] = ("", "")  # Names of the geometries of the pair with the least margin.
+    margin: float = math.inf  # Distance of that pair less the distance that it keeps [m].
+    unsolved: int = 0  # Bit i is set if the QP of substep i had no solution in time, so that the stop was executed.
+    faults: tuple[str, ...] = ()  # Why answers of the user's own tasks and constraints were not used.
 
 
 @dataclass(slots=True)
 class Reference:
-    """Joint motion that the QP allows, once per tick.
+    """The certified joint motion of one tick.
 
-    ``a`` leads from the last tick's velocity to ``v``, but ``q`` is not in general where it alone would lead, since
-    acceleration changes between substeps.
+    ``a`` is the mean acceleration from the last tick's velocity to ``v``. It does not lead exactly to ``q``, because
+    the acceleration may change between substeps.
     """
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
-    a: Array  # (nv,) mean since the last tick [rad/s^2]
+    a: Array  # (nv,) Mean since the last tick [rad/s^2].
     report: StepReport
 
 
 @dataclass(slots=True)
 class ArmTarget:
-    """The teleop layer's target for one arm."""
+    """The target of one arm from the teleop layer."""
 
-    pose: pin.SE3 | None  # tool pose in the world frame; None: hold
-    gripper: float  # opening, 0 closed .. 1 fully open
-    slip: float = 0.0  # how far the target has slipped along with a tool held up, since engaging [m]
-    slip_angle: float = 0.0  # the same of the rotation [rad]
-    offset: Array | None = None  # (3,) of the tool, from its command [m]; None: none
-    filtered_hand: Pose | None = None  # the pose of its hand, filtered, that the target is made of
-    posture: Array | None = None  # (nv,) that a policy wants this arm's joints to have where the tool leaves them free
+    pose: pin.SE3 | None  # Target of the tool in the world frame; None lets the arm hold.
+    gripper: float  # Opening, from 0 for closed to 1 for fully open.
+    slip: float = 0.0  # By how much the leash and the workspace have held the target back since engaging [m].
+    slip_angle: float = 0.0  # The same for the rotation [rad].
+    offset: Array | None = None  # (3,) Measured tool less commanded tool at engaging [m]; None if not known.
+    filtered_hand: Pose | None = None  # The filtered pose of the hand from which the target was computed.
+    posture: Array | None = None  # (nv,) Joint positions that a policy wants where the tool leaves them free [rad].
 
     @property
     def hand(self) -> pin.SE3 | None:
-        """``filtered_hand`` as a pose."""
+        """Return ``filtered_hand`` as a pose."""
         if self.filtered_hand is None:
             return None
         position, quaternion = self.filtered_hand
@@ -300,24 +310,24 @@ class ArmTarget:
 
     @property
     def command(self) -> pin.SE3 | None:
-        """The controller's target that brings the tool to ``pose``."""
+        """The target for the controller that brings the measured tool to ``pose``."""
         return None if self.pose is None else self.command_for(self.pose)
 
     def command_for(self, tool: pin.SE3) -> pin.SE3:
-        """The controller's target that brings the tool to ``tool``, world frame."""
+        """Return the target for the controller that brings the measured tool to ``tool`` (world frame)."""
         return tool if self.offset is None else moved_by(tool, -self.offset)
 
 
 @dataclass(frozen=True, slots=True)
 class ArmTiming:
-    """Timing of an arm against the reference that it follows, all in [s]."""
+    """The timing of one arm relative to the reference that it follows. All times are in seconds."""
 
-    behind: float | None  # the reference, by the newest message of the arm; None: nobody tells, so that it is measured
-    silent: float  # time since that message
-    period: float  # between its messages, as a rule
-    noise: float = 0.0  # of ``behind``
+    behind: float | None  # Lag by the newest message of the arm; None if nobody reports it, so that it is measured.
+    silent: float  # Time since that message.
+    period: float  # Usual time between two messages.
+    noise: float = 0.0  # Noise of ``behind``.
 
     @property
     def lag(self) -> float:
-        """How far behind the arm may be by now: a message that is missing may say that the arm stands still."""
+        """The greatest lag of the arm by now. While its next message is missing, the arm may be standing still."""
         return (self.behind or 0.0) + max(self.silent - self.period, 0.0)

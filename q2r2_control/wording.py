@@ -1,4 +1,4 @@
-"""The sentences of events and reasons, for people: nothing decides by them."""
+"""Make sentences of events and reasons for people. No code decides by these sentences."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ def sentence(reason: Reason) -> str:
 
 
 def _text(value: Any) -> Any:
-    """A list as its names, a mapping as JSON; numbers are formatted by their sentence."""
+    """Return a list as its names and a mapping as JSON. Numbers are formatted by their sentence."""
     if isinstance(value, Mapping):
         return json.dumps(value)
     return " and ".join(map(str, value)) if isinstance(value, list | tuple) else value
 
 
 def event_line(event: Event) -> str:
-    """The activity of an arm, and the reason."""
+    """Return one line with the new state of an arm and the reason."""
     return f"{event.destination}: {sentence(event.reason)}"
 
 
 def limit_name(limit: ActiveLimit) -> str:
-    """The limit that held a step back: ``left_A2 velocity``, ``left_link_5|table``."""
+    """Return the name of a limit that held a step back, such as ``left_A2 velocity`` or ``left_link_5|table``."""
     if limit.kind is LimitKind.SEPARATION:
         return "|".join(limit.names)
     return f"{limit.names[0]} {_LIMITS[limit.kind]}"

@@ -169,28 +169,6 @@ def test_every_link_of_a_page_leads_to_a_file_and_a_heading(page: Path) -> None:
         assert not anchor or anchor in anchors(target), link
 
 
-def prose(file: Path) -> Iterator[str]:
-    """A page, or the docstrings and comments of a Python file."""
-    text = file.read_text(encoding="utf-8")
-    if file.suffix == ".md":
-        yield text
-        return
-    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    yield from (ast.get_docstring(node) or "" for node in ast.walk(ast.parse(text)) if isinstance(node, documented))
-    yield from re.findall(r"(?:^|\s)# (.*)", text)
-
-
-def test_sentences_open_with_their_subject() -> None:
-    files = [
-        file
-        for name in (PACKAGE, "tests", "benchmarks", "examples", "plugins", "robots")
-        for file in (ROOT / name).rglob("*.py")
-    ]
-    opening = re.compile(r"\b(?:What|Whatever|Whoever) .*|^So .*|[.!?]\sSo .*")
-    found = {file.name: hit[0] for file in [*PAGES, *files] for text in prose(file) if (hit := opening.search(text))}
-    assert found == {}
-
-
 def test_the_page_of_ros_names_every_parameter_that_a_node_declares() -> None:
     page = (ROOT / "docs" / "ros.md").read_text(encoding="utf-8")
     sources = [file.read_text(encoding="utf-8") for file in (ROOT / PACKAGE / "ros").rglob("*.py")]

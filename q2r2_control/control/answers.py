@@ -1,6 +1,6 @@
-"""Matrices and vectors that a program's own tasks and constraints answer with, checked.
+"""Ask a user's own tasks and constraints for their matrices and vectors, and check the answers.
 
-A step raises nothing, so an answer that cannot be used becomes a line that says what is wrong with it.
+A step never raises. An answer that cannot be used therefore becomes a line that says what is wrong with it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from q2r2_control.errors import raised
 from q2r2_control.types import Array
 
 Answer = tuple[Array, Array]
-_LENGTH = 120  # of a line, at most
+_MAX_LENGTH = 120  # Of the line.
 
 
 def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array) -> Answer | str:
@@ -33,7 +33,7 @@ def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array) -> Answ
             return f"returned {type(answer).__name__}; allowed: a matrix and a vector"
         matrix, vector = (np.asarray(part, dtype=np.float64) for part in answer)
     except Exception as error:
-        return f"raised {raised(error, _LENGTH)}"
+        return f"raised {raised(error, _MAX_LENGTH)}"
     nv = len(q)
     if matrix.ndim != 2 or matrix.shape[1] != nv or vector.shape != matrix.shape[:1]:
         return f"returned shapes {matrix.shape} and {vector.shape}; allowed: (k, {nv}) and (k,)"

@@ -1,8 +1,8 @@
-"""Linear constraints of a program's own on the next joint velocities: rows of the QP beside those of separation.
+"""A user's own linear constraints on the next joint velocities: rows of the QP in addition to those of separation.
 
-A soft one gives way as the rows of separation do. A hard one has no slack in the QP, and it is asked again before a
-step is taken: velocities that break it are not executed, and the certified stop is. The certificate reads no row.
-Neither kind can therefore break a limit or a distance, and no kind is part of what the stop is proven to keep.
+A soft constraint has a slack, as the rows of separation have. A hard constraint has none, and is checked again before a
+step is taken: if the velocities break it, the certified stop is executed instead. The certificate does not read these
+rows. For that reason no constraint can break a limit or a distance, and the stop is not proven to keep a constraint.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from q2r2_control.errors import ConfigError, shown
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ActiveLimit, Array, LimitKind
 
-HARD_TOLERANCE = 1e-4  # of a hard row of unit norm, which allows for a solver's own [rad/s]
-_ACTIVE = 1e-7  # of any row of unit norm [rad/s]
-_TINY = 1e-9  # a row with a smaller norm depends on no joint
+HARD_TOLERANCE = 1e-4  # Permitted violation of a hard row of unit norm, for the tolerance of the solver [rad/s].
+_ACTIVE = 1e-7  # A row of unit norm that is this near to its bound is active [rad/s].
+_TINY = 1e-9  # A row with a smaller norm depends on no joint.
 
 
 class Constraint(Protocol):
@@ -28,38 +28,39 @@ class Constraint(Protocol):
     ``CartesianController(robot, settings, constraints=[MyConstraint()])`` adds it. It is soft, unless the object has an
     attribute ``hard`` that is True.
 
-    **A hard constraint** holds the next velocities of every step that is not the stop: they satisfy A v+ >= lower to
-    1e-4 rad/s, for rows of unit norm, with the A and lower of this step's start. Where the solver finds no such
-    velocities, or none that can be certified, or where ``rows`` has no usable answer, the certified stop is executed
-    instead. The stop was chosen before and knows nothing of the constraint, so arms may break it until they rest. That
-    takes 0.3 s from full speed in the shipped cells. From then on the constraint holds if rest satisfies it, that is
-    if no ``lower`` is above 0. Nothing is said about positions: a plane is kept as well as ``rows`` turns distances
-    into velocities, and the stop may lead beyond it. Arms that can never satisfy it stay where they are.
+    **A hard constraint** is satisfied by every step but the certified stop: A v+ >= lower to 1e-4 rad/s for rows of
+    unit norm, with A and lower at the start of the step. If the solver finds no such velocities, or if they cannot be
+    certified, or if ``rows`` has no usable answer, the certified stop is executed instead. The stop was chosen earlier
+    and does not know the constraint, so that the arms may break it until they rest. This takes 0.3 s from full speed in
+    the shipped cells. At rest the constraint holds if no ``lower`` is above 0.
+
+    The constraint is about velocities and not about positions. A plane is kept as well as ``rows`` turns distances into
+    velocities, and the stop may lead beyond it. Arms that can never satisfy the constraint stay where they are.
     """
 
     def rows(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """The rows A v+ >= lower that the next joint velocities v+ are to satisfy.
+        """Return the rows A v+ >= lower that the next joint velocities v+ have to satisfy.
 
-        An equality is two rows, one the negative of the other. To keep a distance d(q) above 0 ask for
-        J_d v+ >= -gain d, with the gradient J_d and a gain of about 5 /s. The method is asked at every substep and by
-        :meth:`CartesianController.problem`, so its answer may depend on q and v alone.
+        An equality is two rows, one of them the negative of the other. To keep a distance d(q) above 0, return
+        J_d v+ >= -gain d with the gradient J_d and a gain of about 5 /s. The method is called at every substep and by
+        :meth:`CartesianController.problem`, so that its answer may depend on q and v only.
 
         Args:
             q: Joint positions of the reference (nv,) [rad].
             v: Joint velocities of the reference (nv,) [rad/s].
 
         Returns:
-            A (k, nv) and lower (k,), finite, with any k and rows of any norm. Another answer, and an exception, is not
-            used: a soft constraint then asks for nothing, and at a hard one the arms brake. The step's report says so
-            in ``faults``.
+            A (k, nv) and lower (k,), finite, with any k and rows of any norm. An exception or another answer is
+            reported in ``faults`` of the step's report. A soft constraint then has no effect, and with a hard one the
+            arms brake.
         """
 
 
 class OwnConstraints:
-    """The constraints of one controller, and the rows of those that answered at this step."""
+    """The constraints of one controller, and their rows at the present step."""
 
     def __init__(self, robot: Robot, own: Sequence[Constraint]) -> None:
-        """Raises :class:`ConfigError` for what is no constraint, and for one that has no usable rows at home."""
+        """Raises :class:`ConfigError` if an object is not a constraint, or has no usable rows at home."""
         allowed = "an object with a method rows(q, v), and hard = True or False if it has that"
         if not isinstance(own, list | tuple):
             raise ConfigError(f"constraints = {shown(own)}: allowed: a list of objects with a method rows(q, v)")
@@ -74,16 +75,16 @@ class OwnConstraints:
                 raise ConfigError(f"{key}: {name}.rows {rows}")
             (self._hard if hard else self._soft).append((f"{key} {name}", one))
         nv = robot.model.nv
-        self.matrix, self.lower = np.zeros((0, nv)), np.zeros(0)  # (k, nv), unit rows, and (k,) [rad/s]
-        self.hard = 0  # how many of the last rows are hard
-        self._names: list[str] = []  # of each row
-        self._unknown = False  # whether some hard constraint has no usable answer
+        self.matrix, self.lower = np.zeros((0, nv)), np.zeros(0)  # Rows of unit norm (k, nv), and (k,) [rad/s].
+        self.hard = 0  # Number of hard rows, which are the last ones.
+        self._names: list[str] = []  # The name of each row's constraint.
+        self._unknown = False  # Whether a hard constraint has no usable answer.
 
     def __bool__(self) -> bool:
         return bool(self._soft or self._hard)
 
     def write(self, q: Array, v: Array) -> tuple[str, ...]:
-        """Ask every constraint at ``q`` and ``v`` for its rows; returns why some were not used."""
+        """Ask every constraint for its rows at ``q`` and ``v``; returns the reasons for answers that are not used."""
         faults: list[str] = []
         found = [self._rows_of(kind, q, v, faults) for kind in (self._soft, self._hard)]
         rows = [answer for kind in found for _, answer in kind]
@@ -106,16 +107,16 @@ class OwnConstraints:
         return answers
 
     def allow(self, v: Array) -> bool:
-        """Whether ``v`` (nv,) [rad/s] satisfies every row, soft ones too."""
+        """Return whether ``v`` (nv,) [rad/s] satisfies all rows, soft and hard."""
         return not self._unknown and bool((self.matrix @ v >= self.lower).all())
 
     def permit(self, v: Array) -> bool:
-        """Whether ``v`` (nv,) [rad/s] may be executed: it satisfies the hard rows, and all of them are known."""
+        """Return whether ``v`` (nv,) [rad/s] may be executed: all hard rows are known, and ``v`` satisfies them."""
         first = len(self.lower) - self.hard
         return not self._unknown and bool((self.matrix[first:] @ v >= self.lower[first:] - HARD_TOLERANCE).all())
 
     def active(self, v: Array) -> tuple[tuple[ActiveLimit, ...], float]:
-        """The constraints that ``v`` (nv,) meets or breaks, and the largest violation of a row [rad/s]."""
+        """Return the constraints that ``v`` (nv,) just satisfies or breaks, and the largest violation [rad/s]."""
         slack = self.lower - self.matrix @ v
         names = dict.fromkeys(name for name, lacks in zip(self._names, slack, strict=True) if lacks >= -_ACTIVE)
         limits = tuple(ActiveLimit(LimitKind.CONSTRAINT, (name.partition(" ")[2],)) for name in names)
@@ -123,7 +124,7 @@ class OwnConstraints:
 
 
 def _unit_rows(constraint: Constraint, q: Array, v: Array) -> Answer | str:
-    """Rows of unit norm, without those that depend on no joint and are satisfied; or why there are none."""
+    """Return rows of unit norm, or the reason why there are none. Rows that hold for every velocity are left out."""
     answer = answer_of(constraint.rows, q, v)
     if isinstance(answer, str):
         return answer

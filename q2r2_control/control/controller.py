@@ -1,4 +1,4 @@
-"""The Cartesian controller: tool targets in, joint motion out that keeps every limit and keeps the arms apart."""
+"""The Cartesian controller. It turns targets of the tools into joint motion that keeps limits and distances."""
 
 from __future__ import annotations
 
@@ -40,28 +40,27 @@ _TARGETS = "a pin.SE3 or None by arm, such as {'left': pose}"
 class CartesianController(WatchedPairs):
     """QP differential inverse kinematics for all arms of a cell at once, with a certified stop at every tick.
 
-    The contract, for every sequence of targets and every dt in (0, 0.1] s, is this. Numbers are finite, and no
-    exception is raised. Joints keep their position, velocity and acceleration limits. Every monitored pair keeps its
-    distance (``min_distance``, or that of ``distances`` and ``pairs``), also between ticks and during a stop. A
-    constant target ends in rest. The reference is the controller's own state: it follows the targets, not the plant's
-    measurement, so that noise never enters it.
+    The contract holds for every sequence of targets and every dt in (0, 0.1] s. All numbers are finite, and no
+    exception is raised. Joints keep their limits of position, velocity and acceleration. Every monitored pair keeps its
+    distance, also between ticks and during a stop. Its distance is ``min_distance``, or the one in ``distances`` or
+    ``pairs``. A constant target ends in rest. The reference is the controller's own state. It follows the targets and
+    not the measured joints, so that noise never enters it.
 
-    One tick is three calls. :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost. A
-    solver solves it where that is not the solution. :func:`move_reference` takes the part of the solution that can be
-    certified, and moves the reference. :meth:`problem` and :meth:`advance` put a program of your own in the solver's
-    place.
+    One tick is three calls. :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost. If
+    this minimum breaks a constraint, a solver solves the QP. :func:`move_reference` moves the reference by the part of
+    the solution that can be certified. With :meth:`problem` and :meth:`advance` a program of yours solves the QP.
 
     Args:
-        robot: Whose arms are controlled.
-        settings: None: the defaults.
-        solver: A name, in place of ``control.solver``, or an object that is asked at every tick. Nothing that it
-            answers, raises or writes into breaks the contract: it gets copies (guard.py).
-        tasks: Costs of a program's own, beside those of ``settings.tasks``.
-        constraints: Rows of a program's own, soft or hard.
+        robot: The robot.
+        settings: The settings; None for the defaults.
+        solver: A name that replaces ``control.solver``, or an object that is asked at every tick. It gets copies
+            (guard.py), so that nothing that it answers, raises or writes can break the contract.
+        tasks: Your own costs, in addition to those of ``settings.tasks``.
+        constraints: Your own rows, soft or hard.
 
     Raises:
-        ConfigError: For an argument of another kind, a task or a constraint without a usable answer at home, and for
-            settings that do not fit the robot.
+        ConfigError: If an argument is of another kind, if a task or a constraint has no usable answer at home, or if
+            the settings do not fit the robot.
     """
 
     def __init__(
@@ -89,24 +88,24 @@ class CartesianController(WatchedPairs):
         self._qp = StepProblem(robot, settings, tasks, constraints)
         self._tools: TaskData = self._data_pointer.value.tasks
         history = self._data_pointer.value.safety.history
-        self._restored = self._state.q, self._state.v, self._stop, *history.kept  # by :meth:`withdraw`
-        self._before = tuple(array.copy() for array in self._restored)  # the last step
+        self._restored = self._state.q, self._state.v, self._stop, *history.kept  # :meth:`withdraw` restores these.
+        self._before = tuple(array.copy() for array in self._restored)  # Their values before the last step.
         self._kept_before = self._live.kept, self._objects.kept
-        self._solution = np.zeros(self._nv)  # of the QP, whatever array has it
+        self._solution = np.zeros(self._nv)  # The solution of the QP, copied from the solver's array.
         self._targets = TargetTracker(self._model_pointer.value.tasks, self._arms, settings)
         self._compile()
         self.reset(robot.home)
 
     @property
     def settings(self) -> ControllerSettings:
-        """The settings that were asked for, by :meth:`change` or at first."""
+        """The settings of the last :meth:`change`, or the first ones."""
         return self._live.settings
 
     def change(self, values: Mapping[str, Any]) -> str | None:
-        """Go by other settings from the next step on, by name as in ``LIVE``; returns why not, or None.
+        """Change settings by the names in ``LIVE`` from the next step on; returns why that is not possible, or None.
 
-        Gains change over half a second. A smaller ``min_distance`` counts at once; a greater one for each pair as far
-        as it is proven (:attr:`kept_distances`). One that home does not keep is not possible.
+        Gains change within half a second. A smaller ``min_distance`` counts at once. A greater one counts for each pair
+        as soon as it is certified (:attr:`kept_distances`). It is refused if the home posture does not keep it.
         """
         try:
             refused = self._live.change(self.settings.changed(values))
@@ -117,22 +116,24 @@ class CartesianController(WatchedPairs):
         return refused
 
     def _compile(self) -> None:
-        """Run every kernel and the solver once, so that none is compiled or set up in mid-motion."""
+        """Run every kernel and the solver once, so that nothing is compiled or set up while arms move."""
         model, data = self._model_pointer, self._data_pointer
         self.reset(self.robot.home)
         self._qp.connect(model, self._targets.pointer, data)
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
         problem = self._qp.problem
-        problem.minimum = None  # a solver is set up at its first problem, and at home there may be none for it
+        problem.minimum = None  # At home the minimum may be the solution, and the solver would not be set up.
         self._solver.solve(problem)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
-        """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each.
+        """Start anew at joint positions ``q`` (nv,) [rad] and velocities ``v`` (nv,) [rad/s].
 
-        Targets and openings are forgotten, and nothing is held. Moving obstacles stay where they are. A start outside
-        the limits or in penetration is allowed: the controller recovers from it. Raises :class:`RobotError` for a
-        wrong shape or no finite number.
+        Targets, openings and held objects are forgotten. Moving obstacles stay where they are. A start outside the
+        limits or in penetration is allowed: the controller recovers from it.
+
+        Raises:
+            RobotError: If an array has another shape, or a number that is not finite.
         """
         state = self._state
         posture, velocity = self.robot.checked("q", q), 0.0 if v is None else self.robot.checked("v", v)
@@ -150,41 +151,49 @@ class CartesianController(WatchedPairs):
         self._certified = proven and self._apart
 
     def step(self, targets: Mapping[str, pin.SE3 | None], dt: float, posture: Array | None = None) -> Reference:
-        """Move the reference by ``dt`` seconds towards the tool ``targets`` (world frame).
+        """Move the reference by one step towards the targets.
 
-        An arm that is missing or None holds. A target that is not a finite pose is not used: the arm's last target
-        stays, and the report names the arm. A dt that is not in (0, 0.1] s moves nothing, or no more than 0.1 s.
-        Joints that the tools leave free go to ``posture`` (nv,) [rad], or home; one that is not finite is not used.
-        Raises :class:`RobotError` for ``targets`` that are no mapping.
+        Args:
+            targets: Poses of the tools by arm, in the world frame. An arm that is missing or None holds. If a target is
+                not a finite pose, the arm keeps its last target, and the report names the arm.
+            dt: Duration of the step [s]. Above 0.1 s the reference moves by 0.1 s; if it is not above 0, by nothing.
+            posture: Where the joints go that the tools leave free (nv,) [rad]; None for home. A posture that is not
+                finite is not used.
+
+        Returns:
+            The new reference, in arrays of its own.
+
+        Raises:
+            RobotError: If ``targets`` is not a mapping.
         """
         return self._tick(targets, dt, posture, self._solver.solve)
 
     def problem(
         self, targets: Mapping[str, pin.SE3 | None], dt: float, posture: Array | None = None
     ) -> qpsolvers.Problem:
-        """The QP that :meth:`step` would solve now, and nothing changes by asking for it.
+        """Return the QP that :meth:`step` would solve now. The controller does not change.
 
             minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = 1e-5 a_i' H^-1 a_i,  a_i the i-th row
             subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
 
         The variables are x = [v; s]: the next joint velocities (nv,) and a slack for each row (m,) [rad/s]. Rows have
-        unit norm. Those of separation come first, then the soft and the hard ones of ``constraints``; the slack of a
-        hard row has the upper bound 0. ``qpsolvers.solve_problem(problem, solver=NAME)`` solves it, and
-        :meth:`advance` goes on with what it finds.
+        unit norm. The rows of separation come first, then the soft and the hard rows of ``constraints``. The slack of a
+        hard row has the upper bound 0. ``qpsolvers.solve_problem(problem, solver=NAME)`` solves the problem, and
+        :meth:`advance` takes the solution.
 
         Args:
-            targets: Tool poses by arm, as of :meth:`step`.
-            dt: Of the step, above 0 and up to 0.1 [s]. One above ``max_substep`` is split, and the QP is the first
-                part's.
-            posture: As of :meth:`step`.
+            targets: As in :meth:`step`.
+            dt: Duration of the step, above 0 and up to 0.1 [s]. If it is above ``max_substep``, the step is split, and
+                the QP is that of the first part.
+            posture: As in :meth:`step`.
 
         Returns:
             The problem, in arrays of its own.
 
         Raises:
-            RobotError: For ``targets`` that are no mapping, and another ``dt``.
+            RobotError: If ``targets`` is not a mapping, or ``dt`` is not allowed.
         """
-        from q2r2_control.control.solvers.qpsolvers import slack_problem  # which imports every solver that there is
+        from q2r2_control.control.solvers.qpsolvers import slack_problem  # This import is slow: it loads every solver.
 
         check_kind("targets", targets, Mapping, _TARGETS, RobotError)
         if not _passes(dt) or dt > LONGEST_DT:
@@ -198,25 +207,25 @@ class CartesianController(WatchedPairs):
     def advance(
         self, x: npt.ArrayLike | None, targets: Mapping[str, pin.SE3 | None], dt: float, posture: Array | None = None
     ) -> Reference:
-        """Take a step with a solution of :meth:`problem` that somebody else found, certified as every step.
+        """Take a step with a solution of :meth:`problem` that your program has found. It is certified as every step is.
 
-        The result is that of :meth:`step` with a solver that finds the same. Nothing about ``x`` raises an exception
-        or is trusted: it is cut to the box, and taken as far as it can be certified. Anything else is a failed
-        solve: None, fewer than nv numbers, numbers that are not finite, another shape. The certified stop is then
-        executed, and ``report.unsolved`` says so.
+        The result is that of :meth:`step` with a solver that finds the same solution. ``x`` is not trusted: it is
+        clamped to the bounds, and executed as far as it can be certified. None, fewer than nv numbers, another shape,
+        and numbers that are not finite count as a failed solve. Then the certified stop is executed, and
+        ``report.unsolved`` says so.
 
         Args:
-            x: Next joint velocities (nv,) [rad/s]. Slacks may follow them, as in a solution of the whole problem. The
-                parts of a dt above ``max_substep`` all go on with the same velocities.
-            targets: Tool poses by arm, as of :meth:`step`; give those that the problem was asked with.
-            dt: As of :meth:`step` [s].
-            posture: As of :meth:`step`.
+            x: Next joint velocities (nv,) [rad/s]. The slacks may follow them, as in a solution of the whole problem.
+                All parts of a dt above ``max_substep`` use the same velocities.
+            targets: As in :meth:`step`. These are the targets with which the problem was made.
+            dt: As in :meth:`step` [s].
+            posture: As in :meth:`step`.
 
         Returns:
-            The reference, as :meth:`step` does.
+            The new reference, in arrays of its own.
 
         Raises:
-            RobotError: For ``targets`` that are no mapping.
+            RobotError: If ``targets`` is not a mapping.
         """
         return self._tick(targets, dt, posture, GivenSolution(x, self._nv).solve)
 
@@ -241,13 +250,13 @@ class CartesianController(WatchedPairs):
             for index in range(parts):
                 if not self._take_part(time / parts, 1.0 / parts, -1.0 if index else time, summary, solve):
                     summary.unsolved |= 1 << index
-        else:  # takes the targets, and moves nothing
+        else:  # The targets are taken, and nothing moves.
             self._qp.take_targets(summary)
         rejected = () if known and summary.targets_usable else self._targets.rejected(targets)
         return self._reference(summary, usable and dt <= LONGEST_DT, rejected)
 
     def _parts_of(self, time: float) -> int:
-        """Into how many steps of at most ``max_substep`` a ``time`` [s] is split."""
+        """Return the number of equal steps of at most ``max_substep`` into which a ``time`` [s] is split."""
         return max(math.ceil(time / self.settings.max_substep - 1e-9), 1)
 
     def _reference(self, summary: StepSummary, dt_usable: bool, rejected: tuple[str, ...] = ()) -> Reference:
@@ -271,9 +280,9 @@ class CartesianController(WatchedPairs):
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
 
     def brake(self, dt: float) -> Reference:
-        """Move the reference by ``dt`` [s] along its certified stop, of which the rest stays certified.
+        """Move the reference by ``dt`` [s] along its certified stop. The rest of the stop stays certified.
 
-        Nothing else moves it: it is at rest when the stop ends. A dt that :meth:`step` does not use moves nothing.
+        When the stop ends, the reference is at rest. A dt that is not above 0 moves nothing.
         """
         self._remember()
         self._state.a[:] = 0.0
@@ -282,56 +291,67 @@ class CartesianController(WatchedPairs):
             self._obstacles.pass_time(dt)
             self._observed, _, _ = self._move(self._model_pointer, self._data_pointer, self._solution, False, dt, 1.0)
             self._apart = self._observed[-1] >= -ROUNDING
-        self._active.used[0] = 0  # no limit holds it back from anything
+        self._active.used[0] = 0  # No limit is active, because no target is followed.
         return self._reference(StepSummary(), usable)
 
     def _remember(self) -> None:
-        """The state to which :meth:`withdraw` returns, and what pairs keep there."""
+        """Remember the state to which :meth:`withdraw` returns, and the distances that pairs keep there."""
         self._kept_before = self._live.kept, self._objects.kept
         for kept, array in zip(self._before, self._restored, strict=True):
             kept[:] = array
 
     def withdraw(self, reference: Reference) -> None:
-        """Undo the last step, whose ``reference`` came too late for the plant: be where the arms went on braking from.
+        """Undo the last step, because its ``reference`` came too late for the plant, which has begun to brake.
 
-        The state and the certified stop are those before the step, and ``reference`` becomes that state. Raises
-        :class:`RobotError` for what is no reference.
+        State and certified stop become those before the step, and ``reference`` becomes that state.
+
+        Raises:
+            RobotError: If ``reference`` is not a reference.
         """
         check_kind("reference", reference, Reference, "the Reference that the last step returned", RobotError)
         for array, kept in zip(self._restored, self._before, strict=True):
             array[:] = kept
         reference.q[:], reference.v[:] = self._state.q, self._state.v
-        # Later parts of the step may have proven more for pairs than holds where the arms are now.
+        # Later parts of the step may have certified greater distances than the arms keep where they are now.
         pairs_kept, objects_kept = self._kept_before
         self._live.keep_no_more_than(pairs_kept)
         self._objects.keep_no_more_than(objects_kept)
         self._observe_again(self._unchanged)
 
     def hold_at(self, q: Array | None) -> None:
-        """Let arms without a target go to joint positions ``q`` (nv,) [rad] and hold there, within every promise.
+        """Let arms without a target go to the posture ``q`` and hold there. The contract holds as always.
 
-        As fast as a gain of 4 /s of the way that is left, so ``q`` should move as the arms should. None: they hold
-        where they come to rest, as they do anyhow after a target. Raises :class:`RobotError` as :meth:`reset` does.
+        Their speed is 4 /s times the remaining way. ``q`` should therefore move as the arms should.
+
+        Args:
+            q: The posture (nv,) [rad]; None lets arms hold where they come to rest.
+
+        Raises:
+            RobotError: If ``q`` has another shape, or a number that is not finite.
         """
         self._targets.hold_at(None if q is None else self.robot.checked("q", q))
 
     def tool_pose(self, arm: str) -> pin.SE3:
-        """World pose of an arm's tool at the reference. Raises :class:`RobotError` for an arm that does not exist."""
+        """Return the pose of an arm's tool in the reference, in the world frame.
+
+        Raises:
+            RobotError: If there is no such arm.
+        """
         i = self._arms.index(self.robot.arm(arm).name)
         return pose_of(self._tools.rotation[i], self._tools.translation[i])
 
     @property
     def solver_failure(self) -> str | None:
-        """Why the solver's last answer was no solution; None if it was one, and with DAQP, which only says so."""
+        """Why the solver's last answer was not a solution; None if it was one. DAQP gives no reasons."""
         return getattr(self._solver, "failure", None)
 
     @property
     def stop_deceleration(self) -> Array:
-        """Of each joint in the full stop from the reference that is known, (nv,) [rad/s^2]."""
+        """Deceleration of each joint in the certified stop from the reference (nv,) [rad/s^2]."""
         return self._stop.copy()
 
     def _write_problem(self, h: float, tick: float, summary: StepSummary) -> None:
-        """Write the QP of a step of ``h`` [s]; ``tick``: see :func:`assemble`."""
+        """Write the QP of a step of ``h`` [s]. See :func:`assemble` for ``tick``."""
         self._live.step(h)
         self._obstacles.keep_clear(h)
         self._qp.write(h, tick, summary)
@@ -339,7 +359,10 @@ class CartesianController(WatchedPairs):
     def _take_part(
         self, h: float, share: float, tick: float, summary: StepSummary, solve: Callable[[QpProblem], QpSolution]
     ) -> bool:
-        """One step, which is a ``share`` of the tick: build, solve, certify and move; whether it was solved."""
+        """Build and solve the QP of one step, certify the solution and move; returns whether it was solved.
+
+        ``share`` is the part of the tick that this step is, and ``h`` its duration [s].
+        """
         self._write_problem(h, tick, summary)
         solution = solve(self._qp.problem)
         limit = self.settings.solve_time_limit
@@ -356,16 +379,17 @@ class CartesianController(WatchedPairs):
         summary.slack = max(summary.slack, slack)
         summary.solve_time += solution.solve_time
         was_apart, self._apart = self._apart, self._observed[-1] >= -ROUNDING
-        # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
+        # The rest of a certified stop is certified. Any other step was certified just now; the proof is complete if all
+        # pairs kept their distance before.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
 
     def _move_as_permitted(self, solved: bool, h: float, share: float, summary: StepSummary) -> tuple[int, float]:
-        """Move where the hard constraints permit it, and along the stop elsewhere.
+        """Move by the solution if the hard constraints permit it, and else along the certified stop.
 
-        A solution that the certificate has moved towards the stop is looked at once more, and undone if need be. Then
-        posture, velocity and the stop at hand are those before the step, and the stop reads nothing else. It is
-        therefore the one that was certified before.
+        The certificate may mix the solution with the stop. The result is checked against the constraints again, and
+        undone if it breaks one. Posture, velocity and the known stop are then those before the step. The stop depends
+        on nothing else, and is therefore the one that was certified before.
         """
         own, problem, state = self._qp.constraints, self._qp.problem, self._state
         usable = solved and own.permit(np.clip(self._solution, problem.lower, problem.upper))
@@ -385,13 +409,14 @@ class CartesianController(WatchedPairs):
 def check_settings(robot: Robot, settings: ControllerSettings) -> None:
     """Check ``settings`` for ``robot`` without compiling a kernel.
 
-    Raises what :class:`CartesianController` raises for them: :class:`ConfigError` for names that the robot does not
-    have and for tasks that cannot be made, :class:`RobotError` for joints and shapes that no kernel handles.
+    Raises:
+        ConfigError: If the robot lacks a name, or a task cannot be made.
+        RobotError: If no kernel handles a joint or a shape.
     """
     kernel_model_of(robot, settings)
     load_tasks(robot, settings.tasks)
 
 
 def _passes(dt: object) -> bool:
-    """Whether ``dt`` [s] is a time in which something may move."""
+    """Return whether ``dt`` is a number of seconds above 0."""
     return is_number(dt) and dt > 0.0

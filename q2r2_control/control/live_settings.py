@@ -1,25 +1,27 @@
-"""Settings in force while a controller runs: distances that pairs keep, objects that are held, and gains.
+"""Change distances, held objects and gains while a controller runs.
 
-**Distances.** A greater one makes a state uncertified that was certified. A pair therefore keeps more only as far as
-the stop at hand is proven with it. That is never more than  d - S - buffer,  with the pair's distance d at the
-reference and the bound S of how much closer the stop brings it (stop_certificate.py). The kept distance of a pair
+**Distances.** A greater distance can make a certified state uncertified. The distance that a pair keeps therefore grows
+only as far as the known stop is certified with it. This bound is  d - S - buffer,  where d is the distance of the pair
+at the reference, and S bounds by how much the stop brings it closer (stop_certificate.py). The kept distance of a pair
 
-- falls at once, when less is asked for: what was proven stays proven;
-- grows at ``GROWTH`` towards what is asked for, and no farther than that bound, before a step is decided on. The step
-  is then proven with the greater distance, and the invariant of safety/README.md holds at every tick;
+- falls at once if less is asked for, since the known stop stays certified;
+- grows at ``GROWTH`` towards the distance asked for, up to the bound, before a step is decided on. The step is then
+  certified with the greater distance, and the invariant of safety/README.md holds at every tick;
 - never falls while it grows. A pair that is nearer than asked for is not pushed apart.
 
-After a reset pairs keep at once what the posture leaves them, and the controller's first settings in any case. Out of a
-start nearer than that it recovers, up to the whole buffer. Pairs that start within the buffer stop where they are, with
-``LEAST_BUFFER`` at least. It grows with d - S as above. Arms that were left so are not pushed apart.
+After a reset every pair keeps the distances of the controller's first settings, and at once as much of the present
+settings as the posture allows. The controller recovers from a start that is nearer, up to the whole buffer. Pairs that
+start within the buffer stop where they are, with ``LEAST_BUFFER`` at least. This buffer grows with d - S as above. Arms
+that rest within it are not pushed apart.
 
-**Held objects.** A pair that does not count keeps minus infinity. One that appears keeps d - S - buffer, or its own
-distance where that is less. The stop at hand is then proven with the object too, and it never has to be refused. It
-grows to the same value for the d and S of later, and never falls. Two objects that overlap when the second one is
-gripped are one that both hands hold, and not watched against each other until one lets go.
+**Held objects.** A pair that does not count keeps minus infinity. The pair of an object that is gripped keeps
+d - S - buffer, or its own distance if that is less. The known stop is then certified with the object too, so that the
+object never has to be refused. The kept distance grows with later values of d and S, and never falls. If two objects
+overlap when the second one is gripped, both hands hold one object. It is not kept apart from itself until one hand lets
+go.
 
-**Gains** and weights go to their new values on a straight line: all arrays in the tasks' models that other settings
-make different. The certificate reads none of them.
+**Gains** and weights go to their new values on straight lines. These are all arrays of the tasks that differ between
+the settings. The certificate reads none of them.
 """
 
 from __future__ import annotations
@@ -41,13 +43,13 @@ from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-GROWTH = 0.05  # of what a pair keeps [m/s]
-_PERIOD = 0.01  # between two looks at distances that grow [s]
-_RAMP_TIME = 0.5  # of gains [s]
+GROWTH = 0.05  # Speed at which a kept distance grows [m/s].
+_PERIOD = 0.01  # Time between two updates of distances that grow [s].
+_RAMP_TIME = 0.5  # Time in which gains change [s].
 
 
 class ObjectPairs:
-    """Which objects are held, and what their pairs keep; all arrays are of the objects' pairs alone."""
+    """The objects that are held, and the distances that their pairs keep. All arrays are of the objects' pairs only."""
 
     def __init__(self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData) -> None:
         self._robot, self._safety, self._data = robot, model.safety, data.safety
@@ -63,17 +65,19 @@ class ObjectPairs:
         self._buffer = stop_buffer(self._goal, settings)
 
     def clear(self) -> None:
-        """Nothing is held."""
+        """Let no object be held."""
         self.holding: frozenset[str] = frozenset()
         self._due = 0.0
         self._new: npt.NDArray[np.bool_] = np.zeros(len(self._holders), dtype=np.bool_)
         self._write(np.full(len(self._holders), -np.inf))
 
     def set_holding(self, arm: str, holds: bool) -> bool:
-        """Take it that an arm's gripper holds its object, or does not; whether that is new.
+        """Let an arm's gripper hold its object, or not; returns whether this is a change.
 
-        Pairs that begin to count keep their own distance until they are measured, and :meth:`begin` then. Raises
-        :class:`RobotError` for an arm that has no object.
+        Pairs that begin to count keep their own distance until they are measured. The caller calls :meth:`begin` then.
+
+        Raises:
+            RobotError: If the arm has no object.
         """
         if arm not in self._arms:
             allowed = ", ".join(self._arms) or "none"
@@ -89,16 +93,16 @@ class ObjectPairs:
         return True
 
     def begin(self) -> None:
-        """Let the pairs that have begun to count, and were measured, keep what they can."""
+        """Let the pairs that have begun to count, and were measured, keep as much as is certified."""
         kept = np.where(self._new, np.minimum(self._goal, self._within_reach()), self.kept)
         overlap = self._data.distance[self._range] < np.minimum(self._goal, 0.0)
-        if (overlap & self._shared & self._new).any():  # both hands hold one object
+        if (overlap & self._shared & self._new).any():  # Both hands hold one object.
             kept[self._shared] = -np.inf
         self._write(kept)
         self._due = 0.0
 
     def step(self, h: float) -> None:
-        """Before a step of ``h`` [s]: let what pairs keep grow, with the reference and the stop as they are."""
+        """Let kept distances grow, before a step of ``h`` [s]."""
         self._due -= h
         if self._due <= 0.0:
             self._due = _PERIOD
@@ -106,12 +110,12 @@ class ObjectPairs:
             self._write(np.where(np.isfinite(self.kept), more, -np.inf))
 
     def change(self, settings: ControllerSettings) -> None:
-        """Let pairs keep what ``settings`` say: less at once, more as :meth:`step` finds the room."""
+        """Let pairs keep the distances of ``settings``: a smaller one at once, a greater one by :meth:`step`."""
         self._aim(settings)
         self._write(np.minimum(self.kept, self._goal))
 
     def keep_no_more_than(self, kept: Array) -> None:
-        """Take back what pairs have come to keep since they kept ``kept``, in a step that was undone [m]."""
+        """Keep no more than ``kept`` [m] again, because the step since then was undone."""
         self._write(np.where(np.isfinite(kept), np.minimum(self.kept, kept), self.kept))
 
     def _within_reach(self) -> Array:
@@ -119,7 +123,7 @@ class ObjectPairs:
         return np.asarray(provable_distances(self._safety, self._data)[self._range] - self._buffer)
 
     def _write(self, kept: Array) -> None:
-        """Tell the kernels what the pairs keep [m]; minus infinity where they do not count."""
+        """Write the kept distances for the kernels [m]; minus infinity for pairs that do not count."""
         self.kept = kept
         self._safety.min_distance[self._range] = kept
         self._safety.approach.stop_distance[self._range] = kept + self._buffer
@@ -127,28 +131,28 @@ class ObjectPairs:
 
 
 class LiveSettings:
-    """The settings of one controller that are in force, on their way to the ones that were asked for."""
+    """The present settings of one controller, on their way to the settings that were asked for."""
 
     def __init__(
         self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData, objects: ObjectPairs
     ) -> None:
         self._robot, self._objects = robot, objects
         self._model, self._safety, self._data = model, model.safety, data.safety
-        self._gains, self._ramp = self._gains_of(settings), 0.0  # asked for, and the time until they are reached [s]
-        self._changing: list[tuple[Array, Array]] = []  # what kernels read of these, and what it goes to
-        self._goal = self._least = kept_distances(robot, settings).values  # least: without any change
-        self._stops = model.safety.approach.stop_distance[: len(self._goal)]  # where the QP stops pairs
-        self._growing, self._crowded, self._due = False, False, 0.0  # crowded: a pair is within its buffer
+        self._gains, self._ramp = self._gains_of(settings), 0.0  # The goal, and the time until it is reached [s].
+        self._changing: list[tuple[Array, Array]] = []  # Arrays that kernels read, and their new values.
+        self._goal = self._least = kept_distances(robot, settings).values  # The least is that of the first settings.
+        self._stops = model.safety.approach.stop_distance[: len(self._goal)]  # Distances at which the QP stops pairs.
+        self._growing, self._crowded, self._due = False, False, 0.0  # Crowded means that a pair is within its buffer.
         self.settings = settings
-        self.kept = self._goal  # by every monitored pair now (p,) [m]; another array whenever something has changed
+        self.kept = self._goal  # Distance that every monitored pair keeps (p,) [m]; another array after a change.
 
     @property
     def narrow(self) -> int:
-        """The pair that keeps the least of what it was asked for, or -1 where all keep all of it."""
+        """The pair whose kept distance is farthest from the one asked for; -1 if all pairs keep all of it."""
         return int(np.argmax(self._goal - self.kept)) if self._growing else -1
 
     def change(self, settings: ControllerSettings) -> str | None:
-        """Go to ``settings``, which differ in ``LIVE`` only; returns why not, and changes nothing then, or None."""
+        """Go to ``settings``, which may differ in ``LIVE`` only; returns None, or why nothing was changed."""
         before, goal = self.settings.min_distance, kept_distances(self._robot, settings)
         if settings.min_distance > before:
             if settings.min_distance > CLEARANCE:
@@ -156,7 +160,7 @@ class LiveSettings:
                     f"min_distance = {settings.min_distance:g} m: allowed while a controller runs: up to "
                     f"{CLEARANCE:g}, since pairs that always stay farther apart are not watched"
                 )
-            # Arms at home then keep all of it, and rest.
+            # With this room, arms at home keep the whole distance and rest.
             room = replace(goal, values=goal.values + stop_buffer(goal.values, settings))
             if faults := too_close_at_home(self._robot, room):
                 return f"min_distance = {settings.min_distance:g} m: {faults[0]} with distance_buffer"
@@ -172,21 +176,21 @@ class LiveSettings:
         return None
 
     def restart(self) -> None:
-        """Before a reset is observed: begin with what does not depend on where that is."""
+        """Begin anew before a reset, with the distances that do not depend on the posture."""
         self._due = 0.0
         self._write(np.minimum(self._goal, self._least))
         self._stops[:] = self.kept + stop_buffer(self.kept, self.settings)
         self._approach_gains(self._ramp)
 
     def begin(self) -> None:
-        """After a reset was observed: keep what the posture allows, and stop no farther away than that."""
+        """After the reset, keep as much as the posture allows, and let the QP stop pairs no farther away than that."""
         self._grow(np.inf)
         distance = self._data.distance[: len(self.kept)]
         is_within = (distance >= self.kept - ROUNDING) & (distance < self._stops)
         self._stop_from(np.where(is_within, self.kept, self._stops))
 
     def step(self, h: float) -> None:
-        """Before a step of ``h`` [s] from an observed reference."""
+        """Let kept distances and gains change, before a step of ``h`` [s] from a reference that was observed."""
         if self._objects.growing:
             self._objects.step(h)
         if self._ramp:
@@ -199,11 +203,11 @@ class LiveSettings:
                 self._stop_from(self._stops)
 
     def keep_no_more_than(self, kept: Array) -> None:
-        """Take back what pairs have come to keep since they kept ``kept`` (p,), in a step that was undone [m]."""
+        """Keep no more than ``kept`` (p,) [m] again, because the step since then was undone."""
         self._write(np.minimum(self.kept, kept))
 
     def _grow(self, most: float) -> None:
-        """Keep more, by at most ``most`` [m], where the stop at hand proves it."""
+        """Let kept distances grow by at most ``most`` [m], as far as the known stop is certified with them."""
         if self._growing:
             room = self._lasting() - stop_buffer(self._goal, self.settings)
             self._write(np.maximum(self.kept, np.minimum(np.minimum(self._goal, self.kept + most), room)))
@@ -216,14 +220,17 @@ class LiveSettings:
             self._stop_from(self._stops)
 
     def _stop_from(self, before: Array) -> None:
-        """Let the QP stop pairs with their buffer, or where they are within it; no nearer than ``before`` (p,) [m]."""
+        """Let the QP stop pairs at their buffer, or within it where they are already.
+
+        ``before`` (p,) are the distances at which the QP stopped them so far [m]. They do not fall.
+        """
         wanted = self.kept + stop_buffer(self.kept, self.settings)
         least = np.maximum(before, self.kept + LEAST_BUFFER)
         self._stops[:] = np.minimum(np.maximum(self._lasting(), least), wanted)
         self._crowded = bool((self._stops < wanted).any())
 
     def _lasting(self) -> Array:
-        """d - S of every monitored pair (p,) [m]."""
+        """Return d - S of every monitored pair (p,) [m]."""
         return provable_distances(self._safety, self._data)[: len(self._goal)]
 
     def _gains_of(self, settings: ControllerSettings) -> tuple[Array, ...]:
@@ -237,7 +244,7 @@ class LiveSettings:
 
 
 def arrays_in(values: tuple[Any, ...]) -> Iterator[Array]:
-    """All arrays in a tuple and the tuples within it."""
+    """Yield all arrays in a tuple and in the tuples within it."""
     for value in values:
         if isinstance(value, tuple):
             yield from arrays_in(value)

@@ -1,4 +1,4 @@
-"""Moving obstacles of one controller: where they were reported, and what pairs with them keep."""
+"""The moving obstacles of one controller: their last reports, and the distances that pairs with them keep."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from q2r2_control.types import Array
 
 
 class MovingObstacles:
-    """The obstacles that are there, by name. One that is not there keeps minus infinity, as an object not held."""
+    """The obstacles that are there, by name. Pairs with an obstacle that is not there keep minus infinity."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class MovingObstacles:
         pointers: tuple[KernelPointer, ...],
         geometry: pin.GeometryModel,
     ) -> None:
-        """``pointers`` to the kernels' model and data, which were made with ``geometry``."""
+        """``pointers`` lead to the kernels' model and data, which were made with ``geometry``."""
         model: KernelModel = pointers[0].value
         self._robot, self._bodies, limits = robot, model.safety.collision.bodies, model.safety.limits
         names, last = [item.name for item in geometry.geometryObjects], len(geometry.collisionPairs)
@@ -39,7 +39,8 @@ class MovingObstacles:
         count, goal = len(self._number), kept_by_obstacles(robot, settings).values
         hulls = {f"{held.link}{HULL}": arm for arm, held in robot.objects.by_arm.items()}
         pairs = list(geometry.collisionPairs)[last - len(goal) :]
-        self._holders = [hulls.get(names[pair.first]) for pair in pairs]  # arm that has to hold for a pair to count
+        # For each pair with a held object, the arm that has to hold it for the pair to count.
+        self._holders = [hulls.get(names[pair.first]) for pair in pairs]
         self._limits = limits
         self.data = ObstacleData(
             first=(len(goal) // max(count, 1)) * np.arange(count + 1),
@@ -53,7 +54,7 @@ class MovingObstacles:
             stop_time=np.zeros(1),
         )
         self.there: dict[str, MovingObstacle] = {}
-        self.still: dict[str, MovingObstacle] = {}  # those among them that stay; another mapping at each report
+        self.still: dict[str, MovingObstacle] = {}  # The obstacles that do not move. Each report makes another mapping.
         self._holding: frozenset[str] = frozenset()
         if count:
             pointers = *pointers, pointer_to(self.data)
@@ -63,15 +64,15 @@ class MovingObstacles:
 
     @property
     def reports(self) -> dict[str, ObstacleReport]:
-        """Those that are there, as reported last."""
+        """The last reports of the obstacles that are there."""
         ages = zip(self._number, self.data.age.tolist(), strict=True)
         return {name: ObstacleReport(self.there[name], age) for name, age in ages if name in self.there}
 
     def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
-        """Take it that an obstacle is there as described, or is not there; returns a 1 for its body (g,).
+        """Take a report of an obstacle; None if it has gone. Returns an array (g,) with a 1 for the body that changed.
 
-        Until :meth:`keep_clear` all pairs with obstacles keep what they have to while the arms stop. Raises as
-        :func:`check_obstacle` does.
+        Until :meth:`keep_clear`, all pairs with obstacles keep the distances that they need while the arms stop. Raises
+        as :func:`check_obstacle` does.
         """
         check_obstacle(name, obstacle, self._number)
         number, index = self._number[name], list(self._number).index(name)
@@ -90,33 +91,33 @@ class MovingObstacles:
         return changed
 
     def hold(self, holding: frozenset[str]) -> None:
-        """Take it that these arms' grippers hold their objects."""
+        """Let the grippers of these arms hold their objects."""
         self._holding = holding
         self._count()
 
     def change(self, settings: ControllerSettings) -> None:
-        """Let pairs keep what ``settings`` say."""
+        """Let pairs keep the distances of ``settings``."""
         self._goal = kept_by_obstacles(self._robot, settings).values
         self.data.buffer[:] = stop_buffer(self._goal, settings)
         self._count()
 
     def kept_from(self, stop: float) -> Array:
-        """Distances that pairs keep from where these were reported, if arms stop in ``stop`` [s]."""
+        """Return the distances that pairs keep from the reported places, if the arms stop in ``stop`` [s] (n,) [m]."""
         kept = self.data.kept.reshape(len(self._number), -1) if self._number else np.zeros((0, 0))
         way = self.data.speed * (np.maximum(self.data.age, REPORT_AGE) + stop)
         return np.ravel((kept + way[:, None])[[name in self.there for name in self._number]])
 
     def keep_clear(self, h: float) -> None:
-        """Before a step of ``h`` [s] from an observed reference: say what pairs have to keep, and joint speeds."""
+        """Write kept distances and joint speeds for the kernels, before a step of ``h`` [s]."""
         if self.there:
             self._keep_clear(h)
 
     def pass_time(self, time: float) -> None:
-        """Let reports get older by a ``time`` [s] for which no step is taken."""
+        """Let reports age by ``time`` [s], for which no step is taken."""
         self.data.age[:] += time
 
     def _count(self) -> None:
-        """Let pairs count whose obstacle is there and whose object is held."""
+        """Let those pairs count whose obstacle is there and whose object is held."""
         if not self._number:
             return
         there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))
@@ -129,7 +130,7 @@ class MovingObstacles:
 
 
 def write_body(bodies: CollisionBodies, number: int, obstacle: MovingObstacle) -> None:
-    """Let the body ``number`` of a collision model be an obstacle's."""
+    """Write an obstacle as the body ``number`` of a collision model."""
     body = pin.GeometryModel()
     body.addGeometryObject(body_of("", obstacle))
     for array, value in zip(bodies, bodies_of(body), strict=True):

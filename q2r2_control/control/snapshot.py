@@ -1,4 +1,4 @@
-"""Let something be worked out as if it happened, and put everything back as it was."""
+"""Compute something on a controller's own data, and then restore these data."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from q2r2_control.control.live_settings import arrays_in
 
 @contextmanager
 def put_back(values: tuple[Any, ...], objects: Iterable[object]) -> Iterator[None]:
-    """Restore, to the bit, all arrays within ``values`` and the attributes of ``objects`` when the block ends.
+    """Restore all arrays in ``values`` and the attributes of ``objects`` to the bit when the block ends.
 
     Args:
-        values: Tuples of arrays, also within each other, as kernels read them.
-        objects: Whose attributes are replaced, never changed in place. Arrays among them that are, are in ``values``.
+        values: Tuples of arrays, which may be nested, as kernels read them.
+        objects: Objects whose attributes are replaced in the block. An array that is changed in place must be in
+            ``values``.
     """
     arrays = [(array, array.copy()) for array in arrays_in(values)]
     attributes = [(vars(one), dict(vars(one))) for one in objects]

@@ -1,4 +1,4 @@
-"""The QP of each step of one controller, with the tasks and constraints of a program's own."""
+"""Write the QP of each step of one controller, with the user's own tasks and constraints."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class StepProblem:
         self.constraints = OwnConstraints(robot, constraints)
 
     def connect(self, model: KernelPointer, targets: KernelPointer, data: KernelPointer) -> None:
-        """Compile for these, which have been written by a reset."""
+        """Compile the kernels for these pointers, after a reset has written what they lead to."""
         self._pointers = model, targets, data
         arrays: KernelData = data.value
         self._rows, self._tasks, self._state = arrays.safety.rows, arrays.tasks, arrays.safety.state
@@ -47,7 +47,7 @@ class StepProblem:
             self._find_minimum = bound(find_minimum, data)
 
     def take_targets(self, summary: StepSummary) -> None:
-        """Take the targets that were offered at a tick that moves nothing."""
+        """Take the offered targets in a tick that moves nothing."""
         summary.targets_usable, _, _ = self._assemble(*self._pointers, self._longest, 0.0)
 
     def write(self, h: float, tick: float, summary: StepSummary) -> None:
@@ -72,19 +72,19 @@ class StepProblem:
 
 
 class GivenSolution:
-    """A solver whose answer to every problem was given from outside."""
+    """A solver that always gives the same answer, which a program has found elsewhere."""
 
     def __init__(self, x: object, nv: int) -> None:
-        """``x``: the velocities (nv,) [rad/s], and whatever follows them; anything else is no solution."""
+        """``x`` begins with the velocities (nv,) [rad/s]. Anything else counts as no solution."""
         self._v: Array | None = None
         try:
             given = np.asarray(x)
             numbers = np.array(given, dtype=np.float64) if given.dtype.kind != "c" else np.zeros(0)
-        except Exception:  # of any kind that a stranger's object raises
+        except Exception:  # An object of the caller's may raise anything.
             return
         if numbers.ndim == 1 and len(numbers) >= nv and np.isfinite(numbers[:nv]).all():
             self._v = numbers[:nv]
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """The given answer, whatever the problem is."""
+        """Return the given answer for any problem."""
         return QpSolution(self._v, 0.0)

@@ -1,4 +1,4 @@
-"""The report of a step: its outcome, and the names of the limits that held it back."""
+"""Report the outcome of a step, and the names of the limits that held it back."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _KINDS = {POSITION: LimitKind.POSITION, VELOCITY: LimitKind.VELOCITY, ACCELERATI
 
 
 class LimitNames:
-    """Names of limits and pairs, by the numbers that kernels know them by."""
+    """Names of limits and pairs by their numbers in the kernels."""
 
     def __init__(self, robot: Robot, geometry: pin.GeometryModel) -> None:
-        """``geometry`` begins with the robot's, as the kernels' bodies and pairs do."""
+        """``geometry`` begins with the robot's own bodies and pairs, as the kernels' arrays do."""
         names = [item.name for item in geometry.geometryObjects]
         pairs = collision_model_of(
             robot, geometry
@@ -29,7 +29,8 @@ class LimitNames:
         self.pairs = [
             (names[first], names[second]) for first, second in both
         ]  # of the cell, then of objects, then of obstacles
-        self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()  # most ticks bind as the one before
+        # In most ticks the same limits are active as in the last one.
+        self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()
         self._by_kind: dict[int, list[ActiveLimit]] = {
             kind: [ActiveLimit(limit, (joint,)) for joint in robot.joint_names] for kind, limit in _KINDS.items()
         }
@@ -37,11 +38,11 @@ class LimitNames:
         self._by_kind[TOOL_SPEED] = [ActiveLimit(LimitKind.TOOL_SPEED, (arm,)) for arm in robot.arms]
 
     def pair(self, number: int) -> tuple[str, str]:
-        """Both bodies of a pair; empty names in a cell without pairs."""
+        """Return the names of both bodies of a pair; empty names in a cell without pairs."""
         return self.pairs[number] if self.pairs else ("", "")
 
     def of(self, active: ActiveBounds) -> tuple[ActiveLimit, ...]:
-        """Limits and pairs, each once."""
+        """Return the active limits and pairs, each of them once."""
         found = int(active.used[0])
         if not found:
             return ()
@@ -55,19 +56,19 @@ class LimitNames:
 
 @dataclass(slots=True)
 class StepSummary:
-    """The sum of the substeps of one tick."""
+    """Collects the results of the substeps of one tick."""
 
     fallback: bool = False
-    targets_usable: bool = True  # all of them
-    inside: bool = True  # all joints are within their limits
-    unsolved: int = 0  # bit by bit, which substeps had no solution
+    targets_usable: bool = True  # Whether all targets were usable.
+    inside: bool = True  # Whether all joints are within their limits.
+    unsolved: int = 0  # One bit for each substep without a solution.
     slack: float = 0.0
     solve_time: float = 0.0
-    faults: tuple[str, ...] = ()  # of tasks and constraints of a program's own
-    constraints: tuple[ActiveLimit, ...] = ()  # of a program's own that the last substep met
+    faults: tuple[str, ...] = ()  # Faults of the user's own tasks and constraints.
+    constraints: tuple[ActiveLimit, ...] = ()  # The user's own constraints that are active in the last substep.
 
     def status(self, apart: bool, dt_usable: bool, rejected: tuple[str, ...]) -> StepStatus:
-        """The most important of what happened."""
+        """Return the most important event of the step as its status."""
         if self.fallback:
             return StepStatus.FALLBACK
         if not (self.inside and apart):

@@ -1,4 +1,4 @@
-"""Pairs that a controller keeps apart: how far, and those of its bodies that change between steps."""
+"""The pairs of bodies that a controller keeps apart, their distances, and the bodies that change between steps."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval
 
-# Measures pairs at a posture (nv,), and what each of them has to keep there (p,) [m].
+# Measures the pairs at a posture (nv,), and returns their distances and the distances that they have to keep (p,) [m].
 PairsAhead = tuple[Callable[[Array], Array], Array]
 
 
 class WatchedPairs:
-    """Fingers, held objects and moving obstacles at the reference, and what their pairs and all others keep."""
+    """Fingers, held objects and moving obstacles of a controller, and the distances that all pairs keep."""
 
     def __init__(self, robot: Robot, settings: ControllerSettings) -> None:
         self.robot, self._arms = robot, tuple(robot.arms)
@@ -55,23 +55,32 @@ class WatchedPairs:
 
     @property
     def kept_distances(self) -> Array:
-        """Kept distance of every monitored pair now (p,) [m]; another array, not a changed one, when that changes."""
+        """Distance that every monitored pair keeps now (p,) [m]. After a change this is another array."""
         return self._live.kept
 
     @property
     def narrow_pair(self) -> tuple[str, str] | None:
-        """The pair that is farthest from keeping what was asked for, since it was too near yet; None: all keep it."""
+        """The pair whose kept distance is farthest from the one asked for; None if all pairs keep all of it."""
         return None if self._live.narrow < 0 else self._names.pair(self._live.narrow)
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
-        """Say that the gripper of ``arm`` is, and stays, between two openings, 0 closed .. 1 fully open.
+        """Declare that the gripper of an arm is, and stays, between two openings.
 
-        Its fingers count as what they sweep between these, from the next step on; at first, and after :meth:`reset`,
-        they are all of their way. Bodies within what they were are always accepted. Others are if every pair keeps its
-        distance with them, at the reference and on a certified stop from there. Else nothing changes, and the pair in
-        the way is returned. A gripper may be commanded to what was accepted only.
+        From the next step on its fingers count as the volume that they sweep between the openings. At first, and after
+        :meth:`reset`, this is their whole way. A part of the present volume is always accepted. Another volume is
+        accepted if every pair keeps its distance with it, at the reference and during a certified stop from there. The
+        caller may send the gripper only to openings that were accepted.
 
-        Raises :class:`RobotError` for a name that is no arm's and for numbers that are no interval.
+        Args:
+            arm: The arm.
+            least: The least opening, from 0 for closed to 1 for fully open.
+            greatest: The greatest opening.
+
+        Returns:
+            None if the openings were accepted; else the pair in the way, and nothing has changed.
+
+        Raises:
+            RobotError: If there is no such arm, or the numbers are not an interval within 0 .. 1.
         """
         self.robot.arm(arm)
         interval, before = self._fingers.checked(arm, least, greatest), self._fingers.intervals[arm]
@@ -86,15 +95,18 @@ class WatchedPairs:
 
     @property
     def openings(self) -> dict[str, Interval]:
-        """Between which openings each arm's gripper counts as being, as :meth:`set_opening` accepted it."""
+        """For each arm, the least and the greatest opening of its gripper that :meth:`set_opening` accepted."""
         return dict(self._fingers.intervals)
 
     def set_holding(self, arm: str, holds: bool) -> None:
-        """Say that the gripper of ``arm`` holds its object from the next step on, or, as after :meth:`reset`, does not.
+        """Declare that the gripper of an arm holds its object from the next step on, or holds it no more.
 
-        The object then is part of the tool. Each of its pairs begins with the distance that there is and keeps more as
-        it gets more, until it keeps its own (:attr:`object_distances`). The object is therefore always accepted, and
-        nothing moves for it. Raises :class:`RobotError` for an arm that has no object.
+        A held object is part of the tool. Each of its pairs begins with the distance that it has. It keeps more as the
+        distance grows, until it keeps its own (:attr:`object_distances`). For that reason the object is always
+        accepted, and no arm moves for it. After :meth:`reset` no object is held.
+
+        Raises:
+            RobotError: If the arm has no object.
         """
         if not self._objects.set_holding(arm, holds):
             return
@@ -106,21 +118,30 @@ class WatchedPairs:
 
     @property
     def holding(self) -> dict[str, bool]:
-        """Of each arm that has an object, whether its gripper holds it, as :meth:`set_holding` was told."""
+        """For each arm that has an object, whether its gripper holds it, as :meth:`set_holding` was told."""
         return {arm: arm in self._objects.holding for arm in self.robot.objects.by_arm}
 
     @property
     def object_distances(self) -> Array:
-        """Kept distance of every pair of ``Robot.objects`` now (pairs,) [m]; minus infinity while it does not count."""
+        """Distance that every pair of ``Robot.objects`` keeps now (pairs,) [m]; -inf while the object is not held."""
         return self._objects.kept.copy()
 
     def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> tuple[str, str] | None:
-        """Say where a moving obstacle is from the next step on, and how fast it may move; None: it is gone.
+        """Report where a moving obstacle is and how fast it may move, from the next step on.
 
-        ``name`` is one of ``ControllerSettings.moving_obstacles``. The arms keep away from all that it can get to
-        until they rest, and slow down as it comes nearer. From then on nothing moves closer to it. It counts in any
-        case. The pair is returned for which the stop at hand is not proven to end before the obstacle could be there,
-        as when it appears in front of a moving arm. Raises :class:`ConfigError` for another name.
+        The arms keep away from all places that the obstacle can reach until they rest, and slow down as it comes
+        nearer. The report always counts.
+
+        Args:
+            name: One of ``ControllerSettings.moving_obstacles``.
+            obstacle: The obstacle; None if it has gone.
+
+        Returns:
+            None, or a pair for which the certified stop may end too late, because the obstacle could be there first.
+            This happens if an obstacle appears in front of a moving arm.
+
+        Raises:
+            ConfigError: If there is no such name.
         """
         changed = self._obstacles.put(name, obstacle)
         self._active.used[0] = 0  # what it names may not count any more
@@ -131,9 +152,10 @@ class WatchedPairs:
         return None if blocked < 0 else self._names.pair(blocked)
 
     def pass_time(self, time: float) -> None:
-        """Let reports of moving obstacles become older by a ``time`` [s] for which no step is taken.
+        """Let reports of moving obstacles age by ``time`` [s], for which no step is taken.
 
-        Raises :class:`RobotError` for what is no time.
+        Raises:
+            RobotError: If ``time`` is not a number of seconds, 0 or more.
         """
         if not (isinstance(time, float | int) and 0.0 <= time < np.inf):
             raise RobotError(f"time = {shown(time)}: allowed: seconds, 0 or more")
@@ -141,57 +163,67 @@ class WatchedPairs:
 
     @property
     def skew(self) -> float:
-        """By how much time one arm may be behind where another one is on the reference [s]; 0: they move as one."""
+        """Greatest difference between the lags of two arms behind the reference [s]; 0 if they move as one body."""
         return float(self._data_pointer.value.safety.history.window[0])
 
     def allow_skew(self, time: float) -> None:
-        """Let arms be apart in time by up to ``time`` [s], at most 0.1, and stop one by one, from the next step on.
+        """Let the lags of the arms differ by up to ``time`` [s] from the next step on, and each arm stop on its own.
 
-        Bodies of two arms then keep their distance wherever on its own way each arm is: from where the reference had
-        it ``time`` ago to the end of the certified stop. More counts as fast as time passes, less counts at once. After
-        a :meth:`reset`, all of it does. Raises :class:`RobotError` for what is no such time.
+        Bodies of two arms then keep their distance wherever on its own way each arm is. Its way begins where the
+        reference was a ``time`` ago, and ends where the certified stop does. A greater time takes effect as time
+        passes, and a smaller one at once. After :meth:`reset` all of it counts.
+
+        Args:
+            time: The difference, from 0 to 0.1 [s].
+
+        Raises:
+            RobotError: If ``time`` is not such a number.
         """
         if not (isinstance(time, float | int) and 0.0 <= time <= LONGEST_WINDOW):
             raise RobotError(f"skew = {shown(time)}: allowed: seconds, 0 to {LONGEST_WINDOW:g}")
         self._data_pointer.value.safety.history.window[1] = time
 
     def pairs_ahead(self, stop: float) -> PairsAhead:
-        """All pairs, for a look at a way before it is gone by arms that stop in ``stop`` [s].
+        """Return a function that measures all pairs at a posture, to check a way before the arms take it.
 
-        Held objects count, and moving obstacles where they were reported last.
+        Held objects count, and moving obstacles count where they were reported last.
+
+        Args:
+            stop: Time in which the arms stop on that way [s].
         """
         kept = self.kept_distances, self._objects.kept, self._obstacles.kept_from(stop)
         return distances_with(self.robot, self.moving_obstacles), np.concatenate(kept)
 
     @property
     def moving_obstacles(self) -> dict[str, MovingObstacle]:
-        """The moving obstacles that are there, by name, as :meth:`move_obstacle` was told last."""
+        """The moving obstacles that are there, by name, from the last calls of :meth:`move_obstacle`."""
         return dict(self._obstacles.there)
 
     @property
     def obstacle_reports(self) -> dict[str, ObstacleReport]:
-        """The same, and how old these reports are now."""
+        """The moving obstacles that are there, with the present age of their reports."""
         return self._obstacles.reports
 
     def spare_distance(self, arm: str) -> float:
-        """How much nearer ``arm`` may come to what is no part of it at the reference [m]; inf if there is no pair.
+        """Return by how much an arm may still approach other bodies at the reference [m]; infinite without a pair.
 
-        Raises as :meth:`tool_pose` does.
+        Raises:
+            RobotError: If there is no such arm.
         """
         return float(self._spare(self._model_pointer, self._data_pointer, self._with_others[self.robot.arm(arm).name]))
 
     @property
     def still_obstacles(self) -> Mapping[str, MovingObstacle]:
-        """Those of :attr:`moving_obstacles` that stay; another mapping, not a changed one, when that changes."""
+        """The :attr:`moving_obstacles` that do not move. After a change this is another mapping."""
         return self._obstacles.still
 
     @property
     def _kernel_values(self) -> tuple[KernelModel, KernelData, ObstacleData]:
-        """All arrays that kernels read and write beside the targets."""
+        """All arrays that kernels read and write, except the targets."""
         return self._model_pointer.value, self._data_pointer.value, self._obstacles.data
 
     def _observe_again(self, grown: IntArray) -> int:
-        """Observe what has changed; returns the pair in the way of bodies that have ``grown``, or -1."""
+        """Update the distances after a change; returns the pair in the way of bodies that have ``grown``, or -1."""
         self._observed, blocked = self._observe_bodies(self._model_pointer, self._data_pointer, grown)
         self._apart = self._observed[-1] >= -ROUNDING
         return int(blocked)

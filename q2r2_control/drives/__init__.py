@@ -1,5 +1,5 @@
-"""Ways to drive a plant: what becomes of a reference before it is sent, the same for every loop.
+"""Turn the controller's reference into commands of a plant, by position, velocity or torque.
 
-The pipeline hands the commands to a plant, the ROS nodes turn them into messages. The rules that stop the arms are in
-``supervision``.
+The pipeline hands these commands to a plant, and the ROS nodes turn them into messages. The rules that stop the arms
+are in ``supervision``.
 """

@@ -1,4 +1,4 @@
-"""Modes of driving a plant, by position, velocity or torque: from tool targets and a reference to a command."""
+"""Drive a plant by position, velocity or torque: from targets and a reference to a command."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ Openings = dict[str, float]
 
 @dataclass(slots=True)
 class DriveReport:
-    """Outcome of the mode's own laws in one tick; None for those of the other modes, or not enabled."""
+    """The results of one tick: of the impedance and the wall in torque mode, of the admittance in position mode.
+
+    A result is None if it belongs to another mode, or is not enabled.
+    """
 
     impedance: ImpedanceReport | None = None
     wall: WallReport | None = None
@@ -37,74 +40,78 @@ class Drive(ABC):
     """One mode of driving a plant."""
 
     mode: CommandMode
-    report: DriveReport  # of the last tick
-    yields = False  # whether arms that are pushed leave the reference by design
-    coasts = False  # whether a plant goes on moving by the last command while none comes
+    report: DriveReport  # The results of the last tick.
+    yields = False  # Whether a person may push the arms away from the reference.
+    coasts = False  # Whether a plant goes on moving by the last command while no new one comes.
 
     @abstractmethod
     def reset(self, state: RobotState) -> None:
-        """Start anew, at rest at the measured ``state``. Raises :class:`Q2R2Error` where that cannot be."""
+        """Start anew, at rest at the measured ``state``; raises :class:`Q2R2Error` if that is not possible."""
 
     @abstractmethod
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
     ) -> Command:
-        """The command to the plant in a tick of ``dt`` [s]; never raises because of a number.
+        """Return the command for the plant. No number makes it raise.
 
-        ``trusted`` is False where ``state`` is out of date or not to be believed, and for the last command before there
-        are no more. Terms that push according to the state must not push then.
+        Args:
+            reference: The controller's reference.
+            state: The measured state.
+            grippers: The openings of the grippers.
+            dt: Duration of the tick [s].
+            trusted: False if ``state`` is too old or implausible, and for the last command of a run. Terms that push
+                according to the state must not push then.
         """
 
     def set_openings(self, openings: Mapping[str, Interval]) -> None:  # noqa: B027
-        """Between which openings each arm's gripper is, as the controller has accepted it."""
+        """Take the interval of openings of each arm's gripper that the controller has accepted."""
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:  # noqa: B027
-        """Of each arm whose gripper has an object, whether it is held."""
+        """Take whether each gripper that has an object holds it."""
 
     def set_kept_distances(self, kept: Array) -> None:  # noqa: B027
-        """How far apart every pair stays from now on, (p,) [m], as the controller's settings were changed."""
+        """Take the distance that every pair keeps from now on (p,) [m]."""
 
     def set_obstacles(self, obstacles: Mapping[str, MovingObstacle]) -> None:  # noqa: B027
-        """The moving obstacles that stay where they are, by name."""
+        """Take the reported obstacles that do not move, by name."""
 
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
-        """The tool targets that the controller is to follow in a tick of ``dt`` [s]."""
+        """Return the targets for the controller in a tick of ``dt`` [s]; an admittance displaces them."""
         return targets
 
     def at_rest(self, state: RobotState) -> bool:
-        """Whether the arms stand still, given that the reference does."""
+        """Return whether the arms stand still, if the reference does."""
         return True
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        """The command that holds the arms when no more commands come; None: the last one does."""
+        """Return the command that holds the arms after a run; None if the last command does so."""
         return None
 
 
 def permitted(settings: ControllerSettings, drive: Drive) -> ControllerSettings:
-    """The controller's settings as far as a drive permits them: only where arms yield may bodies touch."""
+    """Return the controller's settings that a drive permits. Bodies may touch only if the arms are compliant."""
     return settings if drive.yields else settings.without_contact()
 
 
 def position_command(reference: Reference, grippers: Openings) -> Command:
-    """The reference itself."""
+    """Return the command that follows the reference."""
     return Command(CommandMode.POSITION, reference.q, reference.v, np.zeros(len(reference.q)), grippers)
 
 
 def holding_command(q: Array, grippers: Openings) -> Command:
-    """Stand still at ``q`` (nv,) [rad], held by the plant's own servos."""
+    """Return the command that lets the plant's own servos hold the arms at ``q`` (nv,) [rad]."""
     zero = np.zeros_like(q)
     return Command(CommandMode.POSITION, q, zero, zero, grippers)
 
 
-# Of the way from the measured position back to the reference [1/s]. A plant that answers with a delay T is stable below
-# about 1 / T, here 100 ms.
+# Gain of the position feedback [1/s]. A plant with a delay T is stable below about 1 / T, here 100 ms.
 FEEDBACK_GAIN = 10.0
-_FRESH_TICKS = 3  # a measurement that did not change for longer is old: the arm has moved on since
-_STILL = 1e-2  # of an arm on its spring [rad/s]
+_FRESH_TICKS = 3  # A measurement that has not changed for more ticks is old, because the arm has moved since.
+_STILL = 1e-2  # An arm on its spring stands still if its joints are slower than this [rad/s].
 
 
 class PositionDrive(Drive):
-    """The reference is the command. With the admittance enabled, what the tools feel displaces their targets."""
+    """Commands the positions of the reference. With an admittance, forces at the tools displace their targets."""
 
     mode = CommandMode.POSITION
 
@@ -134,9 +141,9 @@ class PositionDrive(Drive):
 
 
 class VelocityDrive(PositionDrive):
-    """The reference's velocity, and feedback of the measured position:  v = v_ref + k (q_ref - q),  within the limits.
+    """Commands v = v_ref + k (q_ref - q) within the limits: the reference's velocity, and feedback of the position.
 
-    Without a state to trust, or with one that is some ticks old, there is no feedback.
+    There is no feedback without a trusted state, or with a state that is some ticks old.
     """
 
     mode = CommandMode.VELOCITY
@@ -145,7 +152,7 @@ class VelocityDrive(PositionDrive):
     def __init__(self, robot: Robot, config: Config) -> None:
         super().__init__(robot, config)
         self._limit: Array = robot.velocity_limit * config.control.velocity_scale
-        self._stamp, self._ticks = -math.inf, 0  # of the newest state, and since then
+        self._stamp, self._ticks = -math.inf, 0  # Stamp of the newest state, and the number of ticks since then.
 
     def reset(self, state: RobotState) -> None:
         super().reset(state)
@@ -163,17 +170,18 @@ class VelocityDrive(PositionDrive):
         return Command(self.mode, reference.q, bounded, np.zeros_like(reference.q), grippers)
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        # A velocity outlives its sender on many plants.
+        # Many plants go on at the last velocity after its sender has ended.
         zero = np.zeros_like(self._limit)
         return Command(self.mode, np.nan_to_num(state.q), zero, zero, grippers)
 
 
 class TorqueDrive(Drive):
-    """Turns references into torques. Targets stay as they are: the spring is the compliance.
+    """Commands torques that follow the reference. Targets are not displaced, because the spring is the compliance.
 
-    **Without a state to trust.** A spring about a posture that was measured long ago could push anywhere. A plant with
-    position servos (``has_servos``), which measure by themselves, follows the reference by those. Otherwise the command
-    is gravity's torque at the newest measured posture, and says so: many drivers repeat the last command for ever.
+    **Without a trusted state** a spring about an old posture could push anywhere. If the plant has position servos
+    (``has_servos``), which measure by themselves, they follow the reference. If not, the command is the torque of
+    gravity at the newest measured posture, with a flag that says so, because many drivers repeat the last command for
+    ever.
     """
 
     mode = CommandMode.TORQUE
@@ -184,7 +192,7 @@ class TorqueDrive(Drive):
         self.wall = MeasuredSeparation(robot, config.control, config.impedance.wall)
         self.report = DriveReport()
         self._has_servos = has_servos
-        self._believed = self._reference = robot.home  # the last posture and reference (nv,) [rad]
+        self._believed = self._reference = robot.home  # The last posture and the last reference (nv,) [rad].
 
     def reset(self, state: RobotState) -> None:
         self.report = DriveReport()
@@ -221,24 +229,24 @@ class TorqueDrive(Drive):
         return Command(self.mode, reference.q, reference.v, torque.tau, grippers)
 
     def at_rest(self, state: RobotState) -> bool:
-        # An unseen motion is not waited for.
+        # Without a measurement there is nothing to wait for.
         seen = np.isfinite(state.q).all() and np.isfinite(state.v).all()
         return not seen or float(np.abs(state.v).max()) <= _STILL
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        # A torque that nobody renews holds nothing, position servos do.
+        # Position servos hold the arms. A torque that nobody updates does not.
         if self._has_servos:
             return holding_command(state.q if np.isfinite(state.q).all() else self._reference, grippers)
         q = self._posture(state)
         return Command(self.mode, q, np.zeros_like(q), self.impedance.gravity(q), grippers, gravity_only=True)
 
     def _posture(self, state: RobotState) -> Array:
-        """The newest measured posture that was a posture."""
+        """Return the newest measured posture that was finite."""
         return state.q if np.isfinite(state.q).all() else self._believed
 
 
 def make_drive(mode: CommandMode, robot: Robot, config: Config, has_servos: bool = True) -> Drive:
-    """The drive of ``mode``; ``has_servos``: whether the plant follows positions too when torques are not safe."""
+    """Return the drive of ``mode``; ``has_servos`` says if the plant can follow positions when torques are not safe."""
     if mode is CommandMode.TORQUE:
         return TorqueDrive(robot, config, has_servos)
     return VelocityDrive(robot, config) if mode is CommandMode.VELOCITY else PositionDrive(robot, config)

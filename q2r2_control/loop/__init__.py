@@ -1,1 +1,1 @@
-"""One tick of control, for the in-process loop and the ROS nodes alike."""
+"""One tick of control, which the in-process loop and the ROS nodes share."""

@@ -1,4 +1,4 @@
-"""One tick of control, from measured joints and targets to a command, and the conditions that a hand feels."""
+"""Compute one tick of control, from measured joints and targets to a command, and the conditions that a hand feels."""
 
 from __future__ import annotations
 
@@ -26,30 +26,31 @@ from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import ArmTiming, Array, Command, LimitKind, Reference, RobotState, StepReport
 
-_PROVEN = Phase.ACTIVE, Phase.BRAKING  # in other phases no opening of a gripper is proven
+_PROVEN = Phase.ACTIVE, Phase.BRAKING  # Openings of grippers are certified in these phases only.
 
 
 @dataclass(slots=True)
 class LoopStep:
     """The result of one tick."""
 
-    reference: Reference | None  # None: nothing is commanded
-    command: Command | None  # for the plant; None: nothing is commanded
-    grippers: dict[str, float]  # commanded openings, 0 closed .. 1 fully open
-    trusted: bool  # whether the command may go by the measured state
+    reference: Reference | None  # None if nothing is commanded.
+    command: Command | None  # The command for the plant; None if nothing is commanded.
+    grippers: dict[str, float]  # Commanded openings, from 0 for closed to 1 for fully open.
+    trusted: bool  # Whether the command may depend on the measured state.
     report: DriveReport
-    refusals: dict[str, Reason] = field(default_factory=dict)  # arm -> why its target is not followed
+    refusals: dict[str, Reason] = field(default_factory=dict)  # For each arm that refuses its target, the reason.
 
 
-_REMEMBERED_LAG = 0.999  # share of the longest lag lately that a tick leaves
-_SAME_TIME = 1e-6  # [s]; less is rounding
+_REMEMBERED_LAG = 0.999  # Factor per tick by which the longest recent lag is forgotten.
+_SAME_TIME = 1e-6  # A smaller difference is rounding [s].
 
 
 class ControlLoop:
-    """Supervision, controller, grippers and drive, in the order that one tick needs.
+    """Calls supervision, grippers, controller and drive in the order that one tick needs.
 
-    In each tick: :meth:`pace`, :meth:`observe` for each measured state that came, and :meth:`step`. Times are the
-    caller's [s]. Held objects and finger openings are known before the controller's step, which is proven with them.
+    In each tick the caller uses :meth:`pace`, :meth:`observe` for each measured state that came, and :meth:`step`. The
+    caller gives all times [s]. Held objects and openings of fingers are updated before the controller's step, which is
+    certified with them.
     """
 
     def __init__(
@@ -66,10 +67,20 @@ class ControlLoop:
         owns_plant: bool = True,
         standstill: StandstillLimits | None = None,
     ) -> None:
-        """``period`` [s] of the commands; ``gripper_delay`` [s]: until a gripper gets its command, at most.
+        """Make a loop.
 
-        ``owns_plant``: commands go on while the arms are stopped. Otherwise whatever else holds them is left alone.
-        ``standstill``: see :class:`Supervisor`.
+        Args:
+            controller: The controller.
+            drive: Turns the reference into commands of the plant.
+            period: Time between two commands [s].
+            streams: The rules for streams of targets.
+            watch: The limits for measured states.
+            origins: See :class:`Supervisor`.
+            external: See :class:`Supervisor`.
+            owns_plant: Whether commands go on while the arms are stopped. If not, another controller holds the arms
+                then, and is left alone.
+            gripper_delay: The longest time until a gripper gets its command [s].
+            standstill: See :class:`Supervisor`.
         """
         robot = controller.robot
         self.controller, self.drive, self._owns_plant = controller, drive, owns_plant
@@ -79,64 +90,77 @@ class ControlLoop:
         self.pacer = TickPacer(period, velocity_limit, self.acceleration_limit, drive.coasts)
         self._delay = max(gripper_delay, REMEMBERED)
         self._grasps = GraspWatch(controller, STALL + gripper_delay)
-        self._limiter: GripperLimiter | None = None  # while the controller's reference is where the arms are
-        self._kept: Array = controller.kept_distances  # that the drive was told of [m]
-        self._still: Mapping[str, MovingObstacle] = {}  # obstacles that the drive was told of
-        self.holding: dict[str, bool] = {}  # of each arm that has an object, whether its gripper holds it
-        self.granted_openings: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and granted
+        self._limiter: GripperLimiter | None = None  # Exists while the reference is where the arms are.
+        self._kept: Array = controller.kept_distances  # The kept distances that the drive knows [m].
+        self._still: Mapping[str, MovingObstacle] = {}  # The obstacles at rest that the drive knows.
+        self.holding: dict[str, bool] = {}  # For each arm that has an object, whether its gripper holds it.
+        self.granted_openings: dict[str, tuple[float, float]] = {}  # By arm, the wanted and the granted opening.
         self._lags = MeasuredLags(robot)
-        self._usual_lag = 0.0  # the longest one that was found lately [s]
-        self._untold: dict[str, float] = {}  # when arms were measured whose drivers do not tell how far they are [s]
-        self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
-        self._first: float | None = None  # time of the first tick [s]
-        self._aged = 0.0  # by how much reports of moving obstacles became older since then [s]
+        self._usual_lag = 0.0  # The longest recent lag [s].
+        # For each arm whose driver does not report its lag, the time at which it was measured [s].
+        self._untold: dict[str, float] = {}
+        self._velocity = np.zeros(robot.model.nv)  # Joint velocities of the last reference [rad/s].
+        self._first: float | None = None  # Time of the first tick [s].
+        self._aged = 0.0  # Time by which reports of moving obstacles have aged since the first tick [s].
 
     @property
     def held_grippers(self) -> dict[str, tuple[str, str]]:
-        """Arm -> pair of bodies that keeps its gripper from being commanded as wanted."""
+        """For each gripper that is not commanded as wanted, the pair of bodies that prevents it."""
         return {} if self._limiter is None else self._limiter.held
 
     def pace(self, gap: float) -> float:
-        """Time [s] for the reference to move by, ``gap`` [s] after the last tick; see :meth:`TickPacer.step`."""
+        """Return the time by which the reference advances [s], ``gap`` [s] after the last tick.
+
+        See :meth:`TickPacer.step`.
+        """
         return self.pacer.step(gap, self._velocity)
 
     def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0, lost: Reason | None = None) -> None:
-        """Let supervision see a measured state, or the reason why there is none; see :meth:`JointWatch.take`.
+        """Pass a measured state to supervision, or the reason why there is none; see :meth:`JointWatch.observe`.
 
-        ``lost``: why the arms cannot be commanded although they are measured. Those that still can brake by the state,
-        until they rest.
+        ``lost`` is the reason why the arms cannot be commanded although they are measured. An arm that can still be
+        commanded then brakes by this state until it rests.
         """
         self.supervisor.update_state(state, now, passed, lost)
 
     def watch_skew(self, timings: Mapping[str, ArmTiming], lead: float, now: float) -> None:
-        """Let supervision compare arms that follow the reference each on its own, before a step and an activation.
+        """Let supervision compare the lags of arms that follow the reference each on its own.
 
-        ``lead``: from where they are led to the end of the newest step [s]. They are kept apart for all that they may
-        be apart in time.
+        It is called before a step and before an activation. The controller keeps the arms apart for the greatest
+        difference between their lags.
+
+        Args:
+            timings: The timing of each arm's messages.
+            lead: Time from the posture that the arms are sent to until the end of the reference's newest step [s].
+            now: The time [s].
         """
         self._untold = untold = {arm: now - its.silent for arm, its in timings.items() if its.behind is None}
         if untold and (state := self.supervisor.state) is not None:
             behind = self._lags.behind(state.q, untold)
             timings = {arm: replace(its, behind=behind.get(arm, its.behind)) for arm, its in timings.items()}
             self._usual_lag = max(_REMEMBERED_LAG * self._usual_lag, *behind.values())
-            lead += self._usual_lag  # such arms are led from where they are
+            lead += self._usual_lag  # A driver that reports no lag is sent on from where its arm is.
         self.controller.allow_skew(min(skew_window(timings, lead), LONGEST_WINDOW))
         self.supervisor.skew.observe(timings, now)
 
     def activate(self, state: RobotState, now: float) -> None:
-        """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`Q2R2Error`."""
+        """Activate the arms at once, because the caller knows that they are at rest at ``state``.
+
+        Raises:
+            Q2R2Error: If the controller cannot start there.
+        """
         self.supervisor.activate(replace(state, stamp=now), now)
         self._begin(state, {}, now)
 
     def wait(self, state: RobotState) -> None:
-        """Begin inactive at ``state``, until it is good and at rest; see :class:`Supervisor`."""
+        """Begin inactive at ``state``, until the states are good and at rest; see :class:`Supervisor`."""
         self.controller.reset(state.q)
         self.drive.reset(state)
 
     def resume_gripper(
         self, arm: str, wanted: float, commanded: float, openings: Mapping[str, float], now: float
     ) -> None:
-        """Let a gripper that was ``commanded`` to an opening by another program stay as it is."""
+        """Let a gripper stay at the opening to which another program has ``commanded`` it."""
         self.granted_openings[arm] = wanted, commanded
         if self._limiter is not None:
             self._limiter.resume({arm: commanded}, openings, now)
@@ -152,12 +176,21 @@ class ControlLoop:
         braked: float = 0.0,
         posture: Array | None = None,
     ) -> LoopStep:
-        """Move on by ``dt`` [s], after ``braked`` [s] of the certified stop, which the plant has begun by itself.
+        """Advance by one tick.
 
-        ``state`` is the newest measured one, which was observed; ``targets`` are tool poses in the world frame, None:
-        the arm holds. An arm whose targets come as messages is not among them. ``grippers`` are wanted openings,
-        ``openings`` the measured ones, 0 closed .. 1 fully open. ``posture`` (nv,) [rad]: where
-        joints go that the targets leave free; None: home.
+        Args:
+            state: The newest measured state, which :meth:`observe` has seen; None if there is none.
+            targets: Targets of the tools in the world frame; None lets the arm hold. An arm whose targets come as
+                messages is not among them.
+            now: The time [s].
+            dt: Time by which the reference advances [s].
+            grippers: The wanted openings, from 0 for closed to 1 for fully open.
+            openings: The measured openings.
+            braked: Time for which the plant has followed the certified stop by itself before this tick [s].
+            posture: Where the joints go that the targets leave free (nv,) [rad]; None for the home posture.
+
+        Returns:
+            The reference and the command for the plant.
         """
         self._age_obstacles(now)
         supervisor, refusals = self.supervisor, {}
@@ -174,13 +207,13 @@ class ControlLoop:
         if was_inactive and supervisor.phase is Phase.ACTIVE and state is not None:
             self._begin(state, openings, now)
         if reference is None and self._owns_plant:
-            reference = self.controller.brake(dt)  # the rest of the arms' motion
+            reference = self.controller.brake(dt)  # The arms go on along their certified stop until they rest.
         self._aged += braked if reference is None else braked + dt
         if reference is None:
             self._lags.restart()
         elif self._untold:
             self._lags.note(reference.q, now)
-        if self.controller.kept_distances is not self._kept:  # the step may have taken up others
+        if self.controller.kept_distances is not self._kept:  # The step may have changed the kept distances.
             self._kept = self.controller.kept_distances
             self.drive.set_kept_distances(self._kept)
         if self.controller.still_obstacles is not self._still:
@@ -195,10 +228,10 @@ class ControlLoop:
         return LoopStep(reference, command, commanded, trusted, self.drive.report, refusals)
 
     def _age_obstacles(self, now: float) -> None:
-        """Let reports of moving obstacles be as old as the clock says.
+        """Let reports of moving obstacles age by the clock.
 
-        A step makes them older by the time that it moves the reference by. Less passes than on the clock while the loop
-        stalls, and none while the arms are not commanded.
+        A step ages them by the time by which it advances the reference. This is less than the time of the clock while
+        the loop stalls, and nothing while the arms are not commanded. The rest is added here.
         """
         if self._first is None:
             self._first = now
@@ -210,10 +243,10 @@ class ControlLoop:
     def limit_grippers(
         self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float
     ) -> dict[str, float]:
-        """The openings to be commanded; also finds out whether the grippers hold something.
+        """Return the openings to be commanded, and find out whether the grippers hold something.
 
-        While the arms do not move, nothing is proven: a gripper gets what it wants, for instance to let go. But one
-        that was held does not go on in that direction because the arms were stopped.
+        While the arms do not move, nothing is certified, and a gripper gets the wanted opening, for instance to let go
+        of an object. If a gripper was held up before the arms stopped, it does not go on in that direction.
         """
         if not self._owns_plant and self.supervisor.phase not in _PROVEN:
             self._limiter, self.holding = None, {}
@@ -235,7 +268,7 @@ class ControlLoop:
         self.drive.set_holding(self.holding)
 
     def _begin(self, state: RobotState, openings: Mapping[str, float], now: float) -> None:
-        """The controller was reset at ``state``: bodies and drive begin there too, with the weight of held objects."""
+        """Let grippers and drive begin at ``state``, where the controller was reset, with the objects held before."""
         self._grasps.tell_again()
         self._limiter = GripperLimiter(self.controller, self._delay)
         self._tell_holding()
@@ -247,43 +280,48 @@ class ControlLoop:
 
 
 def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
-    """The opening that is granted while the arms do not move; ``before``: wanted and granted before."""
+    """Return the opening that is granted while the arms do not move.
+
+    Args:
+        wanted: The wanted opening.
+        before: The wanted and the granted opening of the last tick; None if there is none.
+    """
     if before is None or before[0] == before[1]:
         return wanted
     return min(wanted, before[1]) if before[0] > before[1] else max(wanted, before[1])
 
 
-_LIMIT_LASTS = 0.5  # a joint counts as at its limit for so long after it last was: limits bind on and off [s]
+_LIMIT_LASTS = 0.5  # A limit may bind in some ticks only, and counts for this time after it last did [s].
 
 
 class ArmConditions:
-    """Looks at a controller and at what was measured. Times are the loop's [s]."""
+    """Finds the conditions that a hand feels, from the controller and the measured state. Times are the loop's [s]."""
 
     def __init__(self, controller: CartesianController) -> None:
         robot = controller.robot
         self._controller, self._robot = controller, robot
         self._data = robot.model.createData()
         self._joints = {arm: {robot.joint_names[j] for j in robot.arms[arm].joints} for arm in robot.arms}
-        self._limited: dict[str, float] = {}  # when a joint last was at its position limit [s]
+        self._limited: dict[str, float] = {}  # Time at which each joint was last at its position limit [s].
 
     def note(self, report: StepReport, now: float) -> None:
-        """Remember which limits held up a step; of every tick."""
+        """Remember the limits that held a step back. It is called in every tick."""
         for kind, names in report.binding:
             if kind is LimitKind.POSITION:
                 self._limited[names[0]] = now
 
     def look(self, state: RobotState, now: float) -> Mapping[str, ArmCondition]:
-        """Of every arm, at ``now``."""
+        """Return the conditions of every arm at ``now``."""
         return {arm: self.look_at(arm, state, now) for arm in self._joints}
 
     def look_at(self, arm: str, state: RobotState, now: float) -> ArmCondition:
-        """Of one arm, at ``now``; less often than every tick, since distances take their time."""
+        """Return the conditions of one arm at ``now``. Its distances take too long for every tick."""
         self._limited = {name: t for name, t in self._limited.items() if now - t <= _LIMIT_LASTS}
         limited = frozenset(self._joints[arm] & self._limited.keys())
         return ArmCondition(self._controller.spare_distance(arm), limited, self._contact_force(arm, state))
 
     def _contact_force(self, arm: str, state: RobotState) -> float | None:
-        """As an admittance estimates it [N]; None where nothing is measured."""
+        """Return the contact force that an admittance would estimate [N]; None if no torque is measured."""
         if state.tau_external is None or not np.isfinite((state.tau_external, state.q)).all():
             return None
         chosen = self._robot.arms[arm]

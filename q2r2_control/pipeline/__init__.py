@@ -1,1 +1,1 @@
-"""The in-process loop: input -> teleop -> control -> plant. The only room that knows them all."""
+"""The loop in one process: input -> teleop -> control -> plant. Only this package imports all of them."""

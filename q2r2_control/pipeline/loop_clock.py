@@ -1,4 +1,4 @@
-"""When a tick is due: by the computer's clock, or in simulated time."""
+"""Decide when a tick is due: by the computer's clock, or in simulated time."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from q2r2_control.summary.run_summary import Histogram
 from q2r2_control.types import RobotState
 
 _SHORTEST_DT = 1e-6  # [s]
-_SHORTEST_SLEEP = (
-    0.004  # A shorter one costs more than it is worth: a picture of the arms lasts eight times as long [s].
-)
-_LONGEST_LAG = 0.1  # Simulated time that is further behind is not caught up with, but goes on in slow motion [s].
-_WINDOW = 1.0  # time over which late ticks are counted [s]
-_MANY_LATE = 0.1  # share of the ticks of a window
+# Shorter sleeps cost more than they are worth, since a picture of the arms lasts eight times as long [s].
+_SHORTEST_SLEEP = 0.004
+# If simulated time is farther behind than this, it does not catch up, and the motion goes on in slow motion [s].
+_LONGEST_LAG = 0.1
+_WINDOW = 1.0  # Time over which late ticks are counted [s].
+_MANY_LATE = 0.1  # Share of late ticks in a window from which the loop falls behind.
 
 
 class WallPace:
     """Lets simulated time pass no faster than the computer's clock, and more slowly where the computer is too slow."""
 
     def __init__(self) -> None:
-        self._ahead_since: float | None = None  # reading of the computer's clock at simulated time zero [s]
+        self._ahead_since: float | None = None  # Time of the computer's clock at simulated time zero [s].
 
     def wait_for(self, elapsed: float) -> None:
-        """Sleep until ``elapsed`` [s] of simulated time may be over."""
+        """Sleep until the computer's clock allows that ``elapsed`` [s] of simulated time are over."""
         now = time.monotonic()
         if self._ahead_since is None:
             self._ahead_since = now - elapsed
@@ -36,10 +36,10 @@ class WallPace:
 
 
 class LoopClock:
-    """Ticks on a grid of ``period`` [s]: in real time, or in simulated time, which is never late.
+    """Ticks on a grid of ``period`` [s], in real time or in simulated time. Simulated time is never late.
 
-    Simulated time passes as fast as the ticks come, or, with a ``pace``, no faster than that allows. A tick does not
-    know the difference, so both give the same results to the bit.
+    Simulated time passes as fast as the ticks are computed, or with a ``pace`` no faster than it allows. A tick does
+    not know the difference, so that both give the same results to the bit.
     """
 
     def __init__(self, period: float, realtime: bool, pace: WallPace | None = None) -> None:
@@ -47,13 +47,13 @@ class LoopClock:
         self._ticks = 0
         self.start = self.now = self._due = time.monotonic() if realtime else 0.0  # [s]
         self._wall_start = time.perf_counter()
-        self.lateness = Histogram(1e-3)  # of each tick, after it was due
-        self.overruns = 0  # ticks that began more than a period after they were due
+        self.lateness = Histogram(1e-3)  # Delay of each tick after it was due.
+        self.overruns = 0  # Number of ticks that began more than a period after they were due.
         self._window_ends, self._late_in_window = self.now + _WINDOW, 0
-        self.woke = self._wall_start  # when the newest tick began, by time.perf_counter() [s]
+        self.woke = self._wall_start  # Beginning of the newest tick, by time.perf_counter() [s].
 
     def wait(self) -> float:
-        """Let the next tick come; returns the time since the last one [s], however long that was."""
+        """Wait for the next tick; returns the time since the last one [s], even if it is long."""
         self._ticks += 1
         if not self._realtime:
             self.now = self._ticks * self.period
@@ -68,52 +68,61 @@ class LoopClock:
         self.lateness.add(late)
         self.overruns += late > self.period
         self._late_in_window += late > self.period
-        # Late wake-ups do not add up, since ticks are due on a grid; ticks that were missed are not made up for.
+        # Late ticks do not add up, because ticks are due on a grid. Missed ticks are not made up for.
         self._due = max(self._due, self.now - self.period)
         return max(self.now - before, _SHORTEST_DT)
 
     def keep_pace(self) -> None:
-        """Wait where simulated time is ahead of the computer's clock and shall not be."""
+        """Wait if simulated time is ahead of the computer's clock and must not be."""
         if self._pace is not None:
             self._pace.wait_for(self.now - self.start)
 
     def falls_behind(self) -> bool:
-        """True once in each second in which more than a tenth of the ticks were late by more than a period."""
+        """Return True once for each second in which more than a tenth of the ticks were late by more than a period."""
         if self.now < self._window_ends:
             return False
         late, self._late_in_window, self._window_ends = self._late_in_window, 0, self.now + _WINDOW
         return late * self.period > _MANY_LATE * _WINDOW
 
     def after(self, duration: float) -> bool:
-        """Whether ``duration`` [s] is over; half a period early, so that rounding adds or loses no tick."""
+        """Return whether ``duration`` [s] is over. The test is half a period early, so that rounding costs no tick."""
         return self.now - self.start >= duration - 0.5 * self.period
 
     def read(self) -> float:
-        """Time of this very moment; in simulated time that of the tick [s]."""
+        """Return the present time [s]; in simulated time the time of the tick."""
         return time.monotonic() if self._realtime else self.now
 
     def real_time_factor(self) -> float | None:
-        """Seconds of simulated time that passed in a second of the computer's clock; None in real time."""
+        """Return the simulated time per second of the computer's clock [s/s]; None in real time."""
         return None if self._realtime else (self.now - self.start) / max(self.wall_time(), 1e-9)
 
     def wall_time(self) -> float:
-        """Real time since the run began [s]."""
+        """Return the real time since the run began [s]."""
         return time.perf_counter() - self._wall_start
 
 
 class PlantClock:
-    """Stamps a plant's states by the loop's clock; a repeated one is as old as the time that the plant got since."""
+    """Stamps the states of a plant by the loop's clock.
+
+    A state that the plant repeats gets older by the time for which the plant was advanced since.
+    """
 
     def __init__(self, state: RobotState) -> None:
-        """``state``: the first one."""
-        self._stamp, self._unanswered = state.stamp, 0.0  # and the time given since it had a newer state [s]
+        """``state`` is the first state of the plant."""
+        # The plant's stamp of the newest state, and the time for which it was advanced without a newer one [s].
+        self._stamp, self._unanswered = state.stamp, 0.0
 
     def give(self, dt: float) -> None:
-        """The plant is let go on by ``dt`` [s]."""
+        """Record that the plant was advanced by ``dt`` [s]."""
         self._unanswered += dt
 
     def stamped(self, state: RobotState, now: float) -> tuple[RobotState, float]:
-        """The ``state`` that came at ``now`` [s], stamped by the loop's clock, and the plant's time since the last."""
+        """Return the ``state`` with a stamp of the loop's clock, and the plant's time since the last state [s].
+
+        Args:
+            state: The state that was read at ``now``, with the stamp of the plant's clock.
+            now: The time of the loop [s].
+        """
         passed = state.stamp - self._stamp
         if passed != 0.0:
             self._stamp, self._unanswered = state.stamp, 0.0

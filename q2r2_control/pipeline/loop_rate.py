@@ -1,4 +1,4 @@
-"""How often a second a loop in real time should tick on this computer."""
+"""Choose the rate at which a loop in real time should tick on this computer."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from q2r2_control.config.cell import HIGHEST_FITTING_RATE_HZ
 
 # The highest one that leaves room is taken. At the lowest, torques of the impedance are shown to be stable, too.
 FITTING_RATES_HZ = (HIGHEST_FITTING_RATE_HZ, 500.0, 250.0)
-_ROOM = 0.4  # share of the period that 99 of 100 ticks leave for other programs
-_WARM_UP, _LOOKED_AT = 50, 250  # ticks
+_ROOM = 0.4  # Share of the period that 99 of 100 ticks must leave free for other programs.
+_WARM_UP, _LOOKED_AT = 50, 250  # Numbers of ticks that are ignored at first, and that are timed then.
 
 
 @dataclass(frozen=True, slots=True)
 class RateFit:
-    """A rate of the loop, and how long its ticks take on this computer."""
+    """A rate of the loop, and the duration of its ticks on this computer."""
 
     rate_hz: float
-    p99_s: float  # duration that 99 of 100 ticks do not exceed
+    p99_s: float  # Duration that 99 of 100 ticks do not exceed.
 
     @property
     def leaves_room(self) -> bool:
-        """True if 99 of 100 ticks leave 40 % of the period."""
+        """Whether 99 of 100 ticks leave 40 % of the period free."""
         return self.p99_s * self.rate_hz <= 1.0 - _ROOM
 
     def __str__(self) -> str:
@@ -37,5 +37,5 @@ class RateFit:
 
 
 def largest_usual_time(durations_s: Iterator[float]) -> float:
-    """Duration that 99 of 100 ticks do not exceed [s], of those that come after the first ones."""
+    """Return the duration that 99 of 100 ticks do not exceed [s], without the first ticks."""
     return float(np.percentile(list(islice(durations_s, _WARM_UP, _WARM_UP + _LOOKED_AT)), 99))

@@ -1,4 +1,4 @@
-"""The in-process loop of a cell: input -> teleop -> control -> plant at every tick, and rest at its end."""
+"""Run a cell in one process: input -> teleop -> control -> plant at every tick, and arms at rest at the end."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import LONGEST_DT, ArmTarget, Array, CommandMode, RobotState, is_number
 from q2r2_control.wording import sentence
 
-STOPPING = "stopping"  # state of every arm while the run ends
-_STOP_ALLOWANCE = 1.0  # after full braking, for an arm that still recovers into its limits [s]
-_REST = 1e-6  # of the reference [rad/s]
-_ROUNDING = 1e-9  # [s]
-_LONGEST_TORQUE = 0.005  # that one torque may push for: in 0.1 s it drives the arms into each other [s]
+STOPPING = "stopping"  # The state of every arm while the run ends.
+_STOP_ALLOWANCE_S = 1.0  # Time after full braking for an arm that still recovers into its limits.
+_REST = 1e-6  # The reference is at rest if no joint is faster [rad/s].
+_ROUNDING_S = 1e-9
+_MAX_TORQUE_HOLD_S = 0.005  # A torque that a late tick held for 0.1 s would drive the arms into each other.
 _LATE_LOOP = (
     "the loop falls behind: of its %.0f ticks a second more than a tenth come late; close other programs, give it "
     "priority with --rt, or set a lower loop_rate_hz in the cell"
@@ -54,26 +54,27 @@ _logger = logging.getLogger(__name__)
 
 
 class Pipeline(RequestedRun):
-    """Runs a cell. ``listeners`` are called with every :class:`Tick`; they must not take long.
+    """Runs a cell.
 
-    The arms are brought to rest before input and plant are closed, for whatever reason a run ends. A listener that
-    raises ends the run like :meth:`stop`, and its exception goes to the caller. A plant that measures nonsense or does
-    not follow ends it with a :class:`PlantError`: see ``supervision``.
+    Whatever ends a run, the arms are brought to rest before input and plant are closed. The objects in ``listeners``
+    are called with every :class:`Tick` and must not take long. A listener that raises ends the run like :meth:`stop`,
+    and the caller gets its exception. A plant whose states are implausible, or which does not follow, ends the run with
+    a :class:`PlantError`: see ``supervision``.
 
     Args:
         config: The cell.
         robot: Its arms.
-        input: Whose hands, or policy, lead them.
-        plant: The arms, real or simulated, that its commands move.
+        input: The device whose hands move the arms, or a policy.
+        plant: The real or simulated arms that get the commands.
         mode: Kind of the plant's commands: joint positions, velocities, or the torques of a Cartesian impedance.
-        solver: As of :class:`CartesianController`, like ``tasks`` and ``constraints``. A recording does not have these
-            objects, so that a replay of the run goes without them.
-        tasks: Costs beside those of ``config.control.tasks``.
-        constraints: Rows beside those of the controller.
+        solver: As of :class:`CartesianController`, like ``tasks`` and ``constraints``. A recording does not contain
+            these objects, so that a replay of the run goes without them.
+        tasks: Costs in addition to those of ``config.control.tasks``.
+        constraints: Rows in addition to those of the controller.
 
     Raises:
-        ConfigError: An argument is of another kind, the plant lacks the mode, the input lacks a control that is bound,
-            or the controller refuses its part.
+        ConfigError: If an argument is of another kind, if the plant lacks the mode, if the input lacks a control that
+            is bound, or if the controller refuses its part.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class Pipeline(RequestedRun):
         check_kind("plant", plant, Plant, "an object with all methods of Plant")
         config.teleop.bindings.check_device(input.controls)
         self.config, self.robot, self.input, self.plant = config, robot, input, plant
-        # A session is of one mode: its arms follow no positions while torques are not safe.
+        # A session has one mode: its arms cannot follow positions while torques are not safe.
         has_servos = CommandMode.POSITION in plant.modes and not isinstance(plant, SessionPlant)
         self.drive = make_drive(check_mode(mode, plant), robot, config, has_servos)
         if isinstance(solver, str):
@@ -105,10 +106,10 @@ class Pipeline(RequestedRun):
         self.controller = CartesianController(robot, permitted(self.config.control, self.drive), **self._own)
         self._data = robot.model.createData()
         self.listeners: list[Callable[[Tick], None]] = []
-        # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
+        # This is a plain flag, because a signal handler cannot take the lock of a threading.Event safely.
         self._stopping = False
-        self._rested_since: float | None = None  # the end of the run before this one [s]
-        self._pace: WallPace | None = None  # of a run in simulated time that must not be faster than the clock
+        self._rested_since: float | None = None  # The end of the last run [s].
+        self._pace: WallPace | None = None  # If given, simulated time must not be faster than the clock.
         self._set_up()
 
     @classmethod
@@ -123,12 +124,20 @@ class Pipeline(RequestedRun):
         tasks: Sequence[Task] = (),
         constraints: Sequence[Constraint] = (),
     ) -> Pipeline:
-        """Build a pipeline with an ``input`` (such as ``headset``) and a ``plant`` (such as ``kinematic``).
+        """Build a pipeline for a cell.
 
-        Either is the name of an entry point, see :mod:`q2r2_control.plugins`, an object, or None: the cell's. ``mode``:
-        the plant gets joint positions, velocities, or the torques of a Cartesian impedance. Raises :class:`ConfigError`
-        for an unknown name, a mode that the plant lacks, and a binding to a control that the input lacks. The others
-        are those of the class; a task or constraint may have been made with another Robot of the same ``config``.
+        The other arguments are those of the class. A task or constraint may have been made with another Robot of the
+        same ``config``.
+
+        Args:
+            config: The cell.
+            input: The name of an entry point such as ``headset``, see :mod:`q2r2_control.plugins`, or an object; None
+                for the input that the cell names.
+            plant: The same for the plant, such as ``kinematic``.
+
+        Raises:
+            ConfigError: If a name is not known, if the plant lacks the mode, or if the input lacks a control that is
+                bound.
         """
         robot = Robot.from_config(config)
         source = make_input(config.input if input is None else input, config)
@@ -140,11 +149,14 @@ class Pipeline(RequestedRun):
         return self.loop.supervisor
 
     def stop(self) -> None:
-        """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
+        """Bring the arms to rest and end the run, or end the next run if none goes on.
+
+        Any thread and any signal handler may call it.
+        """
         self._stopping = True
 
     def run(self, duration: float | None = None, realtime: bool = True, *, paced: bool = False) -> RunSummary:
-        """Run until the duration is over, or until :meth:`stop`, Ctrl-C or SIGTERM; the arms come to rest first.
+        """Run until the duration is over, or until :meth:`stop`, Ctrl-C or SIGTERM. The arms come to rest first.
 
         Args:
             duration: Length of the run [s]; None if only a stop ends it.
@@ -154,7 +166,7 @@ class Pipeline(RequestedRun):
                 The result is the same to the bit.
 
         Raises:
-            ConfigError: The duration is not positive, or the plant cannot go by the time that is asked for.
+            ConfigError: If the duration is not positive, or if the plant cannot keep the kind of time asked for.
         """
         if duration is not None and not (is_number(duration) and duration > 0.0):
             raise ConfigError(f"duration = {shown(duration)}: allowed: a positive number of seconds")
@@ -174,9 +186,10 @@ class Pipeline(RequestedRun):
             self.end()
 
     def begin(self) -> None:
-        """Begin a run in simulated time whose ticks the caller takes: :meth:`tick`, :meth:`check`, at last :meth:`end`.
+        """Begin a run in simulated time whose ticks the caller takes, by :meth:`tick`, :meth:`check` and :meth:`end`.
 
-        Its arms are not brought to rest, so real ones are refused: raises :class:`ConfigError`.
+        Raises:
+            ConfigError: If the plant is real, because nothing brings these arms to rest.
         """
         if isinstance(self.plant, SessionPlant):
             raise ConfigError("ticks one by one: allowed with a plant that is simulated only")
@@ -186,28 +199,29 @@ class Pipeline(RequestedRun):
         self._begin(realtime=False, counts=False)
 
     def tick_until(self, end: float) -> None:
-        """Take the ticks of a run that has begun, up to the newest one at or before ``end`` [s] on the loop's clock.
+        """Take the ticks of a run that has begun, up to the last one at or before ``end`` [s] of the loop's clock.
 
-        Raises :class:`PlantError` where supervision has stopped the arms. Raises :class:`ConfigError` for no time, and
-        before a run.
+        Raises:
+            PlantError: If supervision has stopped the arms.
+            ConfigError: If ``end`` is not a time, or no run has begun.
         """
         if not is_number(end):
             raise ConfigError(f"end = {shown(end)}: allowed: a time [s]")
         if not hasattr(self, "_clock"):
             raise ConfigError("Pipeline.tick_until: call begin() first")
-        while self._clock.now <= end - self._clock.period + _ROUNDING:
+        while self._clock.now <= end - self._clock.period + _ROUNDING_S:
             self.tick()
             self.check()
 
     def check(self) -> None:
-        """Raises :class:`PlantError` where supervision has stopped the arms."""
+        """Raise :class:`PlantError` if supervision has stopped the arms."""
         phase = self.supervisor.phase
         if phase is Phase.STOPPED or (phase is not Phase.ACTIVE and self._sessions is None):
             fault = self.supervisor.fault
             raise PlantError("the arms were stopped" if fault is None else sentence(fault))
 
     def end(self) -> None:
-        """Close input and plant; may be called twice, and before a run."""
+        """Close input and plant. It may be called twice, and before a run."""
         self.requests.clear()
         try:
             self.input.close()
@@ -220,7 +234,7 @@ class Pipeline(RequestedRun):
         self.input.start()
 
     def make_clock(self, realtime: bool) -> LoopClock:
-        """The clock of a run, which begins now; a replay has one of its own."""
+        """Make the clock of a run that begins now. A replay has a clock of its own."""
         return LoopClock(1.0 / self.config.nominal_rate_hz, realtime, self._pace)
 
     def fit_rate(self) -> RateFit | None:
@@ -232,7 +246,7 @@ class Pipeline(RequestedRun):
         """
         if self.config.loop_rate_hz != AUTO or isinstance(self.plant, SessionPlant):
             return None
-        listeners, self.listeners = self.listeners, []  # these ticks are no part of the run
+        listeners, self.listeners = self.listeners, []  # These ticks are not part of the run.
         try:
             for rate in FITTING_RATES_HZ:
                 self.config = self.config.model_copy(update={"loop_rate_hz": rate})
@@ -255,7 +269,7 @@ class Pipeline(RequestedRun):
             yield time.perf_counter() - self._clock.woke
 
     def _prepare(self, realtime: bool) -> None:
-        """Nothing of an earlier run may move an arm: every run starts paused and with open grippers, as the plant."""
+        """Forget the last run, so that nothing of it moves an arm. Every run starts paused, with open grippers."""
         settings = permitted(self.config.control.timed(realtime), self.drive)
         if settings != self.controller.settings:
             self.controller = CartesianController(self.robot, settings, **self._own)
@@ -266,7 +280,7 @@ class Pipeline(RequestedRun):
         watch = watch_settings(self.config.supervision, self.drive.yields)
         streams = StreamSettings(linked=self.config.teleop.linked)
         period, delay = 1.0 / self.config.nominal_rate_hz, self.config.gripper_delay
-        standstill = getattr(self.plant, "standstill", None)  # of a plant whose arms are moved by another process
+        standstill = getattr(self.plant, "standstill", None)  # A plant has it if another process moves its arms.
         self.loop = ControlLoop(
             self.controller, self.drive, period, streams, watch, gripper_delay=delay, standstill=standstill
         )
@@ -275,12 +289,12 @@ class Pipeline(RequestedRun):
         self._following = True
         self._told_late = False
         self._targets = {arm: ArmTarget(None, OPEN) for arm in self.robot.arms}
-        self._grippers = dict.fromkeys(self.robot.arms, OPEN)  # commanded
+        self._grippers = dict.fromkeys(self.robot.arms, OPEN)  # The commanded openings.
         sessions = self._sessions = self.plant if isinstance(self.plant, SessionPlant) else None
         if sessions is not None:
             sessions.begin(self.drive.mode, lambda: self._stopping)
         self.plant.reset()
-        self._state = check_state(self.plant.state(), self.robot)  # the newest one
+        self._state = check_state(self.plant.state(), self.robot)  # The newest measured state.
         self._clock = self.make_clock(realtime)
         if realtime and self._rested_since is not None:
             self.controller.pass_time(self._clock.now - self._rested_since)
@@ -294,7 +308,7 @@ class Pipeline(RequestedRun):
         else:
             self.loop.wait(self._state)
         is_torque = self.drive.mode is CommandMode.TORQUE
-        self._longest_advance = max(_LONGEST_TORQUE, self._clock.period) if is_torque else LONGEST_DT
+        self._longest_advance = max(_MAX_TORQUE_HOLD_S, self._clock.period) if is_torque else LONGEST_DT
         self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop, counts)
         self._operator = OperatorSide(
             self.teleop, self.input, self.supervisor, self.controller, self.requests, self.impedance
@@ -302,13 +316,14 @@ class Pipeline(RequestedRun):
         self.teleop.marks.recorded = self._recorder.keeps_episodes
 
     def _run_until(self, duration: float) -> RunSummary:
-        """Tick until ``duration`` [s] is over or a stop is asked for, then until the arms are at rest."""
+        """Tick until ``duration`` [s] is over or a stop is asked for, and then until the arms are at rest."""
         try:
             while not (self._clock.after(duration) or self._stopping):
                 self.tick()
                 self.check()
         except BaseException:
-            # The arms come first, whatever failed. A part that failed may fail again; the first fault tells more.
+            # The arms come to rest first, whatever has failed. A part may fail again here, and its first error is the
+            # more helpful one.
             with suppress(Exception):
                 self._bring_to_rest()
             raise
@@ -318,24 +333,24 @@ class Pipeline(RequestedRun):
         return self._recorder.finish(self._clock, self.loop.pacer)
 
     def _bring_to_rest(self) -> None:
-        """Tick without input and targets until all stands still; no fault of an input can prevent it."""
+        """Tick without input and targets until all arms stand still. No fault of an input can prevent it."""
         self._following = False
         self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
         self.supervisor.stop(Reason(ReasonKind.RUN_ENDED))
         self.supervisor.events.clear()
         try:
             velocity = np.abs(self.tick().reference.v)
-            deadline = self._clock.now + float((velocity / self.loop.acceleration_limit).max()) + _STOP_ALLOWANCE
+            deadline = self._clock.now + float((velocity / self.loop.acceleration_limit).max()) + _STOP_ALLOWANCE_S
             while (velocity.max() > _REST or not self.drive.at_rest(self._state)) and self._clock.now < deadline:
                 velocity = np.abs(self.tick().reference.v)
         finally:
-            # From the last state that came: a plant that has lost its sensors still takes commands.
+            # The last state that came is used, because a plant that has lost its sensors still takes commands.
             if (command := self.drive.last_command(self._state, self._grippers)) is not None:
                 self.plant.apply(command)
             self._rested_since = time.monotonic()
 
     def tick(self) -> Tick:
-        """The way of the data, once: sample -> target -> reference -> command -> state."""
+        """Pass the data through all stations once: sample -> target -> reference -> command -> state."""
         gap = self._clock.wait()
         now = self._clock.now
         if self._clock.falls_behind() and not self._told_late:
@@ -353,7 +368,7 @@ class Pipeline(RequestedRun):
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
         step = self._control(state, openings, now, gap, dt, braked)
-        assert step.reference is not None  # the plant is the loop's own
+        assert step.reference is not None  # The loop owns its plant, and always commands it.
         assert step.command is not None
         self.plant.apply(step.command)
         withdrawn = self._sessions is not None and self._sessions.withdraws()
@@ -361,7 +376,7 @@ class Pipeline(RequestedRun):
             self.controller.withdraw(step.reference)
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
-        # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
+        # A simulated plant advances by no more than this at once, as if the computer had stood still meanwhile.
         advance = min(gap, self._longest_advance)
         self.plant.advance(advance)
         self._plant_clock.give(advance)
@@ -410,7 +425,7 @@ class Pipeline(RequestedRun):
         return {name: pin.updateFramePlacement(model, data, arm.frame_id).copy() for name, arm in arms.items()}
 
     def _posture(self) -> Array | None:
-        """The joint positions that a policy asks for, arm by arm; None: it asks for none."""
+        """Return the joint positions that a policy asks for (nv,) [rad], or None. Other arms get their home."""
         asked = {arm: posture for arm, target in self._targets.items() if (posture := target.posture) is not None}
         if not asked:
             return None
@@ -422,7 +437,7 @@ class Pipeline(RequestedRun):
     def _control(
         self, state: RobotState, openings: Mapping[str, float], now: float, gap: float, dt: float, braked: float
     ) -> LoopStep:
-        """From measurements and targets to a command. While a run ends, the operator asks for nothing."""
+        """Compute the command from measurements and targets. The operator's targets do not count while a run ends."""
         poses = {arm: target.command for arm, target in self._targets.items()} if self._following else {}
         if self._sessions is not None:
             poses = self._lead.ahead(poses, gap, self._sessions.delay())
@@ -430,7 +445,7 @@ class Pipeline(RequestedRun):
         step = self.loop.step(state, poses, now, dt, grippers, openings, braked, self._posture())
         self._grippers = step.grippers
         for refusal in step.refusals.values():
-            self.teleop.pause(now, refusal)  # or the operator would think that the arm follows
+            self.teleop.pause(now, refusal)  # Otherwise the operator would think that the arm follows.
         for reason in self.supervisor.events:
             _logger.log(logging.INFO if reason.root.kind in ROUTINE else logging.WARNING, sentence(reason))
         self.supervisor.events.clear()

@@ -1,4 +1,4 @@
-"""Figures and listeners of one run."""
+"""Collect the figures of one run, and call its listeners."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from q2r2_control.supervision.tick_pacer import TickPacer
 
 
 class RunRecorder(RunStatistics):
-    """Adds up every tick and tells listeners of it. A listener that raises ends the run and is not called again.
+    """Adds every tick to the statistics and passes it to the listeners.
 
-    ``counts`` is False for a run whose summary nobody can ask for: its ticks are not added up.
+    A listener that raises ends the run, and is not called again. ``counts`` is False for a run whose summary nobody can
+    ask for: its ticks are not added.
     """
 
     def __init__(
@@ -30,15 +31,15 @@ class RunRecorder(RunStatistics):
         super().__init__(robot, control)
         self._counts = counts
         self._listeners, self._stop = list(listeners), stop
-        self._failure: Exception | None = None  # of a listener
+        self._failure: Exception | None = None  # The first exception of a listener.
 
     @property
     def keeps_episodes(self) -> bool:
-        """Whether a listener records the run to where episodes of it can be found."""
+        """Whether a listener records the run into a file that can hold episodes."""
         return any(getattr(listener, "keeps_episodes", False) for listener in self._listeners)
 
     def add(self, tick: Tick) -> None:
-        """Count one tick, and hand it to every listener."""
+        """Count one tick, and pass it to every listener."""
         if self._counts:
             super().add(tick)
         for listener in list(self._listeners):
@@ -50,7 +51,7 @@ class RunRecorder(RunStatistics):
                 self._stop()
 
     def finish(self, clock: LoopClock, pacer: TickPacer) -> RunSummary:
-        """The whole run. Raises the first exception of a listener."""
+        """Return the summary of the whole run; raises the first exception of a listener."""
         if self._failure is not None:
             raise self._failure
         return replace(

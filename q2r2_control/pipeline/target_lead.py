@@ -1,4 +1,4 @@
-"""Targets as far ahead as a plant is late, so that its arms are where the targets are."""
+"""Move targets ahead by the delay of a plant, so that the real arms are where the targets are."""
 
 from __future__ import annotations
 
@@ -10,24 +10,31 @@ import pinocchio as pin
 
 from q2r2_control.types import Array
 
-_SMOOTHING = 0.01  # time constant of a target's velocity [s]
-_FASTEST = 3.0, 20.0  # what is faster is a step of the target, and no motion of it [m/s], [rad/s]
-_REST = 1e-6  # what is slower stands still [m/s], [rad/s]
+_SMOOTHING = 0.01  # Time constant by which the velocity of a target is smoothed [s].
+_FASTEST = 3.0, 20.0  # A target that moves faster has made a step [m/s], [rad/s].
+_REST = 1e-6  # A target that moves more slowly stands still [m/s], [rad/s].
 
 
 class TargetLead:
-    """Leads each target by its own smoothed velocity.
+    """Moves each target ahead by its own smoothed velocity.
 
-    A target at constant velocity is led by exactly the delay. One that stops at once is overshot by its velocity times
-    the delay at most, for some ``_SMOOTHING``. One that rests is not changed.
+    A target at constant velocity is moved ahead by exactly the delay. If it stops at once, it is overshot by its
+    velocity times the delay at most, for about ``_SMOOTHING``. A target at rest is not changed.
     """
 
     def __init__(self) -> None:
         self._last: dict[str, pin.SE3] = {}
-        self._velocities: dict[str, Array] = {}  # linear, and angular in the target's frame (6,) [m/s], [rad/s]
+        # Linear velocity, and angular velocity in the target's frame (6,) [m/s], [rad/s].
+        self._velocities: dict[str, Array] = {}
 
     def ahead(self, targets: Mapping[str, pin.SE3 | None], dt: float, delay: float) -> dict[str, pin.SE3 | None]:
-        """The world poses where ``targets``, ``dt`` [s] after the last ones, will be in ``delay`` [s]."""
+        """Return where the targets will be after ``delay`` [s], in the world frame.
+
+        Args:
+            targets: The present targets.
+            dt: Time since the targets of the last call [s].
+            delay: Of the plant [s].
+        """
         velocities, self._velocities = self._velocities, {}
         led: dict[str, pin.SE3 | None] = dict(targets)
         for arm, pose in targets.items():
@@ -43,7 +50,7 @@ class TargetLead:
 
 
 def _velocity(before: pin.SE3, pose: pin.SE3, dt: float) -> Array:
-    """From one target to the next (6,); zero for a step."""
+    """Return the velocity from one target to the next (6,) [m/s], [rad/s]; zero if the target made a step."""
     linear = (pose.translation - before.translation) / dt
     angular = pin.log3(before.rotation.T @ pose.rotation) / dt
     if math.hypot(*linear) > _FASTEST[0] or math.hypot(*angular) > _FASTEST[1]:

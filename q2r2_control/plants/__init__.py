@@ -1,4 +1,5 @@
-"""Robots that move, simulated or real. To add a plant, implement ``Plant`` of ``base``, which also checks commands.
+"""Robots that move, simulated or real.
 
-MuJoCo is imported only where it is used.
+A new plant implements ``Plant`` of ``base``, which also has the checks of commands. MuJoCo is imported only when it is
+used.
 """

@@ -1,4 +1,4 @@
-"""The interface of every plant, and the checks that keep a bad command from reaching one."""
+"""The interface of every plant, and the checks that keep bad commands from it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState, is_number
 
-# Longest time of one call [s]: a loop that fell further behind must not catch up in one leap.
+# Longest time of one call [s]. A loop that is farther behind must not catch up at once.
 MAX_ADVANCE = 1.0
 
 
@@ -24,100 +24,102 @@ MAX_ADVANCE = 1.0
 class Plant(Protocol):
     """A robot that moves, simulated or real. Joint arrays are (nv,) in the order of ``Robot.joint_names``.
 
-    One tick: ``apply`` says where the plant has to be at the end of the tick, ``advance`` lets that time pass,
-    ``state`` says where it got. On hardware, where time passes by itself, ``advance`` is where a plant waits for the
-    next measurement. A new plant stands at home with open grippers, and stays there until a command comes. A plant
-    that is found by its name has a class method ``from_config(robot, config)`` as well, and one with a window is a
-    :class:`WindowedPlant`.
+    In each tick ``apply`` takes the posture that the plant should have at the end of the tick, ``advance`` lets the
+    time of the tick pass, and ``state`` returns the measurement. The time of real hardware passes by itself, so that
+    ``advance`` of such a plant waits for the next measurement. A new plant stands at home with open grippers until a
+    command comes. A plant that is found by its name also has a class method ``from_config(robot, config)``. A plant
+    with a window is a :class:`WindowedPlant`.
     """
 
-    modes: tuple[CommandMode, ...]  # of the commands that this plant follows
+    modes: tuple[CommandMode, ...]  # The modes of commands that this plant follows.
 
     def reset(self, q: Array | None = None) -> None:
-        """Start over at time 0, at rest at ``q`` (nv,) or else at home, grippers open. Raises :class:`PlantError`."""
+        """Start over at time 0, at rest at ``q`` (nv,) [rad] or at home, with open grippers; may raise PlantError."""
 
     def apply(self, command: Command) -> None:
-        """Take ``command``: posture and velocity are due at the end of the next ``advance``, a torque acts at once.
+        """Take a command. Posture and velocity are due at the end of the next ``advance``; a torque acts at once.
 
-        Without a newer one, later advances hold its posture at rest, or its torque. Raises :class:`PlantError` on a
-        mode that the plant does not have and on numbers that are not finite; the previous command stays in force.
+        If no newer command comes, later advances hold its posture at rest, or its torque.
+
+        Raises:
+            PlantError: If the plant lacks the mode, or a number is not finite. The previous command then stays.
         """
 
     def advance(self, dt: float) -> None:
-        """Let ``dt`` [s], 0 .. 1, pass. Raises :class:`PlantError` on any other time; nothing moves then."""
+        """Let ``dt`` [s], from 0 to 1, pass; raises :class:`PlantError` for another time, and nothing moves then."""
 
     def state(self) -> RobotState:
-        """The newest measurement; its stamp is on the plant's own clock, which starts at 0 on ``reset``.
+        """Return the newest measurement, with a stamp of the plant's own clock, which starts at 0 on ``reset``.
 
-        Its arrays stay as they are: others keep them for some ticks.
+        The plant never changes its arrays afterwards, because the callers keep them for some ticks.
         """
 
     def gripper_openings(self) -> dict[str, float]:
-        """Measured opening of each arm that has a gripper, 0 closed .. 1 fully open; another mapping at each call."""
+        """Return the measured opening of each gripper, from 0 for closed to 1, as a new mapping at each call."""
 
     def close(self) -> None:
-        """Give back every resource; may be called twice."""
+        """Free every resource. It may be called twice."""
 
 
 @runtime_checkable
 class WindowedPlant(Protocol):
-    """The methods that a plant with a window has besides those of :class:`Plant`, for ``--viewer``."""
+    """The additional methods of a plant with a window, for ``--viewer``."""
 
     def launch_viewer(self) -> None:
-        """Open the window. Raises :class:`PlantError` where there is no display."""
+        """Open the window; raises :class:`PlantError` if there is no display."""
 
     def viewer_sync(self, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]] = ()) -> bool:
-        """Show the plant as it is now, and ``obstacles`` in colours r g b; False once the window has been closed."""
+        """Show the plant and ``obstacles`` in colours r g b; returns False if the window was closed."""
 
 
 @runtime_checkable
 class SessionPlant(Protocol):
-    """The methods of a plant whose arms follow only during sessions, at times of their own, besides :class:`Plant`'s.
+    """The additional methods of a plant whose arms follow only during sessions, with a timing of their own.
 
-    Its arms start where they stand. A session that ends is no end of the run: the arms of all sessions brake, and are
-    activated anew where they rest, as soon as all are in a session again.
+    The arms start where they stand. If the session of one arm ends, the run goes on: all arms brake, and are activated
+    anew where they rest, as soon as all of them are in a session again.
     """
 
     realtime_only: bool
 
     def begin(self, mode: CommandMode, stopped: Callable[[], bool]) -> None:
-        """Commands of this ``mode`` are to come after the next ``reset``, which ends its wait if ``stopped()``."""
+        """Prepare for commands of ``mode`` after the next ``reset``, which ends its wait if ``stopped()`` is True."""
 
     def due(self, now: float) -> tuple[float, float]:
-        """In a tick at ``now`` [s]: how long the reference follows its certified stop, and moves on then [s].
+        """Return two durations for the tick at ``now`` [s]: of the certified stop, and of the motion after it [s].
 
-        The next command is for the end of both.
+        The plant has begun to follow the certified stop if a command was late. The next command is for the end of both.
         """
 
     def withdraws(self) -> bool:
-        """Whether the newest command came too late: the arms go on along the stop of the command before it."""
+        """Return whether the newest command came too late, so that the arms follow the stop of the one before it."""
 
     def delay(self) -> float:
-        """From the time that a command is for until the arms are measured there [s]."""
+        """Return the time from when a command is due until the arms are measured there [s]."""
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Of each arm that follows the reference on its own, when it does so at the newest tick; empty: all as one."""
+        """Return the timing of each arm that follows the reference on its own; empty if all arms move as one."""
 
     def lead(self) -> float:
-        """From where the arms are led at a tick to the end of the command that the tick is for, at most [s]."""
+        """Return the longest time from the posture that arms are sent to, to the end of the tick's command [s]."""
 
     def fault(self) -> Reason | None:
-        """Why the arms cannot be commanded now, or ceased to be since the last call; None: they can."""
+        """Return why the arms cannot be commanded now, or could not since the last call; None if they can."""
 
     def sessions(self) -> dict[str, str]:
-        """Of each arm, its session in words."""
+        """Return the state of each arm's session in words."""
 
 
 @runtime_checkable
 class WaitingPlant(Protocol):
-    """The attributes of a plant that waits in a reset for a person, besides those of :class:`Plant`, for ``--wait``."""
+    """The additional attributes of a plant whose reset waits for a person, for ``--wait``."""
 
-    longest_wait: float  # for the robot to be there, without which a reset raises :class:`PlantError` [s]
-    longest_session_wait: float  # for all sessions, from the same moment; a run then begins without them [s]
+    longest_wait: float  # Time to wait for the robot. A reset then raises :class:`PlantError` [s].
+    longest_session_wait: float  # Time to wait for all sessions. A run then begins without them [s].
 
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
-    """The plant called ``plant``, or ``plant`` itself. Raises :class:`ConfigError` for an unknown name."""
+    """Return the plant with the name ``plant``, or ``plant`` itself; raises :class:`ConfigError` for another name."""
     if not isinstance(plant, str):
         check_kind("plant", plant, Plant, "the name of a plant, or an object with all methods of Plant")
         return plant
@@ -126,7 +128,7 @@ def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
 
 
 def check_mode(mode: CommandMode | str, plant: Plant) -> CommandMode:
-    """``mode`` as one that ``plant`` follows. Raises :class:`ConfigError` for any other."""
+    """Return ``mode`` if the plant follows it; raises :class:`ConfigError` if not."""
     if not isinstance(mode, str) or mode not in plant.modes:
         allowed = ", ".join(plant.modes)
         raise ConfigError(f"mode {shown(mode)}: {type(plant).__name__} follows {allowed} commands only")
@@ -134,7 +136,7 @@ def check_mode(mode: CommandMode | str, plant: Plant) -> CommandMode:
 
 
 def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]) -> None:
-    """Raise :class:`PlantError` unless a plant with ``modes`` can follow ``command``."""
+    """Raise :class:`PlantError` if a plant with ``modes`` cannot follow ``command``."""
     check_kind("command", command, Command, "a Command", PlantError)
     check_kind("command mode", command.mode, str, ", ".join(modes), PlantError)
     if command.mode not in modes:
@@ -153,9 +155,9 @@ def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]
 
 
 def check_joints(what: str, values: Array, robot: Robot) -> None:
-    """Raise :class:`PlantError` unless ``values`` has one finite number for each joint of the robot."""
+    """Raise :class:`PlantError` if ``values`` does not have one finite number for each joint of the robot."""
     _check_shape(what, values, robot)
-    # A product is fast; squares of finite numbers may overflow.
+    # A scalar product is a fast test. The squares of large finite numbers may overflow, and are looked at again.
     if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():
         joint = int(np.flatnonzero(~np.isfinite(values))[0])
         raise PlantError(f"{what}: {robot.joint_names[joint]} = {values[joint]}: allowed: finite numbers")
@@ -169,7 +171,7 @@ def _check_shape(what: str, values: Array, robot: Robot) -> None:
 
 
 def check_state(state: RobotState, robot: Robot) -> RobotState:
-    """The first ``state`` of a plant, of any numbers. Raises :class:`PlantError` for what is none."""
+    """Return the first ``state`` of a plant, with any numbers; raises :class:`PlantError` for another object."""
     check_kind("state() of the plant", state, RobotState, "a RobotState", PlantError)
     check_kind("stamp of the plant's state", state.stamp, (float, int, np.number), "a time [s]", PlantError)
     _check_shape("q of the plant's state", state.q, robot)
@@ -180,13 +182,13 @@ def check_state(state: RobotState, robot: Robot) -> RobotState:
 
 
 def check_duration(dt: float) -> None:
-    """Raise :class:`PlantError` unless ``dt`` is a time that a plant may be advanced by."""
+    """Raise :class:`PlantError` if a plant may not be advanced by ``dt``."""
     if not (is_number(dt) and 0 <= dt <= MAX_ADVANCE):
         raise PlantError(f"advance by dt = {shown(dt, 40)} s: allowed: 0 .. {MAX_ADVANCE:g} s")
 
 
 class GripperMotion:
-    """Openings of the grippers, moving towards the commanded ones at the configured speed."""
+    """Simulated openings of grippers, which move to the commanded ones at the configured speed."""
 
     def __init__(self, config: Config) -> None:
         self._rate: dict[str, float] = {
@@ -201,7 +203,7 @@ class GripperMotion:
         self._wanted = dict(self.openings)
 
     def command(self, openings: dict[str, float]) -> None:
-        """Set where to go; arms without a gripper are passed over, grippers not named keep their goal."""
+        """Set the commanded openings. Arms without a gripper are ignored, and grippers without an entry keep theirs."""
         for arm in self._rate:
             if arm in openings:
                 self._wanted[arm] = float(openings[arm])

@@ -1,4 +1,4 @@
-"""Pictures of a simulated cell for processes beside the loop, as JPEG."""
+"""Take pictures of a simulated cell as JPEG, in a process beside the loop."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from q2r2_control.types import Array
 if TYPE_CHECKING:
     from q2r2_control.plants.mujoco_cameras import CellPictures
 
-# Of such a process: MuJoCo's own choice needs a display, and one processor stays the loop's where there is no graphics
-# card.
+# Environment of such a process. MuJoCo's own choice needs a display. Without a graphics card one processor is left to
+# the loop.
 ENVIRONMENT = {"MUJOCO_GL": "egl", "LP_NUM_THREADS": "1"}
 
 
 def open_cameras(model: bytes, cameras: Mapping[str, CameraConfig]) -> CellPictures:
-    """The cameras of a pickled ``mujoco.MjModel``. Raises :class:`PlantError` where OpenGL is missing."""
+    """Open the cameras of a pickled ``mujoco.MjModel``; raises :class:`PlantError` if OpenGL is missing."""
     try:
-        from q2r2_control.plants.mujoco_cameras import CellPictures  # MuJoCo may look for OpenGL when it is imported
+        from q2r2_control.plants.mujoco_cameras import CellPictures  # MuJoCo may need OpenGL when it is imported.
     except (ImportError, AttributeError, RuntimeError) as error:
         raise PlantError(f"no pictures: MUJOCO_GL={os.environ['MUJOCO_GL']}: {reason_of(error)}") from error
     return CellPictures(pickle.loads(model), cameras)

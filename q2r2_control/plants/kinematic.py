@@ -1,4 +1,4 @@
-"""A plant that does exactly what it is told: for tests, replays and machines without a simulator."""
+"""A plant that follows every command exactly, for tests, replays and computers without a simulator."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 
 
 class KinematicPlant:
-    """Perfect tracking of position and velocity commands; grippers move at their configured speed. No mass."""
+    """Follows position and velocity commands without error. Grippers move at their configured speed."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY)
     simulated = True
@@ -30,7 +30,7 @@ class KinematicPlant:
         check_joints("reset q", posture, self._robot)
         self._q = np.array(posture, dtype=np.float64)
         self._v = np.zeros_like(self._q)
-        self._due_q: Array | None = self._q  # None: the velocity says where to go
+        self._due_q: Array | None = self._q  # The commanded posture; None if a velocity was commanded.
         self._due_v = self._v
         self._time = 0.0
         self._grippers.reset()
@@ -51,7 +51,7 @@ class KinematicPlant:
         self._grippers.advance(dt)
 
     def state(self) -> RobotState:
-        """See :meth:`Plant.state`. Torques are zero; external torque cannot be told."""
+        """See :meth:`Plant.state`. Torques are zero, and external torques are not known."""
         return RobotState(self._q.copy(), self._v.copy(), np.zeros(len(self._q)), None, self._time)
 
     def gripper_openings(self) -> dict[str, float]:

@@ -1,11 +1,11 @@
-"""A Robotiq gripper on Modbus, for any plant, with a thread of its own: no call of a loop waits for it.
+"""A Robotiq gripper on Modbus, for any plant. It has its own thread, so that the loop never waits for it.
 
 Hand-E, 2F-85 and 2F-140 have the same registers (chapter 4 of their instruction manuals).
 
-**Safety.** Fingers count as all of their way until an opening is measured, and then as what is around the openings that
-were measured and commanded a moment ago. An activation opens and closes them all of their way, and is therefore done
-only before the first opening of a run. An opening is not told any more once it, or the command that the gripper had
-then, is older than ``MODBUS_DELAY``: supervision grants no other opening then.
+**Safety.** Until an opening is measured, the fingers count as their whole way. After that, they count as the openings
+that were measured and commanded a moment ago. An activation opens and closes the fingers fully. It is therefore done
+only before the first opening of a run. If the measured opening, or the command at that time, is older than
+``MODBUS_DELAY``, the opening is not known any more, and supervision grants no other opening.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from q2r2_control.config.fri import MODBUS_DELAY, ModbusGripperConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.extras import install_line
 
-_OUTPUTS, _INPUTS = 0x03E8, 0x07D0  # the first of three registers to write, and to read, of two bytes each
-_PERIOD = 0.025  # of reading, and of writing where the opening is a new one [s]
-_AGAIN = 1.0  # after which a lost connection is tried again [s]
-_TIMEOUT, _REPEATS = 0.3, 1  # of an answer [s], and how often it is asked for once more
-_ACTIVATE, _GO = 0x01, 0x08  # rACT and rGTO of the action request
+_OUTPUTS, _INPUTS = 0x03E8, 0x07D0  # The first of three registers to write and to read, of two bytes each.
+_PERIOD = 0.025  # Time between two readings. A new opening is written at the same time [s].
+_AGAIN = 1.0  # Time after which a lost connection is tried again [s].
+_TIMEOUT, _REPEATS = 0.3, 1  # Time to wait for an answer [s], and the number of repeated requests.
+_ACTIVATE, _GO = 0x01, 0x08  # The bits rACT and rGTO of the action request.
 _RESET, _ACTIVATION = bytes(6), bytes((_ACTIVATE, 0, 0, 0, 0, 0))
-_MAJOR = 0x0A  # and above: only a reset ends such a fault
-_FAULTS = {  # others end by activation, or by asking for them
+_MAJOR = 0x0A  # Only a reset ends a fault with this number or a greater one.
+_FAULTS = {  # Faults with other numbers end by an activation, or by reading them.
     0x08: "too hot, it has to cool down",
     0x0A: "supply voltage too low",
     0x0B: "automatic release in progress",
@@ -39,67 +39,68 @@ _FAULTS = {  # others end by activation, or by asking for them
     0x0F: "automatic release completed",
 }
 _logger = logging.getLogger(__name__)
-logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # it would print each try of a lost connection
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # It would print each try of a lost connection.
 
 
 @dataclass(frozen=True, slots=True)
 class GripperStatus:
     """One reading of a gripper."""
 
-    requested: bool  # gACT: activation was asked for
-    activated: bool  # gSTA: it is done
-    holds: bool  # gOBJ: an object stopped the fingers, opening or closing
+    requested: bool  # gACT: an activation was asked for.
+    activated: bool  # gSTA: the activation is complete.
+    holds: bool  # gOBJ: an object has stopped the fingers while they opened or closed.
     fault: int  # gFLT
-    position: int  # gPO: about 0 open .. 255 closed
+    position: int  # gPO: from about 0 for open to 255 for closed.
 
     @classmethod
     def of(cls, registers: Sequence[int]) -> GripperStatus:
-        """Raises struct.error unless ``registers`` are three."""
+        """Decode three registers; raises struct.error for another number of them."""
         status, _, fault, _, position, _ = struct.pack(">3H", *registers)
         return cls(bool(status & 0x01), status >> 4 & 0x03 == 3, status >> 6 in (1, 2), fault & 0x0F, position)
 
     @property
     def ready(self) -> bool:
-        """Whether it follows commands."""
+        """Whether the gripper follows commands."""
         return self.activated and self.fault < _MAJOR
 
     @property
     def trouble(self) -> str:
-        """Its fault in words, if any."""
+        """The fault in words, or "" if there is none."""
         return f"fault 0x{self.fault:02x}, {_FAULTS[self.fault]}" if self.fault in _FAULTS else ""
 
 
 class ModbusGripper:
-    """One arm's gripper, in one run. Its openings are 0 closed .. 1 open."""
+    """The gripper of one arm in one run. Openings go from 0 for closed to 1 for open."""
 
     def __init__(self, arm: str, config: ModbusGripperConfig) -> None:
-        """Raises :class:`ConfigError` where pymodbus is not installed."""
+        """Raises :class:`ConfigError` if pymodbus is not installed."""
         self._arm, self._config, self._client = arm, config, _client(arm, config)
         self._where = f"{config.modbus}, unit {config.unit}"
-        self.status: GripperStatus | None = None  # None: it does not answer
+        self.status: GripperStatus | None = None  # None if the gripper does not answer.
         self._wanted: float | None = None
-        self._measured: tuple[float, float] | None = None  # the opening, and when the command then was chosen [s]
-        self._used = False  # it was ready in this run
+        # The measured opening, and the time at which the command of that moment was chosen [s].
+        self._measured: tuple[float, float] | None = None
+        self._used = False  # Whether the gripper was ready in this run.
         self._sent, self._told = b"", ""
         self._closing = Event()
         self._thread = Thread(target=self._serve, name=f"{arm} gripper", daemon=True)
 
     def start(self) -> None:
-        """Read it from now on; it is not activated before the first :meth:`command`."""
+        """Read the gripper from now on. It is not activated before the first :meth:`command`."""
         self._thread.start()
 
     def command(self, opening: float) -> None:
-        """Want an opening from now on."""
+        """Move to an opening from now on."""
         self._wanted = opening
 
     @property
     def opening(self) -> float | None:
-        """The measured one; None where it is not known."""
+        """The measured opening; None if it is not known."""
         measured = self._measured
         return None if measured is None or time.monotonic() - measured[1] > MODBUS_DELAY else measured[0]
 
     def in_words(self) -> str:
-        """Where it is, and how."""
+        """Return the position and the state of the gripper in words."""
         if (status := self.status) is None:
             return f"{self._where}: does not answer"
         state = "active" if status.activated else "not active until a run begins"
@@ -107,7 +108,7 @@ class ModbusGripper:
         return ", ".join(filter(None, (*notes, "holds something" if status.holds else "", status.trouble)))
 
     def close(self) -> None:
-        """Leave the gripper as it is, after :meth:`start`."""
+        """End the thread of :meth:`start`. The gripper stays as it is."""
         self._closing.set()
         self._thread.join()
 
@@ -117,7 +118,7 @@ class ModbusGripper:
             try:
                 self._exchange(began)
                 pause = began + _PERIOD - time.monotonic()
-            except Exception as error:  # not all that comes from a serial device is an OSError
+            except Exception as error:  # A serial device raises more than OSError.
                 self._client.close()
                 self.status = self._measured = None
                 self._sent, pause = b"", _AGAIN
@@ -127,7 +128,7 @@ class ModbusGripper:
         self._client.close()
 
     def _exchange(self, now: float) -> None:
-        """Write what has changed, then read."""
+        """Write the request if it has changed, and then read."""
         status, wanted, unit = self.status, self._wanted, self._config.unit
         if status is not None and wanted is not None and (request := self._request(status, wanted)) != self._sent:
             if request == _ACTIVATION:
@@ -145,7 +146,7 @@ class ModbusGripper:
         self._tell(trouble, "; the next run activates it" if ended else "")
 
     def _request(self, status: GripperStatus, wanted: float) -> bytes:
-        """The output registers that the gripper should have now."""
+        """Return the values that the output registers of the gripper should have now."""
         if status.ready:
             speed, force = round(255 * self._config.speed), round(255 * self._config.force)
             return bytes((_ACTIVATE | _GO, 0, 0, self._position(wanted), speed, force))
@@ -154,7 +155,7 @@ class ModbusGripper:
         return _RESET if status.requested else _ACTIVATION
 
     def _position(self, opening: float) -> int:
-        """The position to ask for: at both ends as far as it goes, wherever that is."""
+        """Return the position for an opening. At both ends the fingers are sent as far as they go."""
         if opening in (0.0, 1.0):
             return 255 - round(255 * opening)
         opened, closed = self._config.counts
@@ -165,7 +166,7 @@ class ModbusGripper:
         return min(max((closed - position) / (closed - opened), 0.0), 1.0)
 
     def _tell(self, trouble: str, detail: str) -> None:
-        """Say once what is wrong, and once that nothing is any more."""
+        """Log a fault once, and its end once."""
         if trouble and trouble != self._told:
             _logger.warning("%s gripper: %s%s", self._arm, trouble, detail)
         elif self._told and not trouble:
@@ -174,13 +175,13 @@ class ModbusGripper:
 
 
 def _client(arm: str, config: ModbusGripperConfig) -> Any:
-    """A client that connects at its first request."""
+    """Return a client, which connects at its first request."""
     try:
         from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
         if config.endpoint is None:
             return ModbusSerialClient(config.modbus, baudrate=115200, timeout=_TIMEOUT, retries=_REPEATS)
-    except (ImportError, RuntimeError) as error:  # as pymodbus says that pyserial is missing
+    except (ImportError, RuntimeError) as error:  # Pymodbus raises RuntimeError if pyserial is missing.
         needs = f"needs pymodbus and pyserial: {install_line('modbus')}"
         raise ConfigError(f"fri.{arm}.gripper.modbus: {needs}") from error
     host, port = config.endpoint

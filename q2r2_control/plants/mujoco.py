@@ -18,18 +18,18 @@ from q2r2_control.plants.mujoco_model import build_model, settle_mimics
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# In steps: a step that is due but for the rounding of the ticks' sum is due.
+# Rounding of the sum of ticks, in physics steps. A step that is due up to this error is due.
 _STEP_ROUNDING = 1e-6
 
-# A joint's inertia is never less than its armature, whatever the posture: M >= diag(armature). With K dt^2 / armature
-# <= 0.16 and D dt / armature <= 1 all eigenvalues of 2 D dt + K dt^2 over M stay below 4, where semi-implicit Euler
-# integration turns unstable.
+# In every posture the inertia of a joint is at least its armature: M >= diag(armature). If K dt^2 / armature <= 0.16
+# and D dt / armature <= 1, all eigenvalues of 2 D dt + K dt^2 over M stay below 4. At 4 semi-implicit Euler integration
+# becomes unstable.
 _MAX_STIFFNESS_STEP, _MAX_DAMPING_STEP = 0.16, 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class _Fingers:
-    """Where one gripper's joints are in MuJoCo's arrays, and what fully open and closed mean for them."""
+    """The places of one gripper's joints in MuJoCo's arrays, and their positions when fully open and closed."""
 
     positions: list[int]
     actuators: list[int]
@@ -45,19 +45,20 @@ class _Fingers:
 
 
 class MujocoPlant:
-    """The simulated cell, driven in one of three ways that each command chooses.
+    """The simulated cell. The mode of each command chooses one of three ways to drive it.
 
-    Position: a servo on each joint, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias, with the simulator's M and
-    bias (gravity, Coriolis), clipped at the torque limits. The reference moves straight from the last command to the
-    newest, and rests without one. Velocity: the same servos about a reference that goes on at the command's velocity
-    for one ``advance``. Torque: the command's, clipped; gravity is the sender's to bear.
+    In position mode each joint has a servo, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias, with the simulator's
+    M and bias (gravity and Coriolis), clipped at the torque limits. Its reference moves straight from the last command
+    to the newest one, and rests without a new one. In velocity mode the same servos follow a reference that moves at
+    the commanded velocity for one ``advance``. In torque mode the commanded torque is applied, clipped; the sender has
+    to bear gravity.
     """
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY, CommandMode.TORQUE)
     simulated = True
 
     def __init__(self, robot: Robot, config: Config) -> None:
-        """``robot`` has to be the one of ``config``. Raises :class:`PlantError` where MuJoCo cannot model it."""
+        """``robot`` must be the robot of ``config``; raises :class:`PlantError` if MuJoCo cannot model it."""
         self.model: mujoco.MjModel = build_model(robot, config)
         self.data: mujoco.MjData = mujoco.MjData(self.model)
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
@@ -81,7 +82,7 @@ class MujocoPlant:
         self._tools = {arm.name: self.model.body(arm.tool_frame).id for arm in robot.arms.values()}
         self._acceleration = np.zeros(self.model.nv)
         self._inertial_torque = np.zeros(self.model.nv)
-        self.observed_qpos: Array = self._qpos.copy()  # (model.nq,) of all that moves, at the last :meth:`state`
+        self.observed_qpos: Array = self._qpos.copy()  # (model.nq,) Of all moving bodies, at the last :meth:`state`.
         self.reset()
         self._stiffness, self._damping = self._tuned(config)
 
@@ -90,7 +91,7 @@ class MujocoPlant:
         return cls(robot, config)
 
     def reset(self, q: Array | None = None) -> None:
-        """See :meth:`Plant.reset`. Loose objects go back to their places, pushes end."""
+        """See :meth:`Plant.reset`. Loose objects go back to their places, and pushes end."""
         posture = self._robot.home if q is None else q
         check_joints("reset q", posture, self._robot)
         mujoco.mj_resetData(self.model, self.data)
@@ -99,11 +100,11 @@ class MujocoPlant:
         for fingers in self._fingers.values():
             self.data.qpos[fingers.positions] = fingers.open_position
         settle_mimics(self.model, self.data)
-        self._start = self._end = self._at_rest(posture)  # posture and velocity at both ends of the tick
-        self._next: tuple[Array, Array] | None = None  # commanded for the end of the next tick
-        self._torque: Array | None = None  # commanded in torque mode
-        self._velocity: Array | None = None  # commanded in velocity mode, for the next advance
-        self._pushes: dict[str, tuple[Array, int]] = {}  # wrench, and the step that it ends before
+        self._start = self._end = self._at_rest(posture)  # Posture and velocity at both ends of the tick.
+        self._next: tuple[Array, Array] | None = None  # Commanded for the end of the next tick.
+        self._torque: Array | None = None  # Commanded in torque mode.
+        self._velocity: Array | None = None  # Commanded in velocity mode, for the next advance.
+        self._pushes: dict[str, tuple[Array, int]] = {}  # By arm, the wrench and the step before which it ends.
         self._steps = 0
         self._clock = 0.0
         mujoco.mj_forward(self.model, self.data)
@@ -118,7 +119,7 @@ class MujocoPlant:
             self._torque = command.tau.copy()
         else:
             if self._torque is not None:
-                # Back from torque mode there is no last command to start the line from.
+                # After torque mode there is no last command at which the line could start.
                 self._end = self._at_rest(command.q if self._velocity is None else self._qpos[self._q_index])
                 self._next = self._torque = None
             if self._velocity is None:
@@ -126,9 +127,10 @@ class MujocoPlant:
         self._grippers.command(command.grippers)
 
     def advance(self, dt: float) -> None:
-        """See :meth:`Plant.advance`. Takes the whole physics steps that are due and carries the rest over.
+        """See :meth:`Plant.advance`. All whole physics steps that are due are taken, and the rest is carried over.
 
-        Raises :class:`PlantError` as well when the simulation has diverged; ``reset`` makes it usable again.
+        Raises:
+            PlantError: Also if the simulation has diverged. ``reset`` makes it usable again.
         """
         check_duration(dt)
         if dt == 0:
@@ -137,27 +139,27 @@ class MujocoPlant:
         if self._velocity is not None:
             self._next, self._velocity = (self._end[0] + dt * self._velocity, self._velocity), None
         if self._next is None:
-            self._start = self._end = self._at_rest(self._end[0])  # a velocity never outlives its tick
+            self._start = self._end = self._at_rest(self._end[0])  # A commanded velocity ends with its tick.
         else:
             self._start, self._end, self._next = self._end, self._next, None
         self._grippers.advance(dt)
         self._drive_fingers()
-        # A tick shorter than a step must not look like a jump of the velocity.
+        # A tick that is shorter than a step must not look like a jump of the velocity.
         self._acceleration[self._v_index] = (self._end[1] - self._start[1]) / max(dt, self._timestep)
         due = math.floor(self._clock / self._timestep + _STEP_ROUNDING)
         while self._steps < due:
-            # A step may begin before the tick that it ends in.
+            # A step may begin before the tick in which it ends.
             self._step(max(self._steps * self._timestep - start, 0.0) / dt)
         if not math.isfinite(self._qvel.dot(self._qvel)):
             raise PlantError(f"the simulation diverged at {self._clock:.3f} s; reset it")
 
     def state(self) -> RobotState:
-        """See :meth:`Plant.state`. External torque: contacts, pushes, and hard stops at the ends of a joint's range."""
+        """See :meth:`Plant.state`. External torques are those of contacts, pushes and the joints' hard stops."""
         index, data = self._v_index, self.data
         self.observed_qpos = self._qpos.copy()
         tau = data.qfrc_actuator.take(index)
-        # MuJoCo's sum before contacts, less the terms that are not external, leaves pushes from here and from its
-        # window.
+        # MuJoCo's sum of forces before contacts, less the terms that are not external, leaves the pushes from here and
+        # from its window.
         external = (data.qfrc_constraint + data.qfrc_smooth - data.qfrc_passive + self._bias).take(index) - tau
         q, v = self._qpos.take(self._q_index), self._qvel.take(index)
         return RobotState(q, v, tau, external, self._steps * self._timestep)
@@ -166,10 +168,15 @@ class MujocoPlant:
         return {side: fingers.opening(self._qpos) for side, fingers in self._fingers.items()}
 
     def push(self, arm: str, wrench: Array, duration: float) -> None:
-        """Push ``arm``'s tool for ``duration`` [s] from now on; replaces the arm's earlier push.
+        """Push the tool of ``arm`` from now on, in the place of an earlier push.
 
-        ``wrench`` (6,): force [N], then torque [Nm], in world axes at the tool frame's origin.
-        Raises :class:`PlantError`.
+        Args:
+            arm: The arm.
+            wrench: Force [N], then torque [Nm], in world axes at the origin of the tool frame (6,).
+            duration: Of the push [s].
+
+        Raises:
+            PlantError: If an argument is not allowed.
         """
         if arm not in self._tools:
             raise PlantError(f"push: no arm {arm!r:.40}; arms: {', '.join(self._tools)}")
@@ -180,17 +187,17 @@ class MujocoPlant:
         self._pushes[arm] = wrench, self._steps + round(duration / self._timestep)
 
     def launch_viewer(self) -> None:
-        """Open MuJoCo's own window. Raises :class:`PlantError` where there is no display."""
+        """Open MuJoCo's own window; raises :class:`PlantError` if there is no display."""
         if self._window is None:
             self._window = open_window(self.model, self.data)
 
     def viewer_say(self, words: str) -> None:
-        """Write ``words`` into the window, if there is one, in place of those of before."""
+        """Write ``words`` into the window, if there is one, in the place of earlier words."""
         if self._window is not None:
             self._window.set_texts((mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos.mjGRID_TOPLEFT, words, ""))
 
     def viewer_sync(self, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]] = ()) -> bool:
-        """See :meth:`WindowedPlant.viewer_sync`; False as well when there is no window."""
+        """See :meth:`WindowedPlant.viewer_sync`. It also returns False if there is no window."""
         if self._window is None or not self._window.is_running():
             return False
         draw_obstacles(self._window.user_scn, obstacles)
@@ -203,9 +210,9 @@ class MujocoPlant:
             self._window = None
 
     def _tuned(self, config: Config) -> tuple[Array, Array]:
-        """Stiffness [Nm/rad] and damping [Nm s/rad] of the servos (nv,), below what the timestep can integrate.
+        """Return stiffness [Nm/rad] and damping [Nm s/rad] of the servos (nv,), within what the timestep can integrate.
 
-        Damping is for each joint's effective inertia at home, 1 / (M^-1)_ii: what it feels while the others give way.
+        The damping is for the effective inertia of each joint at home, 1 / (M^-1)_ii, while the other joints yield.
         """
         inverse = np.empty((self.model.nv, self.model.nv))
         mujoco.mj_solveM(self.model, self.data, inverse, np.eye(self.model.nv))
@@ -220,7 +227,7 @@ class MujocoPlant:
         return np.array(q), np.zeros(len(q))
 
     def _step(self, fraction: float) -> None:
-        """One physics step, which begins when ``fraction`` of the tick has passed."""
+        """Take one physics step, which begins when ``fraction`` of the tick has passed."""
         mujoco.mj_step1(self.model, self.data)
         self._drive_arms(self._servo_torque(fraction) if self._torque is None else self._torque)
         self._apply_pushes()

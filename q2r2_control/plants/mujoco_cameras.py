@@ -1,4 +1,4 @@
-"""The cell's own cameras in MuJoCo: their places in the model, pictures without a window, and MuJoCo's window."""
+"""The cell's cameras in MuJoCo: their places in the model, pictures without a window, and MuJoCo's window."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from q2r2_control.errors import PlantError
 from q2r2_control.process.machine_notes import has_display
 from q2r2_control.types import Array
 
-# MuJoCo's camera looks along -z, with y up in the picture; ours looks along x, with z up.
+# A camera of MuJoCo looks along -z, with y up in the picture. Ours looks along x, with z up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_STRAIGHT = 1e-9  # of the sine between the line of sight and the vertical
-_LONGEST_CLOSE = 5.0  # of a window [s]
-_OPACITY = 0.6  # of moving obstacles
-# Without a graphics card, a window's 8 samples a pixel and shadow map of 8192 take five times as long, and its round
-# shapes of 28 x 16 parts twice as long.
+_STRAIGHT = 1e-9  # Least sine of the angle between the line of sight and the vertical.
+_LONGEST_CLOSE = 5.0  # Time to wait until a window is closed [s].
+_OPACITY = 0.6  # Of moving obstacles.
+# Without a graphics card, MuJoCo's 8 samples per pixel and shadow map of 8192 take five times as long, and its round
+# shapes of 28 x 16 parts take twice as long.
 _SHADOW_MAP, _SAMPLES, _ROUND = 1024, 0, (16, 8)
 
 
 def add_cameras(spec: mujoco.MjSpec, cameras: Mapping[str, CameraConfig]) -> None:
-    """Put cameras into a cell. Raises :class:`PlantError` for one on a link that there is not."""
+    """Put cameras into a cell; raises :class:`PlantError` for a camera on a link that does not exist."""
     for name, camera in cameras.items():
         body = spec.worldbody if camera.link is None else spec.body(camera.link)
         if body is None:
@@ -43,7 +43,7 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Mapping[str, CameraConfig]) -> Non
 
 
 def _orientation(camera: CameraConfig) -> Array:
-    """(3, 3) of the camera's frame in its link's: x is the line of sight, y is level where there is a choice."""
+    """Return the rotation (3, 3) of the camera's frame in its link's frame. x is the line of sight, and y is level."""
     assert camera.position is not None
     if camera.look_at is None:
         assert camera.rpy is not None
@@ -51,17 +51,17 @@ def _orientation(camera: CameraConfig) -> Array:
     sight = np.subtract(camera.look_at, camera.position)
     sight /= np.linalg.norm(sight)
     left = np.cross((0.0, 0.0, 1.0), sight)
-    if np.linalg.norm(left) < _STRAIGHT:  # straight up or down: x of the link is up in the picture
+    if np.linalg.norm(left) < _STRAIGHT:  # The camera looks straight up or down. The x axis of the link is up then.
         left = np.cross((1.0, 0.0, 0.0), sight)
     left /= np.linalg.norm(left)
     return np.stack((sight, left, np.cross(sight, left)), axis=1)
 
 
 class CellPictures:
-    """Takes pictures with the cameras of a model. Only for one thread, since OpenGL is."""
+    """Takes pictures with the cameras of a model, in one thread only, because OpenGL belongs to a thread."""
 
     def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
-        """``model`` is changed. Raises :class:`PlantError`, one line, where OpenGL without a window is missing."""
+        """``model`` is changed; raises :class:`PlantError` of one line if OpenGL without a window is missing."""
         model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_MAP, _SAMPLES
         model.vis.quality.numslices, model.vis.quality.numstacks = _ROUND
         model.vis.global_.offwidth = max(camera.width for camera in cameras.values())
@@ -70,7 +70,7 @@ class CellPictures:
         sizes = {name: (camera.height, camera.width) for name, camera in cameras.items()}
         try:
             renderers = {size: mujoco.Renderer(model, *size) for size in set(sizes.values())}
-        # Without the library, PyOpenGL fails at whatever it looks for first.
+        # Without the library, PyOpenGL fails with an error about the first name that it looks up.
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
             reason = " ".join(str(error).split())
             raise PlantError(
@@ -80,21 +80,21 @@ class CellPictures:
         self._renderers = {name: renderers[size] for name, size in sizes.items()}
 
     def place(self, qpos: Array) -> None:
-        """Let the cell be where ``qpos`` (model.nq,) says."""
+        """Move the cell to ``qpos`` (model.nq,)."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
 
     def take(self, camera: str) -> npt.NDArray[np.uint8]:
-        """Picture (height, width, 3), r g b, of the cell as it was placed last."""
+        """Return the picture (height, width, 3), r g b, of the cell as it was placed last."""
         renderer = self._renderers[camera]
         renderer.update_scene(self._data, camera)
         return np.asarray(renderer.render())
 
 
 def window_fault() -> str | None:
-    """Why no window can be opened, None where one can: MuJoCo waits for ever for one that its thread cannot open."""
+    """Return why no window can be opened; None if one can. MuJoCo would wait for ever for a window that cannot open."""
     if not has_display():
         return "MuJoCo's window needs a display: neither DISPLAY nor WAYLAND_DISPLAY is set; run headless"
     import glfw
@@ -112,7 +112,7 @@ def window_fault() -> str | None:
 
 
 def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.viewer.Handle:
-    """MuJoCo's passive viewer on a running simulation. Raises :class:`PlantError` where there is no display."""
+    """Open MuJoCo's passive viewer on a running simulation; raises :class:`PlantError` if there is no display."""
     if (fault := window_fault()) is not None:
         raise PlantError(fault)
     from mujoco import viewer
@@ -124,14 +124,14 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.viewer.Han
 
 
 def close_window(window: mujoco.viewer.Handle) -> None:
-    """Close it, and wait for its thread: one that still draws as the process ends brings it down."""
+    """Close the window and wait for its thread. A thread that still draws when the process ends would crash it."""
     window.close()
     for thread in threading.enumerate():
-        if "_launch_internal" in thread.name:  # by the name of MuJoCo's function
+        if "_launch_internal" in thread.name:  # The thread has the name of MuJoCo's function.
             thread.join(_LONGEST_CLOSE)
 
 
-# Kind of each shape, and its sizes there in those of ours.
+# MuJoCo's kind of each shape, and its sizes from ours.
 _DRAWN = {
     "sphere": (mujoco.mjtGeom.mjGEOM_SPHERE, (1.0,)),
     "capsule": (mujoco.mjtGeom.mjGEOM_CAPSULE, (1.0, 0.5)),
@@ -140,7 +140,7 @@ _DRAWN = {
 
 
 def draw_obstacles(scene: mujoco.MjvScene, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]]) -> None:
-    """Let ``scene`` hold these obstacles alone, each in its colour r g b."""
+    """Draw only these obstacles into ``scene``, each in its colour r g b."""
     scene.ngeom = 0
     for obstacle, colour in obstacles:
         kind, factors = _DRAWN[obstacle.shape]

@@ -1,1 +1,1 @@
-"""A tick's record, and the figures of a whole run."""
+"""The record of one tick, and the figures of a whole run."""

@@ -1,4 +1,4 @@
-"""Summary of a run: figures gathered at every tick, in constant memory."""
+"""Summarise a run by figures that are collected at every tick, in constant memory."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from q2r2_control.types import ArmTarget, HandSample
 from q2r2_control.wording import sentence
 
 _BINS = 100_000
-EVENTS_KEPT = 10_000  # the newest ones; a broken button can cause more
-_FOLLOWED = 100.0  # as far as the impedance lets a tool be pushed with a force that grows [mm]
+EVENTS_KEPT = 10_000  # Number of the newest events that are kept. A broken button can cause more.
+_FOLLOWED = 100.0  # Distance up to which the impedance pushes back with a growing force [mm].
 _REST = 1e-3  # [rad/s]
 
 
 @dataclass(frozen=True, slots=True)
 class Percentiles:
-    """Of a duration; p50 and p99 to a thousandth of the histogram's unit, None: nothing was measured."""
+    """Percentiles of a duration, to 1/1000 of the histogram's unit for p50 and p99; None if nothing was measured."""
 
     p50: float | None
     p99: float | None
@@ -38,7 +38,7 @@ NOTHING_MEASURED = Percentiles(None, None, None)
 
 
 class Histogram:
-    """Counts durations in thousandths of ``unit`` [s], up to 100 units."""
+    """Counts durations with a resolution of ``unit`` / 1000 [s], up to 100 units."""
 
     def __init__(self, unit: float) -> None:
         self._bin = unit * 1e-3
@@ -46,13 +46,13 @@ class Histogram:
         self._largest = 0.0
 
     def add(self, duration: float) -> None:
-        """Count one duration [s]; one below zero counts as zero, one that is not finite does not count."""
+        """Count one duration [s]. A negative one counts as zero, and one that is not finite does not count."""
         if math.isfinite(duration):
             self._counts[int(min(max(duration / self._bin, 0.0), _BINS - 1))] += 1
             self._largest = max(self._largest, duration)
 
     def percentiles(self, unit: float) -> Percentiles:
-        """In multiples of ``unit`` [s]."""
+        """Return the percentiles in multiples of ``unit`` [s]."""
         cumulative = np.cumsum(self._counts)
         if not cumulative[-1]:
             return NOTHING_MEASURED
@@ -64,26 +64,26 @@ class Histogram:
 
 @dataclass(slots=True)
 class TorqueSummary:
-    """A run in torque mode, gathered tick by tick."""
+    """Figures of a run in torque mode."""
 
-    off_reference_s: dict[str, float]  # of each arm: further from its reference than the impedance's error clip
-    min_measured_distance_mm: float | None = None  # None: no monitored pair
+    off_reference_s: dict[str, float]  # By arm, the time for which it was farther away than the impedance's error clip.
+    min_measured_distance_mm: float | None = None  # None if there is no monitored pair.
     measured_closest_pair: tuple[str, str] | None = None
-    pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # that the wall pushed apart at some time
-    max_wall_force_n: float = 0.0  # on one pair
-    saturated_ticks: int = 0  # some joint would have needed more torque than its limit
-    rate_limited_ticks: int = 0  # some joint's torque could not change as fast as it should
-    held_ticks: int = 0  # without a usable measurement: the last gravity torque was held
+    pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # Pairs that the wall has pushed apart.
+    max_wall_force_n: float = 0.0  # The greatest force of the wall on one pair.
+    saturated_ticks: int = 0  # Ticks in which a joint would have needed more torque than its limit.
+    rate_limited_ticks: int = 0  # Ticks in which a joint's torque could not change as fast as it should.
+    held_ticks: int = 0  # Ticks without a usable measurement, in which the last gravity torque was held.
 
     @property
     def met(self) -> bool:
-        """Whether measured links met that may not touch: what was measured broke what was promised."""
+        """Whether measured links have met that may not touch, so that the measurement breaks the promise."""
         return (self.min_measured_distance_mm or 0.0) < 0.0
 
     def add(self, dt: float, impedance: ImpedanceReport, wall: WallReport) -> None:
         """Count one tick of ``dt`` [s]."""
         least = math.inf if self.min_measured_distance_mm is None else self.min_measured_distance_mm
-        # A NaN distance, where nothing was measured, compares as not less; such a tick counts as held.
+        # The distance is NaN if nothing was measured. It is then not less, and the tick counts as held.
         if 1e3 * wall.closest_distance < least:
             self.min_measured_distance_mm = 1e3 * wall.closest_distance
             self.measured_closest_pair = wall.closest_pair
@@ -99,60 +99,61 @@ class TorqueSummary:
 
 @dataclass(slots=True)
 class ArmSummary:
-    """One arm, over the ticks in which it was engaged. Errors: of the measured tool against the operator's target."""
+    """Figures of one arm while it was engaged. Errors are those of the measured tool from the operator's target."""
 
     engaged_s: float = 0.0
-    position_error_mm_rms: float | None = None  # None: never engaged
+    position_error_mm_rms: float | None = None  # None if the arm was never engaged.
     rotation_error_deg_rms: float | None = None
     gripper_changes: int = 0
-    gripper_held_s: float = 0.0  # for which something near its fingers kept it from opening or closing as wanted
-    gripper_held_by: tuple[str, str] | None = None  # geometry names of the last pair that did
-    object_held_s: float | None = None  # for which its gripper held its object; None: the cell's YAML has none for it
-    slip_mm_max: float = 0.0  # largest slip of one engagement: how far the leash moved the target
+    gripper_held_s: float = 0.0  # Time for which something near the fingers held the gripper up.
+    gripper_held_by: tuple[str, str] | None = None  # Names of the geometries of the last pair that did so.
+    object_held_s: float | None = None  # Time for which the gripper held its object; None if it has none.
+    slip_mm_max: float = 0.0  # Largest slip of the target in one engagement.
     slip_deg_max: float = 0.0
-    yielded_mm_max: float = 0.0  # largest displacement of the target by the admittance, in position mode
+    yielded_mm_max: float = 0.0  # Largest displacement of the target by the admittance, in position mode.
     yielded_deg_max: float = 0.0
-    policy_s: float = 0.0  # moved by a policy
-    interventions: int = 0  # times that a hand took over from a policy
+    policy_s: float = 0.0  # Time for which a policy moved the arm.
+    interventions: int = 0  # Number of times that a hand took over from a policy.
     intervention_s: float = 0.0
-    end_error_mm: float | None = None  # of the measured tool from the reference's at the end; None: not measured
+    # Distance of the measured tool from the reference's tool at the end; None if it was not measured.
+    end_error_mm: float | None = None
 
     @property
     def followed(self) -> bool:
-        """Whether the tool was where it should be at the end, or as near as arms are that yield."""
+        """Whether the tool was where it should be at the end, or as near as a compliant arm can be."""
         return self.end_error_mm is None or self.end_error_mm <= _FOLLOWED
 
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """A whole run. Ratios and margins are the worst of all ticks; 1 is the limit."""
+    """Figures of a whole run. Ratios and margins are the worst of all ticks, and a ratio of 1 is the limit."""
 
     ticks: int
     duration_s: float
     loop_rate_hz: float
-    real_time_factor: float | None  # seconds of simulated time in a second; None in real time
-    tick_us: Percentiles  # from polling the input to the command, plant not included
-    lateness_us: Percentiles  # of a tick's begin, after it was due; None in simulated time
-    input_to_command_ms: Percentiles  # from a sample's receipt to the command it led to
+    real_time_factor: float | None  # Simulated seconds per second of the computer's clock; None in real time.
+    tick_us: Percentiles  # From polling the input to the command, without the plant.
+    lateness_us: Percentiles  # From when a tick was due to its beginning; None in simulated time.
+    input_to_command_ms: Percentiles  # From the receipt of a sample to the command to which it led.
     arms: dict[str, ArmSummary]
-    min_distance_mm: float | None  # None: no monitored pair
+    min_distance_mm: float | None  # None if there is no monitored pair.
     closest_pair: tuple[str, str] | None
     max_velocity_ratio: float
     max_acceleration_ratio: float
-    min_position_margin_rad: float  # beyond the configured margin
+    min_position_margin_rad: float  # In addition to the configured margin.
     fallback_ticks: int
     uncertified_ticks: int
     rejected_targets: int
-    overruns: int  # ticks that began more than a period after they were due
-    missed_ticks: int  # that were due and did not come, since the loop was late
-    stretched_s: float  # by how much that made the motion late
-    at_rest: bool  # the reference was at rest when the run ended
-    torque: TorqueSummary | None  # None: position mode
+    overruns: int  # Ticks that began more than a period after they were due.
+    missed_ticks: int  # Ticks that were due and did not come, because the loop was late.
+    stretched_s: float  # Time by which the motion became late for that reason.
+    at_rest: bool  # Whether the reference was at rest when the run ended.
+    torque: TorqueSummary | None  # None in position mode.
     events: list[Event]
 
     @property
     def followed(self) -> bool:
-        """Whether every tool was where it should be at the end, and no arm refused every press that engages it."""
+        """Whether every tool was where it should be at the end, and every arm that was to be engaged could be."""
         refused = {event.arm for event in self.events if event.kind is ReasonKind.NOT_ENGAGED}
         return all(arm.followed and (arm.engaged_s or name not in refused) for name, arm in self.arms.items())
 
@@ -168,7 +169,7 @@ class _ArmStatistics:
         self.summary = ArmSummary()
         self._gripper: float | None = None
         self._intervenes = False
-        self._squares, self._ticks = np.zeros(2), 0  # of the errors [m^2], [rad^2]
+        self._squares, self._ticks = np.zeros(2), 0  # Sums of the squared errors [m^2], [rad^2], and their number.
 
     def add(self, tick: Tick) -> None:
         name, summary = self._name, self.summary
@@ -200,7 +201,7 @@ class _ArmStatistics:
         if target.pose is not None and tick.engaged[self._name]:
             summary.engaged_s += tick.dt
             errors = tick.tracking_error(self._name)
-            if math.isfinite(sum(errors)):  # else nothing was measured
+            if math.isfinite(sum(errors)):  # Otherwise nothing was measured.
                 self._ticks += 1
                 self._squares += np.square(errors)
 
@@ -212,7 +213,7 @@ class _ArmStatistics:
 
 
 class RunStatistics:
-    """Gathers a :class:`RunSummary`."""
+    """Collects the figures of a :class:`RunSummary`."""
 
     def __init__(self, robot: Robot, control: ControllerSettings) -> None:
         self.robot, self._control = robot, control
@@ -233,9 +234,9 @@ class RunStatistics:
         self._ticks += 1
         self._duration += tick.dt
         self._compute_times.add(tick.compute_time)
-        # Reports of obstacles come many times a second.
+        # Reports of obstacles come many times a second, and would fill the list.
         self.events.extend(event for event in tick.events if event.kind is not ReasonKind.OBSTACLE_REPORTED)
-        # Numbers that are not finite are passed over.
+        # Numbers that are not finite do not count.
         np.fmax(self._speed, np.abs(reference.v), out=self._speed)
         np.fmax(self._acceleration, np.abs(reference.a), out=self._acceleration)
         np.fmin(self._lowest, reference.q, out=self._lowest)
@@ -264,7 +265,10 @@ class RunStatistics:
         return error if math.isfinite(error) else None
 
     def summary(self, wall_time: float) -> RunSummary:
-        """The run so far, which took ``wall_time`` [s], as if no tick had been late."""
+        """Return the summary of the run so far, without the figures of late ticks.
+
+        ``wall_time`` is the duration of the run by the computer's clock [s].
+        """
         robot, control = self.robot, self._control
         acceleration_limit = robot.capped_acceleration(control.acceleration_limit)
         room = np.minimum(self._lowest - robot.position_lower, robot.position_upper - self._highest).min()

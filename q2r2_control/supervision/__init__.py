@@ -1,6 +1,7 @@
-"""The rules that stop an arm or keep one from starting, the same for the pipeline and the ROS nodes.
+"""The rules that stop an arm or keep it from starting. The pipeline and the ROS nodes share them.
 
 ``supervisor`` decides at every tick which targets the controller gets and whether the arms may move. ``joint_watch``
-judges measured states, ``targets`` and ``target_stream`` who is followed. ``homing`` moves arms without targets.
-``tick_pacer`` judges late ticks, and limits targets for controllers that have no limits. No ROS and no clock in here.
+judges the measured states. ``targets`` and ``target_stream`` decide which sender the arms follow. ``homing`` moves the
+arms without targets. ``tick_pacer`` judges late ticks, and limits targets for controllers without limits of their own.
+This package imports no ROS and reads no clock: every function gets the time as an argument.
 """

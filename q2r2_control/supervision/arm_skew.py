@@ -1,9 +1,9 @@
-"""Are all arms at the same place of the one reference? Where one falls behind or is silent, all of them brake.
+"""Watch whether all arms are at the same time of their common reference, and brake all of them where one is not.
 
-The certificate (control/safety/arm_skew.py) keeps arms apart that are no farther apart in time than its window. This
-watch keeps them within it, and it is the same for every loop. While it holds the arms up, the reference follows its
-certified stop. It goes on as soon as the arms are together again. Arms that are held up for a tenth of a second are
-activated anew from rest.
+Each arm follows the reference with a lag of its own. The certificate (control/safety/arm_skew.py) keeps two arms apart
+as long as their lags differ by no more than its window. This watch keeps the difference within the window, for every
+loop. If one arm falls behind or stops sending, the reference follows its certified stop until the arms are together
+again. After 0.1 s of waiting the arms stop, and are activated anew from rest.
 """
 
 from __future__ import annotations
@@ -14,20 +14,27 @@ from collections.abc import Mapping
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.types import ArmTiming
 
-_SPARE = 0.001  # [s]
-_PATIENCE = 0.1  # with arms that are held up [s]
+_TIMING_NOISE_S = 0.001
+_MAX_WAIT_S = 0.1
 
 
 def allowed_skew(timings: Mapping[str, ArmTiming]) -> float:
-    """By how much the lags of arms may differ [s]: one message that is lost, and one that is late."""
-    return _SPARE + max((2.0 * timing.period + timing.noise for timing in timings.values()), default=0.0)
+    """Return the greatest permitted difference between the lags of two arms [s].
+
+    It has room for one lost message and one late message.
+    """
+    return _TIMING_NOISE_S + max((2.0 * timing.period + timing.noise for timing in timings.values()), default=0.0)
 
 
 def skew_window(timings: Mapping[str, ArmTiming], lead: float) -> float:
-    """How far arms can be apart in time when all brake [s]; 0 for a single arm. See :meth:`allow_skew`.
+    """Return the greatest difference between the arms' lags until all of them brake [s]; 0 for a single arm.
 
-    ``lead``: from where the arms are led to the end of the newest step of the reference [s]. To the difference that is
-    allowed come an answer that an arm has not heard, and the message that tells of it.
+    The controller gets it by :meth:`CartesianController.allow_skew`. It is the sum of three parts: the permitted
+    difference; two periods, for a lost command and for the message that shows the loss; and ``lead``.
+
+    Args:
+        timings: The period and the noise of each arm's messages.
+        lead: Time from the posture that the arms are sent to until the end of the reference's newest step [s].
     """
     if len(timings) < 2:
         return 0.0
@@ -35,28 +42,31 @@ def skew_window(timings: Mapping[str, ArmTiming], lead: float) -> float:
 
 
 class SkewWatch:
-    """Compares the arms of one loop at every tick."""
+    """Compares the lags of one loop's arms at every tick."""
 
     def __init__(self) -> None:
-        self.holds = False  # whether all arms brake, until they are together again
-        self._together = math.inf  # when they were last [s]
+        self.holds = False  # True while all arms brake because one of them is behind or silent.
+        self._last_together_s = math.inf
 
     def observe(self, timings: Mapping[str, ArmTiming], now: float) -> None:
-        """Take the ``timings`` of all arms that follow the reference, at ``now`` [s]."""
+        """Compare the ``timings`` of all arms that follow the reference at time ``now`` [s]."""
         self._allowed, lags = allowed_skew(timings), {arm: timing.lag for arm, timing in timings.items()}
         self._last = max(lags, key=lambda arm: lags[arm], default="")
         self._skew = lags[self._last] - min(lags.values()) if lags else 0.0
         self.holds = self._skew > self._allowed or self._one_is_silent(timings)
-        if not self.holds or self._together == math.inf:
-            self._together = now
+        if not self.holds or self._last_together_s == math.inf:
+            self._last_together_s = now
 
     def _one_is_silent(self, timings: Mapping[str, ArmTiming]) -> bool:
-        """Whether an arm has said nothing for two periods, while another one was heard. Else this loop was late."""
+        """Return whether one arm has sent nothing for two periods longer than another arm.
+
+        If all arms are silent for the same time, this loop was late, and no arm is to blame.
+        """
         silent = [timing.silent for timing in timings.values()]
-        return any(timing.silent - min(silent) > 2.0 * timing.period + _SPARE for timing in timings.values())
+        return any(timing.silent - min(silent) > 2.0 * timing.period + _TIMING_NOISE_S for timing in timings.values())
 
     def fault(self, now: float) -> Reason | None:
-        """A reason where arms have been held up for too long at ``now`` [s], else None."""
-        if not self.holds or now - self._together <= _PATIENCE:
+        """Return a reason if the arms have waited for each other for too long at time ``now`` [s], else None."""
+        if not self.holds or now - self._last_together_s <= _MAX_WAIT_S:
             return None
         return Reason.of(ReasonKind.ARMS_APART, arm=self._last, skew=1e3 * self._skew, allowed=1e3 * self._allowed)

@@ -1,4 +1,4 @@
-"""The way home, along which all arms are led instead of following targets; and where no run may begin at home."""
+"""Move all arms home instead of following targets, and check before a run whether it may begin at home."""
 
 from __future__ import annotations
 
@@ -20,55 +20,59 @@ from q2r2_control.robot.stop_torque import joints_that_cannot_hold
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.types import Array, Reference
 
-_SPEED = 0.3  # of the fastest joint [rad/s]
-_SLOWED, _WAITED = 0.09, 0.12  # by how much the arms lag behind where the way is slowed, and where it waits [rad]
-_POINT_REACHED, _GOAL_REACHED = 0.1, 0.003  # how near the arms come to a way point, and to the goal [rad]
-_LONGEST_WAIT, _PROGRESS = 3.0, 1e-3  # without progress of so much [s], [rad]
+_SPEED = 0.3  # Speed of the fastest joint [rad/s].
+_SLOWED, _WAITED = 0.09, 0.12  # Lags of the arms at which the setpoint is slowed, and at which it waits [rad].
+_POINT_REACHED, _GOAL_REACHED = 0.1, 0.003  # Distances at which a way point, and the goal, count as reached [rad].
+_LONGEST_WAIT, _PROGRESS = 3.0, 1e-3  # Homing ends after this time with less progress than this [s], [rad].
 _AT_REST = 0.02  # [rad/s]
-_ROOM = 0.003  # more than what a pair keeps [m]
-_STOP = 0.05  # in which joints of that speed stop, if their limit is 6 rad/s^2 or more [s]
-_SAMPLE = 0.05  # between two samples of a way [rad]
+_ROOM = 0.003  # Room on a planned way beyond the distance that a pair keeps [m].
+_STOP = 0.05  # Time in which joints of that speed stop, if their acceleration limit is 6 rad/s^2 or more [s].
+_SAMPLE = 0.05  # Distance between two postures at which a way is checked [rad].
 _SAMPLES_A_TICK = 2
 _RANDOM_WAYS = 300
-_SPREAD = 0.6  # of random way points [rad]
-_INSIDE = 0.02  # of joint limits [rad]
-_NARROWEST = 1e-3  # range of a joint in which a home can be written down [rad or m]
+_SPREAD = 0.6  # Standard deviation of random way points [rad].
+_INSIDE = 0.02  # Distance of way points from joint limits [rad].
+_NARROWEST = 1e-3  # Least range of a joint in which a home can be written down [rad or m].
 
 
 class HomingStep(NamedTuple):
-    """One tick of a way home."""
+    """The setpoints of one tick on the way home."""
 
-    joints: Array | None  # (nv,) where arms without a target shall be [rad]; None: where they rest
-    targets: dict[str, pin.SE3 | None]  # of tools; an arm that is missing has none
+    joints: Array | None  # Joint setpoint of arms without a target (nv,) [rad]; None lets them stay where they rest.
+    targets: dict[str, pin.SE3 | None]  # Targets of the tools. An arm that is missing has no target.
 
 
 class WayHome(Protocol):
-    """Leads all arms home, from where it was made on."""
+    """Moves all arms home, from the posture at which the object was made."""
 
     @property
     def outcome(self) -> ReasonKind | None:
-        """How it ended, or None while it goes on."""
+        """How the way home ended, or None while it goes on."""
 
     def step(self, q: Array, v: Array, dt: float) -> HomingStep:
-        """Where the arms shall be in ``dt`` [s], with the reference at ``q``, ``v`` (nv,)."""
+        """Return the setpoints for the time ``dt`` [s] from now, with the reference at ``q``, ``v`` (nv,)."""
 
 
 class JointHoming:
-    """Leads all joints to a goal, from where they come to rest."""
+    """Moves all joints to a goal, from where they come to rest. It looks for a free way around obstacles."""
 
     def __init__(self, robot: Robot, look: Callable[[], PairsAhead], goal: Array, straight: bool = False) -> None:
-        """``look``: see :meth:`CartesianController.pairs_ahead`; ``goal`` (nv,) [rad].
+        """Make a way to ``goal`` (nv,) [rad].
 
-        ``straight``: no way but the straight one is gone.
+        Args:
+            robot: The robot.
+            look: See :meth:`CartesianController.pairs_ahead`.
+            goal: The posture at the end (nv,) [rad].
+            straight: Whether only the straight way may be taken.
         """
         self._robot, self._look, self._goal, self._straight = robot, look, goal, straight
         self._search: Iterator[list[Array] | None] | None = None
-        self._points: list[Array] | None = None  # still to be reached, the goal last
-        self._at = self._leg = self._goal  # where the joints shall be, and where the leg to the next point began
-        self._share = 0.0  # of the leg
-        self._least_left = np.inf  # of the way to the next point, of the joint that has the most [rad]
-        self._waited = 0.0  # without progress [s]
-        self.outcome: ReasonKind | None = None  # how it ended
+        self._points: list[Array] | None = None  # Way points that are still to be reached. The goal is the last one.
+        self._at = self._leg = self._goal  # The setpoint, and the beginning of the leg to the next way point.
+        self._share = 0.0  # Share of the leg that the setpoint has covered.
+        self._least_left = np.inf  # Least distance from the next way point so far, of the farthest joint [rad].
+        self._waited = 0.0  # Time without progress [s].
+        self.outcome: ReasonKind | None = None  # How the way home ended.
 
     def step(self, q: Array, v: Array, dt: float) -> HomingStep:
         """See :class:`WayHome`."""
@@ -76,7 +80,7 @@ class JointHoming:
             if float(np.abs(v).max()) > _AT_REST:
                 return HomingStep(None, {})
             self._distances, kept = self._look()
-            # A pair that has less room where the way begins needs no more than that.
+            # A pair that has less room at the beginning of the way needs no more room than that.
             self._needed = np.minimum(kept + _ROOM, self._distances(q) - 1e-4)
             self._at = self._leg = q.copy()
             self._search = self._ways(self._at)
@@ -110,7 +114,12 @@ class JointHoming:
             self.outcome = ReasonKind.HOMING_HELD_UP
 
     def _ways(self, start: Array) -> Iterator[list[Array] | None]:
-        """Samples one way after the other: None for each sample, the points of a free way, [] after the last."""
+        """Check one way after the other.
+
+        Yields:
+            None after each posture that was checked, so that the work can be spread over ticks; then the way points of
+            the first free way, or an empty list if no way is free.
+        """
         for between in self._candidates(start):
             points = [start, *between, self._goal]
             for posture in _samples(points):
@@ -123,7 +132,7 @@ class JointHoming:
         yield []
 
     def _candidates(self, start: Array) -> Iterator[tuple[Array, ...]]:
-        """Way points between ``start`` and the goal."""
+        """Yield the way points between ``start`` and the goal of one way after the other."""
         robot, goal = self._robot, self._goal
         yield ()
         if self._straight:
@@ -132,7 +141,7 @@ class JointHoming:
             first = start.copy()
             first[arm.joints] = goal[arm.joints]
             yield (first,)
-        random = np.random.default_rng(0)  # the same way at every time
+        random = np.random.default_rng(0)  # The same start always leads to the same way.
         for number in range(_RANDOM_WAYS):
             middle = goal if number % 2 else start + random.uniform(0.2, 0.8) * (goal - start)
             point = middle + random.normal(0.0, _SPREAD, len(goal))
@@ -140,7 +149,7 @@ class JointHoming:
 
 
 def _samples(points: list[Array]) -> Iterator[Array]:
-    """Postures along a way; the end of each leg first, since a bad way point is not worth the way there."""
+    """Yield postures along a way. The end of each leg comes first, since a bad way point makes the leg useless."""
     for a, b in pairwise(points):
         count = max(int(np.abs(b - a).max() / _SAMPLE), 1)
         for share in (1.0, *(i / count for i in range(1, count))):
@@ -149,14 +158,14 @@ def _samples(points: list[Array]) -> Iterator[Array]:
 
 _LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # [m/s], [rad/s]
 _ARRIVED, _TURNED = 0.003, 0.01  # [m], [rad]
-_PATIENCE = 5.0  # after the targets have arrived [s]
+_PATIENCE = 5.0  # Time for which the tools may take longer than their targets [s].
 
 
 class ToolHoming:
-    """Targets on straight lines home for all tools at once; where the QP holds one up, the homing ends there."""
+    """Moves all tools home at once on straight lines. If the QP holds a tool up, the homing ends there."""
 
     def __init__(self, home: Mapping[str, pin.SE3], tool_pose: Callable[[str], pin.SE3]) -> None:
-        """``tool_pose``: where the controller's reference has an arm's tool."""
+        """Make a way to the poses ``home``. ``tool_pose`` returns the pose of an arm's tool in the reference."""
         self._home, self._tool_pose = dict(home), tool_pose
         self._start = {arm: tool_pose(arm) for arm in home}
         ways = [apart(start, home[arm]) for arm, start in self._start.items()]
@@ -186,20 +195,23 @@ class ToolHoming:
 
 
 class Homing:
-    """Leads the joints of all arms; with ``tools_only`` the tools, where another controller moves the joints."""
+    """Begins, continues and ends the way home.
+
+    With ``tools_only`` it gives targets to the tools, because another controller moves the joints.
+    """
 
     def __init__(self, robot: Robot, controller: CartesianController, tools_only: bool) -> None:
         self._robot, self._controller, self._tools_only = robot, controller, tools_only
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         self._way: WayHome | None = None
-        self.outcome: Reason | None = None  # how the last way home ended, where it did by itself
+        self.outcome: Reason | None = None  # How the last way home ended, if nobody interrupted it.
 
     @property
     def active(self) -> bool:
         return self._way is not None
 
     def begin(self, goal: Array | None = None) -> None:
-        """Begin the way home, or the straight way of all joints to another ``goal`` (nv,) [rad]."""
+        """Begin the way home, or the straight way of all joints to another posture ``goal`` (nv,) [rad]."""
         self.outcome = None
         if goal is None and self._tools_only:
             self._way = ToolHoming(self._home, self._controller.tool_pose)
@@ -208,7 +220,12 @@ class Homing:
             self._way = JointHoming(self._robot, partial(self._controller.pairs_ahead, _STOP), to, straight)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """The target of each tool in ``dt`` [s], from the ``last`` reference: none where joints are led."""
+        """Return the target of each tool for the time ``dt`` [s] from now; None for arms whose joints are moved.
+
+        Args:
+            last: The last reference.
+            dt: Duration of the tick [s].
+        """
         if self._way is None or last is None:
             return dict.fromkeys(self._robot.arms)
         step = self._way.step(last.q, last.v, dt)
@@ -216,7 +233,7 @@ class Homing:
         return dict.fromkeys(self._robot.arms) | step.targets
 
     def check(self, reference: Reference) -> Reason | None:
-        """End the way where it has an outcome at the tick's ``reference``; returns that, or None."""
+        """End the way home if it has arrived or cannot go on at ``reference``; returns the outcome, or None."""
         kind = None if self._way is None else self._way.outcome
         if kind is None:
             return None
@@ -226,13 +243,13 @@ class Homing:
         return self.outcome
 
     def end(self) -> None:
-        """The arms hold where they come to rest."""
+        """Let the arms hold where they come to rest."""
         if self._way is not None:
             self._controller.hold_at(None)
         self._way = None
 
     def hold(self) -> Reason | None:
-        """End the way home, and say so in :attr:`outcome`. Returns why that is not possible: never, so None."""
+        """End the way home, with ``outcome`` as the record. Returns None, because this is always possible."""
         if self.active:
             self.end()
             self.outcome = Reason(ReasonKind.HOMING_INTERRUPTED)
@@ -242,20 +259,25 @@ class Homing:
 def preflight_faults(
     robot: Robot, settings: ControllerSettings, controller: CartesianController | None
 ) -> tuple[str, ...]:
-    """One line for each reason why ``robot`` should not start at home; empty for a cell that may run.
+    """Return one line for each reason why the robot should not start at home; empty if the cell may run.
 
-    Position limits are checked with their margin, gravity against torque limits, and every monitored pair against the
-    distance that it keeps. The ``controller`` has to know a certified stop at home, where it is left reset. None where
-    no controller is about to move the arms: a stop of arms at rest keeps all apart where the distances are kept.
+    The home posture is checked against position limits with their margin, torque limits under gravity, and the distance
+    that every monitored pair keeps.
+
+    Args:
+        robot: The robot.
+        settings: The controller's settings.
+        controller: The controller, which needs a certified stop at home. It is left reset there. None if no controller
+            is about to move the arms; then the distances suffice, because arms at rest stop at once.
     """
     lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
     change = "to change: control.position_margin, or a fixed joint in the model"
-    # A joint's index in Pinocchio's model is one more than in the vectors, since the world comes first.
+    # The index of a joint in Pinocchio's model is one more than its index in vectors, because the world comes first.
     shaped = {item.parentJoint - 1 for item in robot.collision_model.geometryObjects}
     faults = [
         f"{name} arm: no link between its base and its tool has a collision shape; allowed: a model with <collision>"
         for name, arm in robot.arms.items()
-        if not shaped & set(arm.joints[:-1].tolist())  # the last one moves the tool
+        if not shaped & set(arm.joints[:-1].tolist())  # The last joint moves only the tool.
     ]
     faults += [
         f"{name}: position_margin leaves {max(left, 0.0):g} rad of its range; {change}"
@@ -274,9 +296,9 @@ def preflight_faults(
     ]
     too_close = too_close_at_home(robot, kept_distances(robot, settings), remedies=True)
     faults += too_close
-    if controller is not None and not too_close:  # a pair that is too close leaves no certificate, and says more
+    if controller is not None and not too_close:  # A pair that is too close explains why there is no certificate.
         controller.reset(robot.home)
-        report = controller.step({}, controller.settings.max_substep).report  # every arm holds
+        report = controller.step({}, controller.settings.max_substep).report
         controller.reset(robot.home)
         if not report.certified:
             tightest = (

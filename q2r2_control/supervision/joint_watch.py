@@ -1,4 +1,4 @@
-"""Judge measured joints: whether they can be believed, and whether arms that others move keep apart."""
+"""Judge the measured joints: whether the states are plausible, and whether arms of another controller keep apart."""
 
 from __future__ import annotations
 
@@ -20,26 +20,31 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.target_stream import StreamSettings, apart
 from q2r2_control.types import Array, Reference, RobotState
 
-# Above what the joints may move between two states: noise, and stamps that a busy machine spreads.
+# Tolerances of the test for jumps: for noise of the encoders, and for stamps that a busy machine delays.
 _JUMP_ALLOWANCE, _JUMP_TIME = 0.05, 0.02  # [rad], [s]
-# The motion that counts as rest during the time that states have to be good before they are believed [rad].
+# A joint that moves by less than this during the settle time is at rest [rad].
 _REST = 0.01
 
 
 @dataclass(slots=True)
 class WatchSettings:
-    """The rules for measured states; may be changed at run time. See :func:`watch_settings`."""
+    """The limits for measured states; they may be changed at run time. See :func:`watch_settings`."""
 
-    timeout: float  # without a state for this long is a fault [s]
-    # States that are not finite are bridged for this long [s]; 0: the first one is a fault.
+    timeout: float  # Greatest age of the newest state before the arms stop [s].
+    # Time for which states with NaN or infinite numbers are ignored before they are a fault [s].
     unusable_time: float
-    settle_time: float  # that states have to be good and at rest before the arms are activated [s]
-    deviation: float  # of a joint from the reference [rad]
-    deviation_time: float  # [s]
+    settle_time: float  # Time for which the states must be good and at rest before the arms are activated [s].
+    deviation: float  # Greatest distance of a measured joint from the reference [rad].
+    deviation_time: float  # Time for which a joint may be farther away than that [s].
 
 
 def watch_settings(settings: SupervisionSettings, yields: bool) -> WatchSettings:
-    """The rules of the cell's settings; ``yields``: whether arms that are pushed leave their reference by design."""
+    """Return the limits from the cell's settings.
+
+    Args:
+        settings: The ``supervision`` block of the cell.
+        yields: Whether the drive is compliant, so that a person may push the arms away from the reference.
+    """
     return WatchSettings(
         timeout=settings.state_timeout,
         unusable_time=settings.unusable_time,
@@ -50,7 +55,7 @@ def watch_settings(settings: SupervisionSettings, yields: bool) -> WatchSettings
 
 
 class JointWatch:
-    """Looks at every measured state, whose stamp is when its oldest part was received [s]; arrays are (nv,)."""
+    """Judges every measured state. Its stamp is the time of receipt of its oldest part [s]. Arrays are (nv,)."""
 
     def __init__(
         self,
@@ -60,16 +65,22 @@ class JointWatch:
         source: Callable[[], str] = lambda: "",
     ) -> None:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
-        self._source = source  # where states come from, as " from /node", or ""
-        self.state: RobotState | None = None  # the newest that was good
+        self._source = source  # Text for messages that names the sender, such as " from /node", or "".
+        self.state: RobotState | None = None  # The newest state that was good.
         self.fault: Reason | None = Reason.of(ReasonKind.NO_STATES_YET, source="")
-        self._lost = False  # the fault is that arms could not be commanded, and all states since were good
-        self._q: list[float] = []  # of that state [rad]
+        self._lost = False  # True if the fault is a lost session, and all states since then were good.
+        self._q: list[float] = []  # Joint positions of ``state`` [rad].
         self._still_since, self._still_at = math.inf, self._q
         self._near_at: float | None = None
 
     def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
-        """Judge a state, or what is wrong with it, ``passed`` [s] after the last one on a simulated plant's clock."""
+        """Judge a measured state, or record the reason why there is none.
+
+        Args:
+            state: The state, or the reason why the plant has none.
+            now: The time of the loop [s].
+            passed: Simulated time since the last state, if the plant is simulated [s].
+        """
         if isinstance(state, Reason):
             self._fail(state)
             return
@@ -83,8 +94,8 @@ class JointWatch:
         if last is None or self._still_since == math.inf:
             self._still_since, self._still_at = now, q
             return
-        # If the distance of all joints is below the limit, so is that of every joint. A value that is not a number is
-        # far.
+        # No joint is farther away than the Euclidean distance of all joints. A comparison with NaN is false, so that
+        # NaN counts as far.
         far = not math.dist(q, last_q) < _JUMP_ALLOWANCE
         if far and (fault := self._jump(q, last_q, max(now - last.stamp, passed, 0.0))):
             self._fail(fault)
@@ -92,33 +103,33 @@ class JointWatch:
             self._still_since, self._still_at = now, q
 
     def lose(self, why: Reason) -> None:
-        """Arms cannot be commanded, although they are measured."""
+        """Record that the arms cannot be commanded, although their states are still measured."""
         believed = self.believed
         self._fail(why)
         self._lost = believed
 
     @property
     def believed(self) -> bool:
-        """Whether arms may brake by the newest state, also while there is a fault."""
+        """Whether the newest state is good enough for the arms to brake by it, even during a fault."""
         return self.fault is None or self._lost
 
     def settled(self, now: float) -> bool:
-        """Whether states have been good and at rest for the settle time."""
+        """Return whether the states have been good and at rest for the settle time."""
         fresh = now - self._stamp <= self._settings.timeout
         return fresh and now - self._still_since >= self._settings.settle_time
 
     def check(self, now: float) -> Reason | None:
-        """The fault of now, or None."""
+        """Return the present fault, or None. A state that is too old becomes a fault here."""
         if self.fault is not None:
             return self.fault
-        # A clock that was set back would let lost states look fresh for as long.
+        # After a clock was set back, the newest state seems to come from the future, and would look fresh for long.
         timeout, age = self._settings.timeout, now - self._stamp
         if not -timeout <= age <= timeout:
             self._fail(Reason.of(ReasonKind.STATES_SILENT, age=age, timeout=timeout, source=self._source()))
         return self.fault
 
     def deviates(self, reference: Array, now: float) -> Reason | None:
-        """A reason where the arms have been too far from ``reference`` for too long, else None."""
+        """Return a reason if a joint has been too far from ``reference`` (nv,) [rad] for too long, else None."""
         assert self.state is not None
         allowed = self._settings.deviation
         if self._near_at is None or _all_within(self._q, reference.tolist(), allowed):
@@ -138,11 +149,11 @@ class JointWatch:
         )
 
     def accept(self) -> None:
-        """Believe from now on what :meth:`settled` found good."""
+        """Clear the fault, after :meth:`settled` has found the states good and at rest."""
         self.fault, self._near_at, self._lost = None, None, False
 
     def accept_at_once(self, state: RobotState, now: float) -> None:
-        """Believe ``state`` without waiting: the arms are known to be at rest there."""
+        """Accept ``state`` without waiting, because the caller knows that the arms are at rest there."""
         self.state, self._q = state, state.q.tolist()
         self._still_since, self._still_at = now, self._q
         self.accept()
@@ -160,7 +171,7 @@ class JointWatch:
         return None
 
     def _jump(self, q: list[float], last: list[float], time: float) -> Reason | None:
-        """The fault of a joint that moved farther than it can in ``time`` [s], else None."""
+        """Return the fault of a joint that moved farther than it can in ``time`` [s], else None."""
         moved = np.abs(np.subtract(q, last))
         reach = self._velocity_limit * (time + _JUMP_TIME) + _JUMP_ALLOWANCE
         if not (moved > reach).any():
@@ -170,47 +181,49 @@ class JointWatch:
 
     def _fail(self, fault: Reason) -> None:
         self._still_since, self._lost = math.inf, False
-        # The first fault tells most; before the first good state the newest does.
+        # The first fault is the most helpful one. Before the first good state it is the newest one.
         if self.fault is None or self.state is None:
             self.fault = fault
 
 
 def _all_within(q: list[float], other: list[float], limit: float) -> bool:
-    """Whether no value is farther from the other than ``limit``; not where one is not a number."""
+    """Return whether all values differ by at most ``limit``; False if one of them is NaN."""
     distance = math.dist(q, other)
     return distance < limit or (math.isfinite(distance) and max(map(abs, map(sub, q, other))) <= limit)
 
 
-_SLOW = 0.01  # a held arm's joints are slower before its tool's pose is taken [rad/s]
-# How fast the reference's elbows follow the measured ones [1/s], [rad/s].
+_SLOW = 0.01  # An arm whose joints are slower than this holds the pose that its tool has then [rad/s].
+# How fast the elbows of the reference follow the measured elbows [1/s], [rad/s].
 _FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5}
 
 
 @dataclass(slots=True)
 class ExternalSettings:
-    """The limits for arms that another controller moves; may be changed at run time."""
+    """The limits for arms that another controller moves; they may be changed at run time."""
 
-    tolerance: float = 0.01  # measured pairs may be closer by this than they are kept apart [m]
+    tolerance: float = 0.01  # By how much measured pairs may be closer than the reference keeps them [m].
 
 
 def settings_for_external_arms(config: Config) -> Config:
-    """The cell's configuration with elbows that are free to follow, and with the deviation for arms that lag.
+    """Return the cell's configuration for arms that another controller moves.
 
-    The lag is the other controller's. Arms that come too close are found in what is measured, at any deviation.
+    The elbows of the reference are free to follow the measured ones. The greatest deviation is the one for arms that
+    lag, since the lag is the other controller's. Arms that come too close are found by their measured distances.
     """
     control = config.control.model_copy(update=_FOLLOW)
-    stiff = config.admittance.model_copy(update={"enabled": False})  # compliance is the other controller's
+    stiff = config.admittance.model_copy(update={"enabled": False})  # The other controller is the compliant one.
     supervision = config.supervision
     lagging = supervision.model_copy(update={"max_deviation": supervision.max_deviation_external})
     return config.model_copy(update={"control": control, "admittance": stiff, "supervision": lagging})
 
 
 class ExternalArms:
-    """The targets of the controller, and the checks, for arms that another controller moves after its reference.
+    """Targets and checks for arms that another controller moves along our reference.
 
-    The reference keeps the arms apart only as far as the arms are where it is. For that reason its elbows follow the
-    measured ones, and held tools keep their pose instead of joint positions. Measured pairs may not be closer than the
-    reference's may, less a tolerance for the lag of an arm.
+    The reference keeps the real arms apart only if they are where it is. The other controller follows the tools and
+    chooses the elbows itself. For that reason the elbows of the reference follow the measured ones, and an arm without
+    a target holds its tool's pose instead of its joint positions. The measured distances are checked as well; they may
+    be smaller than the reference's by a tolerance for the lag of an arm.
     """
 
     def __init__(
@@ -224,7 +237,7 @@ class ExternalArms:
         self._robot, self._controller, self._settings = robot, controller, settings
         self._streams, self._watch = streams, watch
         self._keys = kept_distances(robot, controller.settings).keys
-        self._near_at: dict[str, float] = {}  # when an arm's tool was last seen near [s]
+        self._near_at: dict[str, float] = {}  # Time at which each arm's tool was last near its reference [s].
         self._held: dict[str, pin.SE3] = {}
 
     def begin(self) -> None:
@@ -232,7 +245,10 @@ class ExternalArms:
         self._near_at.clear()
 
     def targets(self, wanted: dict[str, pin.SE3 | None], last: Reference | None) -> dict[str, pin.SE3 | None]:
-        """The same targets with the tool's own pose for each arm that has none and rests in the ``last`` reference."""
+        """Return the ``wanted`` targets, with the tool's own pose for each arm that has no target.
+
+        An arm gets its own pose as soon as it is at rest in the ``last`` reference.
+        """
         for arm, pose in wanted.items():
             if pose is not None:
                 self._held.pop(arm, None)
@@ -241,9 +257,10 @@ class ExternalArms:
         return {arm: self._held.get(arm, pose) for arm, pose in wanted.items()}
 
     def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> Reason | None:
-        """A reason where the tool of a ``holding`` arm has been away from its reference's for too long, else None.
+        """Return a reason if the tool of an arm without a target is away from its reference for too long, else None.
 
-        Nothing moves that arm, and it could not be engaged: a stream has to begin where tool and reference both are.
+        The other controller does not move that arm to the reference. The operator could not engage it either, because
+        a stream of targets has to begin at the measured tool and at the reference's tool.
         """
         holding = set(holding)
         for arm in self._robot.arms:
@@ -257,7 +274,7 @@ class ExternalArms:
         return None
 
     def too_close(self, state: RobotState) -> Reason | None:
-        """A reason where a measured pair is closer than allowed, else None."""
+        """Return a reason if a measured pair of bodies is closer than allowed, else None."""
         distances, kept = self._robot.distance_values(state.q), self._controller.kept_distances
         if (distances - kept).min(initial=np.inf) >= -self._settings.tolerance:
             return None

@@ -1,15 +1,15 @@
-"""A controller that stands still while what measures the arm goes on: asked for motion, the arm makes none.
+"""Find a controller that stands still: it is asked for motion, and the measured arm does not move.
 
-A controller whose process is frozen, or whose loop hangs, still is in the graph, and its middleware still acknowledges.
-Measured states of another process go on. Meanwhile the reference leaves the arm, and what was asked for last is a jump
-at the moment in which the controller goes on. An arm that lags moves as fast as it was asked to a little earlier. One
-that stands still does not, which shows within a few states:
+A controller whose process is frozen is still in the ROS graph, and its middleware still acknowledges messages. The
+joint states come from another process and go on. Meanwhile the reference moves away from the arm. When the controller
+wakes up, its newest command is a jump. An arm that only lags moves as fast as it was asked to a little earlier. An arm
+whose controller stands still does not move at all, which shows within a few states:
 
-    path of m in W <= 0.1 |r(t) - r(t - W)|,  |r(t) - r(t - W)| >= least,  |r(t - W) - m(t)| >= ahead,
+    path of m in W <= 0.1 |r(t) - r(t - W)|,  |r(t) - r(t - W)| >= least,  |r(t - W) - m(t)| >= ahead.
 
-with what was asked r and what is measured m, the greatest value of an arm's joints, or the way of its tool. An arm that
-lags by L turns round on a path of W / (4 L) of what it is asked for meanwhile, so one that lags by 0.12 s is not found.
-Where states have a gap nothing is judged. After a gap of this loop an arm has not yet been asked for what counts.
+Here r is the commanded and m the measured position: the joints of an arm, of which the greatest value counts, or its
+tool. W is the window. An arm that lags by L and turns round moves along W / (4 L) of the commanded way, which is more
+than 0.1 for a lag up to 0.12 s. Nothing is judged while the states have a gap, or just after this loop had one.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState
 
 WINDOW = 0.05  # W [s]
-_SHARE = 0.1  # of the way that was asked for, below which an arm stands
-_FOLLOWS = 0.5  # of that way, above which it follows
-_LOOK_PERIOD = 0.0075  # a loop may tick a thousand times a second [s]
-_STATE_GAP = 0.045  # between two states; with more the window begins anew [s]
+_STANDS_BELOW = 0.1  # An arm stands still if it moves by less than this share of the commanded way.
+_FOLLOWS_ABOVE = 0.5  # An arm follows if it moves by more than this share of the commanded way.
+_LOOK_PERIOD = 0.0075  # Time between two looks; the loop may tick more often [s].
+_STATE_GAP = 0.045  # After a longer gap between two states the window begins anew [s].
 
 
 @dataclass(frozen=True, slots=True)
 class StandstillLimits:
-    """The motion that has to be asked for and missing, in [rad] of joints or [m] of a tool."""
+    """How much commanded motion must be missing, in [rad] of joints or in [m] of a tool, and for how long."""
 
-    least: float  # asked for within the window
-    ahead: float  # between what was asked for at its beginning and what is measured
-    # For so long has the finding to hold: a controller that lags stands still where its arm turns round [s].
+    least: float  # Least commanded way within the window.
+    ahead: float  # Least distance from the measured arm to the command at the beginning of the window.
+    # Time for which the arm must stand still [s]. A controller that lags also stands still while its arm turns round.
     patience: float = 0.0
-    begins: float = 0.0  # the same where the arm has not followed yet: until it begins to [s]
+    begins: float = 0.0  # The same for an arm that has not followed yet, and may need time to begin [s].
 
 
-# Limits for a driver that takes joint commands. Its filter and its session may have just begun [rad].
+# Limits for a driver that takes joint commands. Its filter and its session may just have begun [rad].
 JOINTS = StandstillLimits(least=0.01, ahead=0.01, begins=0.05)
 # Limits for a controller that takes poses. Its inverse kinematics may lag by 0.4 s [rad], [m].
 LAGGING_JOINTS = StandstillLimits(least=0.01, ahead=0.01, patience=0.08, begins=0.4)
@@ -51,24 +51,28 @@ LAGGING_TOOL = StandstillLimits(least=0.01, ahead=0.02, patience=0.08, begins=0.
 
 
 class StandstillWatch:
-    """Judges one arm. Arrays are (n,); times are the caller's [s]."""
+    """Judges one arm. Arrays are (n,). The caller gives all times [s]."""
 
     def __init__(self, limits: StandstillLimits) -> None:
         self._limits = limits
         self.reset()
 
     def reset(self) -> None:
-        """Forget all; the arm may stand still from now on."""
-        # For each measured state: when, what was asked, the way that was measured since the first.
+        """Forget everything: the arm may stand still from now on."""
+        # For each measured state: its time, the command, and the measured path since the first state.
         self._seen: deque[tuple[float, Array, Array]] = deque()
         self._measured: Array | None = None
         self._stamp = -math.inf
         self._since, self._follows = math.inf, False
 
     def look(self, asked: Array, measured: Array, stamp: float, now: float) -> float | None:
-        """At a tick at ``now``: how far the arm was asked to go while it stood still, or None.
+        """Return how far the arm was asked to go while it stood still, or None if it does not stand still.
 
-        ``asked``: sent before this tick; ``measured`` has the ``stamp`` at which it was received.
+        Args:
+            asked: The newest command that was sent before this tick (n,).
+            measured: The measured position (n,).
+            stamp: The time at which ``measured`` was received [s].
+            now: The time of this tick [s].
         """
         if now - stamp > _STATE_GAP or stamp < self._stamp:
             self.reset()
@@ -88,11 +92,11 @@ class StandstillWatch:
         _, asked_then, path_then = self._seen[0]
         way, moved = _way(asked, asked_then), _way(self._seen[-1][2], path_then)
         if max(way, moved) < self._limits.least:
-            self._follows = False  # at rest
-        elif moved > _FOLLOWS * way:
+            self._follows = False  # The arm is at rest.
+        elif moved > _FOLLOWS_ABOVE * way:
             self._follows = True
         ahead = _way(asked_then, measured)
-        stands = way >= self._limits.least and moved <= _SHARE * way and ahead >= self._limits.ahead
+        stands = way >= self._limits.least and moved <= _STANDS_BELOW * way and ahead >= self._limits.ahead
         self._since = min(self._since, now) if stands else math.inf
         needed = self._limits.patience if self._follows else max(self._limits.begins, self._limits.patience)
         return way if stands and now - self._since >= needed else None
@@ -107,7 +111,7 @@ class StandingArms:
         self._takers, self._looked = takers, -math.inf
 
     def look(self, asked: Array, state: RobotState, now: float) -> Reason | None:
-        """A reason where an arm does not go where it was ``asked`` to be (nv,) [rad], else None."""
+        """Return a reason if an arm does not move to the commanded posture ``asked`` (nv,) [rad], else None."""
         if 0.0 <= now - self._looked < _LOOK_PERIOD:
             return None
         self._looked = now
@@ -119,7 +123,7 @@ class StandingArms:
 
 
 def standing(arm: str, takers: str, way: float, unit: str) -> Reason:
-    """The reason for an arm that was asked to go a ``way`` within the window."""
+    """Return the reason for an arm that stood still while it was asked to move by ``way`` within the window."""
     kind = ReasonKind.CONTROLLER_STANDS
     return Reason.of(kind, None, arm=arm, takers=takers, way=way, unit=unit, time=WINDOW)
 

@@ -1,12 +1,12 @@
-"""When the controller may move the arms: activation, loss, pause, stop, homing. The same object for every loop.
+"""Decide when the controller may move the arms: activation, loss, pause, stop and homing. Every loop uses this object.
 
     inactive --joint states good and at rest--> active --fault--> braking --at rest--> inactive
                                                 active --stop--> braking --at rest--> stopped --reset--> inactive
 
-Inactive and stopped command nothing more, so that whatever else holds the arms is not disturbed. Activation starts the
-reference at the measured posture and forgets all targets: nothing moves until a stream of targets begins anew at the
-tool, see :mod:`target_stream`. At a fault the arms brake along the controller's certified stop, and hold where they
-come to rest. Knows no ROS and no clock: times are passed in.
+In the phases inactive and stopped nothing is commanded, so that the arms' own controller can hold them. Activation
+starts the reference at the measured posture and forgets all targets. Nothing moves until a new stream of targets begins
+at the tool, see :mod:`target_stream`. After a fault the arms brake along the controller's certified stop and hold where
+they come to rest. This module imports no ROS and reads no clock: the caller gives the time.
 """
 
 from __future__ import annotations
@@ -29,26 +29,23 @@ from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
 from q2r2_control.types import Array, Reference, RobotState
 
-_REST = 1e-4  # of the reference [rad/s]
-# A joint that stands still this far from the reference may have nothing that moves it [rad], [rad/s].
+_REST = 1e-4  # The reference is at rest if no joint is faster [rad/s].
+# A joint that is this far from the reference and slower than this may have no driver any more [rad], [rad/s].
 _OFF_REFERENCE, _STILL = 0.02, 0.05
 
-# The mode of driving changes targets by the measured state and a time [s]: an admittance displaces them.
+# An admittance displaces the targets, by the measured state and a time step [s].
 Displace = Callable[[dict[str, pin.SE3 | None], RobotState, float], dict[str, pin.SE3 | None]]
 
 
 class Phase(StrEnum):
-    INACTIVE = "inactive"  # waits for joint states that are good and at rest
+    INACTIVE = "inactive"  # The supervisor waits for joint states that are good and at rest.
     ACTIVE = "active"
     BRAKING = "braking"
-    STOPPED = "stopped"  # until it is reset
+    STOPPED = "stopped"  # Only a reset ends this phase.
 
 
 class Supervisor:
-    """Decides at every tick what the controller is asked for, and whether its reference is commanded.
-
-    With ``external`` the reference only leads arms that another controller moves.
-    """
+    """Decides at every tick which targets the controller gets, and whether the plant gets its reference."""
 
     def __init__(
         self,
@@ -61,7 +58,18 @@ class Supervisor:
         displace: Displace | None = None,
         standstill: StandstillLimits | None = None,
     ) -> None:
-        """``standstill``: when what moves the arms counts as standing still; None: it is part of this program."""
+        """Make a supervisor, in the phase inactive.
+
+        Args:
+            robot: The robot.
+            controller: Its controller.
+            streams: The rules for streams of targets.
+            watch: The limits for measured states.
+            origins: Who sends targets and states, for messages.
+            external: If given, another controller moves the arms along the reference.
+            displace: If given, the admittance that displaces the targets.
+            standstill: When a driver counts as standing still; None if the driver is part of this program.
+        """
         self._robot, self._controller, self._external, self._displace = robot, controller, external, displace
         self._origins = origins or Origins()
         self.targets = TargetStreams(robot.arms, streams, self._origins)
@@ -69,11 +77,11 @@ class Supervisor:
         self.skew = SkewWatch()
         self.homing = Homing(robot, controller, tools_only=external is not None)
         self._standing = None if standstill is None else StandingArms(robot, standstill, self._origins.takers)
-        self._stopped: Reason | None = None  # why it takes a reset
+        self._stopped: Reason | None = None  # Why the arms stopped until a reset.
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
         self.paused = False
-        self.events: list[Reason] = []  # for the log; its writer clears them
+        self.events: list[Reason] = []  # Events for the log. The writer of the log clears the list.
 
     @property
     def fault(self) -> Reason | None:
@@ -95,11 +103,11 @@ class Supervisor:
 
     @property
     def trusted(self) -> bool:
-        """Whether the arms move, or hold, by joint states that are good."""
+        """Whether the arms move or hold, and their joint states are good."""
         return self.phase in (Phase.ACTIVE, Phase.BRAKING) and self._watch.fault is None
 
     def arm_state(self, arm: str) -> str:
-        """The activity of one arm: following, homing or holding; or why no arm does anything."""
+        """Return the activity of one arm: following, homing or holding; or the phase in which no arm moves."""
         if self.phase is not Phase.ACTIVE:
             return str(self.phase)
         if self.homing.active:
@@ -111,15 +119,19 @@ class Supervisor:
 
     @property
     def measured(self) -> bool:
-        """Whether the arms can brake by the newest state, also those that lost their session or have it again."""
+        """Whether the newest state is good enough for the arms to brake by it, even if their session is lost."""
         return self._watch.believed
 
     def update_state(
         self, state: RobotState | Reason, now: float, passed: float = 0.0, lost: Reason | None = None
     ) -> None:
-        """A joint state, or what is wrong with it; ``passed`` [s]: see :meth:`JointWatch.observe`.
+        """Take a joint state, or the reason why there is none.
 
-        ``lost``: why arms cannot be commanded although they are measured.
+        Args:
+            state: See :meth:`JointWatch.observe`.
+            now: The time of the loop [s].
+            passed: See :meth:`JointWatch.observe` [s].
+            lost: Why the arms cannot be commanded although they are measured; None if they can.
         """
         before = self._watch.fault
         if lost is None or isinstance(state, Reason):
@@ -133,9 +145,14 @@ class Supervisor:
     def update_target(
         self, arm: str, pose: pin.SE3 | None, now: float, number: int | None = None, due: float | None = None
     ) -> Reason | None:
-        """A target in the world frame, or None for one that was no pose; returns why it is not followed, or None.
+        """Take a target of one arm; returns why it is not followed, or None.
 
-        ``number``: among its publisher's messages, where known; ``due``: when it is to be reached [s], None: at once.
+        Args:
+            arm: The arm.
+            pose: The tool's target in the world frame; None if the message was not a pose.
+            now: The time of receipt [s].
+            number: The number of the message at its publisher, if it is known.
+            due: The time at which the tool is to be there [s]; None if that is at once.
         """
         tools: list[pin.SE3] = []
         if not self.targets.follows_on(arm, now):
@@ -154,15 +171,21 @@ class Supervisor:
         return Reason(ReasonKind.ARMS_HOMING) if self.homing.active else None
 
     def tick(self, now: float, dt: float, posture: Array | None = None) -> Reference | None:
-        """Move on by ``dt`` [s]; the reference to be commanded, or None.
+        """Advance by one tick.
 
-        ``posture`` (nv,) [rad]: where joints go that the targets leave free; None: home.
+        Args:
+            now: The time of the loop [s].
+            dt: Time by which the reference advances [s].
+            posture: Where the joints go that the targets leave free (nv,) [rad]; None for the home posture.
+
+        Returns:
+            The reference for the plant; None if nothing may be commanded.
         """
         if self.phase is Phase.INACTIVE:
             if self._watch.settled(now):
                 self._activate()
             return None
-        # Also while the arms brake and are held: a state that is lost then must not drive them any more.
+        # The states are checked in every phase, because arms that brake by a measured state need a good one.
         fault = self._watch.check(now)
         if self.phase is Phase.STOPPED:
             return None
@@ -194,7 +217,7 @@ class Supervisor:
         return self._controller.step(self._external.targets(targets, self._last), dt, state.q)
 
     def _compare(self, reference: Reference, now: float) -> None:
-        """Whether the arms are where the reference is. Those that another controller moves may have none that does."""
+        """Stop the arms or start over if they are not where the reference is, or if their driver stands still."""
         away, state = self._watch.deviates(reference.q, now), self._watch.state
         standing = None if self._standing is None or state is None else self._standing.look(reference.q, state, now)
         if standing is not None:
@@ -212,7 +235,7 @@ class Supervisor:
                 self.start_over(behind, now)
 
     def _with_gravity(self, away: Reason, reference: Reference) -> Reason:
-        """The same, with the torque against gravity where that is more than the joint has."""
+        """Return the reason ``away``, or a better one if the joint is too weak to hold the arm against gravity."""
         torques = joints_that_cannot_hold(self._robot, reference.q).get(away.detail["joint"])
         if torques is None:
             return away
@@ -225,10 +248,10 @@ class Supervisor:
         self._forget_targets()
 
     def stalled(self, duration: float, now: float) -> None:
-        """The loop stood still for ``duration`` [s], and something else may have moved the arms meanwhile.
+        """Deactivate the arms after the loop stood still for ``duration`` [s].
 
-        They rest by themselves, so there is nothing to brake, and going on from the reference could be a jump. They are
-        activated anew where they rest; targets that waited are no new stream.
+        The arms have come to rest without us, and may have been moved. The old reference could be a jump. They are
+        activated anew where they rest. Targets that waited meanwhile do not begin a new stream.
         """
         if self.phase not in (Phase.ACTIVE, Phase.BRAKING):
             return
@@ -239,36 +262,36 @@ class Supervisor:
 
     @property
     def off_reference(self) -> bool:
-        """Whether a joint stands still away from the reference: maybe nothing moves it. A joint that lags moves."""
+        """Whether a joint stands still away from the reference. A joint that only lags moves."""
         state = self._watch.state
         if self.phase is not Phase.ACTIVE or self._last is None or state is None:
             return False
         return bool(((np.abs(state.q - self._last.q) > _OFF_REFERENCE) & (np.abs(state.v) < _STILL)).any())
 
     def let_go(self, fault: Reason, now: float) -> None:
-        """Nothing takes an active arm's commands, or something else than before.
+        """Command nothing more, because the receiver of an active arm's commands has gone or was replaced.
 
-        Then nothing more is commanded, not even the way to rest, which would be a jump to the new receiver.
+        Not even the certified stop is commanded: for a new receiver it would begin with a jump.
         """
         if self.phase is Phase.ACTIVE:
             self.start_over(fault, now)
             self.phase = Phase.INACTIVE
 
     def start_over(self, fault: Reason, now: float) -> None:
-        """The arms do not go where the reference goes: brake, and be activated anew where the arms are then."""
+        """Brake because the arms do not follow the reference, and activate them anew where they come to rest."""
         if self.phase is Phase.ACTIVE:
             self._watch.observe(fault, now)
             self._brake(fault)
 
     def stop(self, why: Reason) -> None:
-        """Brake, and command nothing until :meth:`reset`."""
+        """Brake, and then command nothing until :meth:`reset`."""
         self._stopped = why
         self._brake(why)
         if self.phase is Phase.INACTIVE:
             self.phase = Phase.STOPPED
 
     def reset(self) -> Reason | None:
-        """Forget faults, stop, pause and all targets. Returns why that is not possible now, or None."""
+        """Clear faults, stop, pause and all targets. Returns the reason if that is not possible now, else None."""
         if self.phase is Phase.BRAKING:
             return Reason(ReasonKind.ARMS_BRAKING)
         self._stopped, self.paused = None, False
@@ -279,7 +302,11 @@ class Supervisor:
         return None
 
     def go_home(self, goal: Array | None = None) -> Reason | None:
-        """Begin the way home, or as :meth:`Homing.begin` does. Returns why that is not possible now, or None."""
+        """Begin the way home, or the way to ``goal``. Returns the reason if that is not possible now, else None.
+
+        Args:
+            goal: See :meth:`Homing.begin`.
+        """
         if self.paused:
             return Reason(ReasonKind.CONTROLLER_PAUSED)
         if self.phase is not Phase.ACTIVE:
@@ -289,7 +316,11 @@ class Supervisor:
         return None
 
     def activate(self, state: RobotState, now: float) -> None:
-        """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`RobotError`."""
+        """Activate the arms at once, because the caller knows that they are at rest at ``state``.
+
+        Raises:
+            RobotError: If the controller cannot start there.
+        """
         self._stopped, self.paused = None, False
         self.targets.reset()
         self._watch.accept_at_once(state, now)

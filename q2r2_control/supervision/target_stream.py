@@ -1,10 +1,11 @@
-"""Which targets an arm may follow: only those of a stream that began where the arm was.
+"""Decide which targets an arm may follow: only those of a stream that began where the arm was.
 
-An arm follows a stream whose first target lies within ``engage_distance`` and ``engage_angle`` of the tool, as when an
-operator engages. One that begins elsewhere is of a sender that does not know that the arm was stopped meanwhile. It is
-refused as a whole, even where it later passes the tool. A stream begins with the first target ever, after a silence of
-``timeout``, after a reset, and where refused targets jump to the tool. Then the operator engages again while targets go
-on.
+An arm follows a stream whose first target lies within ``engage_distance`` and ``engage_angle`` of the tool, as it does
+when an operator engages. A stream that begins elsewhere comes from a sender that does not know that the arm was stopped
+meanwhile. All of it is refused, even if it passes the tool later.
+
+A new stream begins with the first target, after a silence of ``timeout``, and after a reset. It also begins when the
+targets of a refused stream jump to the tool: then the operator has engaged again.
 """
 
 from __future__ import annotations
@@ -20,25 +21,28 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.quaternions import Vector, floats_of, inverse, product, rotation_of, rotation_vector, se3_of
 from q2r2_control.types import Pose
 
-# A jump that no hand makes between two messages: a new stream begins [m], [rad].
+# A new stream begins with a jump that no hand makes between two messages [m], [rad].
 _JUMP, _TURN = 0.05, 0.25
 
 
 @dataclass(slots=True)
 class StreamSettings:
-    """The rules for a stream of targets; may be changed at run time."""
+    """The rules for a stream of targets; they may be changed at run time."""
 
     timeout: float = STREAM_TIMEOUT  # [s]
     engage_distance: float = 0.03  # [m]
     engage_angle: float = 0.3  # [rad]
-    linked: bool = True  # all arms hold when the targets of one cease, see TargetStreams
+    linked: bool = True  # Whether all arms hold when the targets of one arm cease, see TargetStreams.
 
 
 @dataclass(frozen=True, slots=True)
 class Origins:
-    """Who sends what, for messages about missing data: " from /node", or "" where that is not known.
+    """Names of senders and receivers for messages to the operator.
 
-    ``takers``: who takes an arm's commands, " /node", or "".
+    Attributes:
+        joint_states: Returns the sender of joint states as " from /node", or "" if it is not known.
+        targets: Returns the sender of an arm's targets, likewise.
+        takers: Returns the receiver of an arm's commands as " /node", or "".
     """
 
     joint_states: Callable[[], str] = lambda: ""
@@ -47,28 +51,29 @@ class Origins:
 
 
 class TargetStream:
-    """The targets of one arm. Times are receipt times [s]."""
+    """Follows or refuses the targets of one arm. All times are times of receipt [s]."""
 
     def __init__(self, settings: StreamSettings) -> None:
         self._settings = settings
-        self.pose: pin.SE3 | None = None  # followed; None: the arm holds
-        self.stamp = -math.inf  # of the last target that was a pose
-        self._last: pin.SE3 | None = None  # of the stream, followed or not; None: the next one begins a stream
+        self.pose: pin.SE3 | None = None  # The target that the arm follows; None while the arm holds.
+        self.stamp = -math.inf  # The time of the last target that was a pose.
+        # The last target, whether it was followed or not. None if the next target begins a stream.
+        self._last: pin.SE3 | None = None
 
     @property
     def following(self) -> bool:
         return self.pose is not None
 
     def reset(self) -> None:
-        """Hold; the next target begins a stream."""
+        """Let the arm hold. The next target begins a new stream."""
         self.pose = self._last = None
 
     def drop(self) -> None:
-        """Hold; the stream that goes on now will not be followed any more."""
+        """Let the arm hold. The rest of the present stream is refused."""
         self.pose = None
 
     def expire(self, now: float) -> bool:
-        """Whether the stream that was followed has just run dry."""
+        """End the stream if its last target is older than the timeout; returns whether the arm followed it."""
         if self._last is None or now - self.stamp <= self._settings.timeout:
             return False
         was_following = self.following
@@ -76,10 +81,14 @@ class TargetStream:
         return was_following
 
     def offer(self, pose: pin.SE3, tools: Sequence[pin.SE3], now: float) -> Reason | None:
-        """Offer a target; returns why it is not followed, or None.
+        """Take a target; returns why it is not followed, or None.
 
-        ``tools`` are the poses that count as the tool's: the reference's, and the measured one where it is known. An
-        arm that was pushed away from its reference is engaged where it is. An arm that follows a stream needs none.
+        Args:
+            pose: The target.
+            tools: The poses at which a stream may begin: the reference's tool, and the measured tool if it is known.
+                An arm that was pushed away from its reference is engaged where it is. An arm that follows a stream
+                already needs none.
+            now: The time of receipt [s].
         """
         self.expire(now)
         last, self._last, self.stamp = self._last, pose, now
@@ -88,8 +97,8 @@ class TargetStream:
             return None
         way, turn = (math.inf, math.inf) if last is None else apart(pose, last)
         begins = way >= _JUMP or turn >= _TURN
-        # Position and rotation may each be near another one of the poses: an operator's first target has the
-        # measured position and the commanded rotation.
+        # The position may be near one of the poses and the rotation near another one: an operator's first target has
+        # the measured position and the commanded rotation.
         ways, turns = zip(*(apart(pose, tool) for tool in tools), strict=True)
         distance, angle = min(ways), min(turns)
         if begins and distance <= self._settings.engage_distance and angle <= self._settings.engage_angle:
@@ -105,37 +114,39 @@ class TargetStream:
 
 
 def apart(a: pin.SE3, b: pin.SE3) -> tuple[float, float]:
-    """Distance [m] and angle [rad] between two poses."""
+    """Return the distance [m] and the angle [rad] between two poses."""
     difference = a.translation - b.translation
     way = float(math.sqrt(difference @ difference))
     cosine = 0.5 * (float((a.rotation * b.rotation).sum()) - 1.0)
     return way, math.acos(min(max(cosine, -1.0), 1.0))
 
 
-# Between two targets of a line: slower ones are steps, and stamps that are nearer say nothing [s].
+# Times between two targets from which a velocity is computed [s]. A shorter time is too inexact, and after a longer one
+# the targets are taken as steps.
 _SHORTEST, _LONGEST = 0.001, 0.025
-_LOOKAHEAD = 2.5  # of the time between two: one may be left out, and the next one late
-# Where the last target was not where the line led to, within this, it does not move evenly and is taken as it is.
-_EVEN, _EVEN_TURN = 1.5e-3, 0.01  # [m], [rad]
+_LOOKAHEAD = 2.5  # Periods for which a line goes on: one target may be lost, and the next one late.
+# The target is extrapolated only if the last prediction was this exact [m], [rad].
+_EVEN, _EVEN_TURN = 1.5e-3, 0.01
 
 
 class TargetExtrapolator:
-    """The targets of one stream. Times are those at which targets are due [s]."""
+    """Extrapolates the targets of one stream that moves evenly. All times are those at which targets are due [s]."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all targets; the next one begins a line."""
+        """Forget all targets."""
         self._pose: pin.SE3 | None = None
         self._due = -math.inf
         self._gap = 0.0
-        self._at: Pose | None = None  # of the pose, where it is due at a known time
-        self._twist: tuple[Vector, Vector] | None = None  # linear, and angular in the target's frame [m/s], [rad/s]
+        self._at: Pose | None = None  # The newest target as numbers, if it is due at a known time.
+        # Linear velocity, and angular velocity in the target's frame [m/s], [rad/s].
+        self._twist: tuple[Vector, Vector] | None = None
         self._even = False
 
     def put(self, pose: pin.SE3, due: float | None) -> None:
-        """A target; ``due``: when it is to be reached, None where that is not known."""
+        """Take a target. ``due`` is the time at which the tool is to be there; None if it is not known."""
         if due is None:
             self.reset()
             self._pose = pose
@@ -143,7 +154,7 @@ class TargetExtrapolator:
         last, gap, twist = self._at, due - self._due, self._twist
         self._pose, self._due, self._at = pose, due, floats_of(pose)
         if 0.0 <= gap < _SHORTEST:
-            return  # a late tick of its sender, and the next one
+            return  # Its sender was late with the last target.
         self._twist, self._even = None, False
         if last is None or not _SHORTEST <= gap <= _LONGEST:
             return
@@ -158,7 +169,7 @@ class TargetExtrapolator:
         self._gap, self._twist = gap, (linear, angular)
 
     def at(self, t: float) -> pin.SE3 | None:
-        """Where the target is at ``t`` [s]; None where there is none."""
+        """Return the target at time ``t`` [s]; None if there is no target."""
         if self._at is None or self._twist is None or not self._even:
             return self._pose
         (x, y, z), rotation = self._at

@@ -1,4 +1,4 @@
-"""The targets of all arms: who may send them, which come too late, which stream is followed, and when it has ended."""
+"""Take the targets of all arms: find late messages and second publishers, and decide which streams are followed."""
 
 from __future__ import annotations
 
@@ -11,26 +11,33 @@ import pinocchio as pin
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.supervision.target_stream import Origins, StreamSettings, TargetExtrapolator, TargetStream
 
-# The usual delay may grow this fast: clocks of two hosts drift apart by less, and a frozen sender's delay by far more.
+# The usual delay may grow by this per second. The clocks of two hosts drift apart more slowly, and the delay of a
+# frozen sender grows much faster.
 _DRIFT = 1e-3
-_CLOCK_WAS_SET = 1.0  # messages that are late for longer show a clock that was set [s]
+_CLOCK_WAS_SET = 1.0  # If all messages are late for longer than this, a clock was set [s].
 
 
 class DelayWatch:
-    """Finds messages of one topic that tell of the past, and must not move an arm. Times are receipt times [s].
+    """Finds late messages of one topic, which must not move an arm. All times are times of receipt [s].
 
-    A sender that is frozen in the middle of sending finishes when it goes on: a target of long ago leaves. A delay is
-    the time of receipt less that of sending, on clocks that may be of two hosts: only its change counts.
+    A sender that was frozen while it sent a target finishes when it wakes up, and then an old target leaves. The delay
+    is the time of receipt less the time of sending. Both may be of different hosts' clocks, so that only the change of
+    the delay counts.
     """
 
     def __init__(self, allowed: float) -> None:
-        """``allowed``: how much longer than usual a message may take [s]."""
+        """``allowed`` is how much longer than usual a message may take [s]."""
         self._allowed = allowed
-        self.usual = math.inf  # the least delay of the past, which clocks that drift apart may change [s]
+        self.usual = math.inf  # The least delay so far, corrected for the drift of the clocks [s].
         self._stamp, self._late_since = 0.0, math.inf
 
     def take(self, delay: float, now: float) -> float:
-        """How much too late [s] a message is that came at ``now`` with ``delay`` [s]; 0 also where that is unknown."""
+        """Return by how much a message is too late [s]; 0 if it is in time or if its delay is not known.
+
+        Args:
+            delay: Time of receipt less time of sending [s]; not finite if it is not known.
+            now: Time of receipt [s].
+        """
         if not math.isfinite(delay):
             return 0.0
         usual = self.usual + _DRIFT * max(now - self._stamp, 0.0)
@@ -43,26 +50,27 @@ class DelayWatch:
         return delay - usual
 
 
-# No publisher sends faster, and none is delivered later than that: a larger step is another one's [Hz], [s].
-_FASTEST, _LATEST = 2000.0, 0.1
-_ALONE = 1.0  # after the last break a stream counts as one publisher's again [s]
+# No publisher sends faster, and no message is delivered later. Numbers that grow faster are another publisher's.
+_MAX_RATE_HZ, _MAX_DELIVERY_S = 2000.0, 0.1
+_ALONE = 1.0  # Time after the last break, after which a single publisher is assumed again [s].
 
 
 class SequenceWatch:
-    """The numbers of one topic's messages. Times are receipt times [s]."""
+    """Finds a second publisher by the sequence numbers of one topic. All times are times of receipt [s]."""
 
     def __init__(self) -> None:
         self._number, self._stamp = 0, -math.inf
         self._breaks: deque[float] = deque()
 
     def take(self, number: int, now: float, timeout: float) -> int:
-        """Look at a message's number; returns the number of recent breaks, 0 for a single publisher.
+        """Look at the number of a message; returns the count of recent breaks in the sequence.
 
-        After a silence of ``timeout`` numbers may begin anywhere: a publisher that was restarted counts from one. One
-        break is a publisher that replaced another, two are two that take turns.
+        The count is 0 for a single publisher and 1 for a publisher that replaced another one. Two breaks or more show
+        two publishers that take turns. After a silence of ``timeout`` the numbers may begin anywhere, because a
+        publisher that was restarted counts from one.
         """
         passed = now - self._stamp
-        if passed <= timeout and not 0 < number - self._number <= 1 + _FASTEST * (passed + _LATEST):
+        if passed <= timeout and not 0 < number - self._number <= 1 + _MAX_RATE_HZ * (passed + _MAX_DELIVERY_S):
             self._breaks.append(now)
         self._number, self._stamp = number, now
         while self._breaks and now - self._breaks[0] > _ALONE:
@@ -71,11 +79,11 @@ class SequenceWatch:
 
 
 class TargetStreams:
-    """One :class:`TargetStream` an arm. Poses are in the world frame, times are receipt times [s].
+    """Holds one :class:`TargetStream` for each arm. Poses are in the world frame; all times are times of receipt [s].
 
-    Linked arms (:attr:`StreamSettings.linked`) are stopped together. Where a stream that is followed ceases, or is
-    dropped because two nodes publish it, every arm needs a stream that begins anew at its tool. A stream that its
-    sender ends with :meth:`release` stops its own arm only: its operator paused it.
+    Linked arms (:attr:`StreamSettings.linked`) stop together. If the targets of one arm cease, or two nodes publish
+    them, then every arm needs a new stream that begins at its tool. An operator who pauses one arm ends its stream by
+    :meth:`release`, which stops this arm only.
     """
 
     def __init__(self, arms: Iterable[str], settings: StreamSettings, origins: Origins) -> None:
@@ -83,23 +91,23 @@ class TargetStreams:
         self._streams = {arm: TargetStream(settings) for arm in arms}
         self._lines = {arm: TargetExtrapolator() for arm in self._streams}
         self._sequences = {arm: SequenceWatch() for arm in self._streams}
-        self.ended: dict[str, Reason] = {}  # arms that hold since their targets ended
+        self.ended: dict[str, Reason] = {}  # For each arm that holds because its targets ended, the reason.
         self._newly_ended: list[Reason] = []
 
     def at(self, now: float) -> dict[str, pin.SE3 | None]:
-        """The target that each arm follows at ``now`` [s], see :class:`TargetExtrapolator`; None: it holds."""
+        """Return the target that each arm follows at ``now`` [s], see :class:`TargetExtrapolator`; None if it holds."""
         return {arm: self._lines[arm].at(now) if self.follows(arm) else None for arm in self._streams}
 
     def follows(self, arm: str) -> bool:
         return self._streams[arm].following
 
     def follows_on(self, arm: str, now: float) -> bool:
-        """Whether an arm follows its targets, and a target at ``now`` [s] still belongs to them."""
+        """Return whether an arm follows its stream, and a target that arrives at ``now`` [s] belongs to this stream."""
         self._expire(arm, now)
         return self.follows(arm)
 
     def age(self, arm: str, now: float) -> float:
-        """Time since the last target of an arm that was a pose [s]."""
+        """Return the time since the last target of an arm that was a pose [s]."""
         return now - self._streams[arm].stamp
 
     def offer(
@@ -112,10 +120,16 @@ class TargetStreams:
         forbidden: Reason | None,
         due: float | None = None,
     ) -> Reason | None:
-        """Offer a target, None for one that was no pose; returns why it is not followed, or None.
+        """Take a target of one arm; returns why it is not followed, or None.
 
-        ``tools``: see :meth:`TargetStream.offer`; ``number``: of the message at its publisher, where known;
-        ``forbidden``: why no arm may follow targets now; ``due``: see :meth:`TargetExtrapolator.put`.
+        Args:
+            arm: The arm.
+            pose: The target; None if the message was not a pose.
+            tools: See :meth:`TargetStream.offer`.
+            now: The time of receipt [s].
+            number: The number of the message at its publisher, if it is known.
+            forbidden: Why no arm may follow targets now; None if arms may.
+            due: See :meth:`TargetExtrapolator.put`.
         """
         stream = self._streams[arm]
         breaks = 0 if number is None else self._sequences[arm].take(number, now, self._settings.timeout)
@@ -139,40 +153,40 @@ class TargetStreams:
         return refusal
 
     def release(self, arm: str) -> None:
-        """The sender ended the arm's stream: it holds, and the next target begins a stream."""
+        """Let the arm hold because its sender ended the stream. The next target begins a new one."""
         self._streams[arm].reset()
 
     def end(self, why: Reason) -> None:
-        """All arms hold, for a reason that is told until they follow again."""
+        """Let all arms hold, for a reason that is shown until they follow targets again."""
         self.ended |= dict.fromkeys(self._streams, why)
         self.drop()
 
     def drop(self) -> None:
-        """All arms hold, and the streams that go on now are not followed any more."""
+        """Let all arms hold, and refuse the rest of the present streams."""
         for stream in self._streams.values():
             stream.drop()
 
     def reset(self) -> None:
-        """All arms hold, and the next target of each begins a stream."""
+        """Let all arms hold. The next target of each arm begins a new stream."""
         self.ended.clear()
         for stream in self._streams.values():
             stream.reset()
 
     def expire(self, now: float) -> list[Reason]:
-        """One for each arm that followed its targets and holds since the last call because targets ceased."""
+        """End the streams that have run dry; returns a reason for each arm that holds since the last call."""
         for arm in self._streams:
             self._expire(arm, now)
         ended, self._newly_ended = self._newly_ended, []
         return ended
 
     def _expire(self, arm: str, now: float) -> None:
-        """End the arm's stream if it has run dry."""
+        """End the arm's stream if its targets have ceased."""
         if self._streams[arm].expire(now):
             self._record_end(arm, self._reason(ReasonKind.TARGETS_CEASED, arm))
             self._hold_linked(arm, self.ended[arm])
 
     def _hold_linked(self, ended: str, why: Reason) -> None:
-        """The arms that follow targets hold as well: one operator moves all, and does not expect one to go on alone."""
+        """Let the other linked arms hold as well: one operator moves all arms, and expects none to go on alone."""
         for arm, stream in self._streams.items():
             if self._settings.linked and arm != ended and stream.following:
                 stream.drop()

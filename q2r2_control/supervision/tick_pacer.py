@@ -1,13 +1,14 @@
-"""A late tick is no jump: by how much time the reference may move in one tick, and how far a pose.
+"""Keep a late tick from becoming a jump: bound the time, and the way, by which one tick moves the reference.
 
-A plant takes one command a period: a joint may do what its velocity limit allows in one period, however late the
-command comes. A tick that is late moves the reference by the time t that passed, but no joint by more than its limit V
-allows in a period h. That is  |v| t + a t^2 / 2 <= V h  for each joint, with the acceleration limit a. Else it moves by
-one period, which no joint's limit forbids. Slow motion catches up at once, and fast motion is stretched in time: the
-same path, later. A command that is clipped joint by joint would leave the path that was certified.
+A plant takes one command per period. From one command to the next a joint may move as far as its velocity limit allows
+in one period, even if the command comes late. A late tick therefore moves the reference by the time t that has passed
+if no joint then moves farther than its velocity limit V allows in a period h:  |v| t + a t^2 / 2 <= V h  for each
+joint, with its acceleration limit a. Otherwise t is reduced until this holds, but not below one period. Slow motion
+thus catches up at once. Fast motion goes along the same path, later. A command that was clipped joint by joint would
+leave the path that was certified.
 
-A plant that is told a velocity goes on at it while no command comes (``coasts``). Then the reference goes on too, by
-the time that passed, up to 0.1 s; what is commanded stays within the velocity limit.
+A plant that is given velocities goes on at the last one while no command comes (``coasts``). Then the reference goes on
+as well, by the time that has passed, up to 0.1 s. The commanded velocity stays within its limit.
 """
 
 from __future__ import annotations
@@ -20,111 +21,132 @@ import pinocchio as pin
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.types import LONGEST_DT, Array
 
-_ROUNDING = 1e-9  # of a period
+_ROUNDING = 1e-9  # Share of a period by which a tick in time may differ from it.
 
 
 class TickPacer:
-    """Turns the time since the last tick into the time that the reference moves by, and counts what was late."""
+    """Computes the time by which the reference advances in a tick, and counts late ticks."""
 
     def __init__(self, period: float, velocity_limit: Array, acceleration_limit: Array, coasts: bool = False) -> None:
-        """``period`` [s] of the commands; ``velocity_limit`` [rad/s], ``acceleration_limit`` [rad/s^2], (n,) each."""
+        """Make a pacer.
+
+        Args:
+            period: Time between two commands [s].
+            velocity_limit: Velocity limit of each joint (n,) [rad/s].
+            acceleration_limit: Acceleration limit of each joint (n,) [rad/s^2].
+            coasts: Whether the plant goes on at the last velocity while no command comes.
+        """
         self.period = period
-        self.missed_ticks = 0  # commands that were due and did not come
-        self.stretched = 0.0  # time by which the motion is late for it [s]
-        self._way = velocity_limit * period  # in one period [rad]
+        self.missed_ticks = 0  # Number of commands that were due and were not sent.
+        self.stretched = 0.0  # Time by which the motion is late because of late ticks [s].
+        self._way = velocity_limit * period  # The farthest that a joint may move in one period [rad].
         self._acceleration = acceleration_limit
         self._coasts = coasts
 
     def step(self, gap: float, v: Array) -> float:
-        """Time [s] to move by, at most the ``gap`` [s] since the last tick, from velocities ``v`` (nv,) [rad/s]."""
+        """Return the time by which the reference advances [s], at most ``gap``.
+
+        Args:
+            gap: Time since the last tick [s].
+            v: Present joint velocities of the reference (n,) [rad/s].
+        """
         if not gap > self.period * (1.0 + _ROUNDING):
             return gap if gap > 0.0 else 0.0
-        # Half a period late is jitter; from there on a command is missing.
+        # A tick that is less than half a period late is jitter. After that a command counts as missing.
         self.missed_ticks += max(round(gap / self.period) - 1, 0)
-        # The time in which each joint can have used up its way.
+        # The time after which each joint may have moved as far as it may.
         longest = 2.0 * self._way / (np.abs(v) + np.sqrt(v * v + 2.0 * self._acceleration * self._way))
         step = min(gap, LONGEST_DT if self._coasts else max(self.period, float(longest.min())))
         self.stretched += gap - step
         return step
 
 
-_SHARE = 0.02  # of what the even time is off is made up in a tick
+_CORRECTION = 0.02  # Share of the difference between even time and measured time that one tick corrects.
 
 
 class TickClock:
-    """Turns the times at which ticks ran into the times for which they count, all in [s]."""
+    """Turns the times at which ticks ran, which jitter, into evenly spaced times [s]."""
 
     def __init__(self, period: float) -> None:
         self._period = period
         self._last = -math.inf
 
     def at(self, now: float) -> float:
-        """The time for which a tick at ``now`` counts; time begins anew after over 0.1 s, and where it was set back."""
+        """Return the even time of a tick that runs at ``now`` [s].
+
+        The even times begin anew after a gap of more than 0.1 s, and after a clock that was set back.
+        """
         off = now - self._last - self._period
         if not -2.0 * self._period < off < LONGEST_DT:
             self._last = now
             return now
         missed = round(off / self._period)
         if missed >= 0:
-            self._last += (1 + missed) * self._period + _SHARE * (off - missed * self._period)
+            self._last += (1 + missed) * self._period + _CORRECTION * (off - missed * self._period)
         return self._last
 
 
-_REST = 1e-9  # slower than this is at rest [m/s, rad/s]
+_REST = 1e-9  # A pose that is slower than this is at rest [m/s, rad/s].
 
 
 class PoseRateLimiter:
-    """Follows a target within limits of velocity and acceleration, and comes to rest where there is none.
+    """Follows a target within limits of velocity and acceleration, and brakes to rest if there is no target.
 
-    Within the limits a target that moves steadily is followed without lag. The limit is on the speed relative to it, v
-    = u + e/|e| s(|e|), with u the target's own velocity, and e the lag. s is the largest speed from which full braking
-    in steps of dt still stops at it,
+    A target that moves steadily within the limits is followed without lag. The velocity is v = u + e/|e| s(|e|), where
+    u is the target's own velocity and e the vector from the pose to the target. s is the greatest speed from which full
+    braking in steps of dt still stops at the target,
 
         s(d) = min(d / dt, a (-dt/2 + sqrt(dt^2/4 + 2 d/a))).
 
-    A step of the target faster than the limit is no motion of it; then u = 0. Rotations are limited the same way by
-    the rotation vector from pose to target. All poses are in one frame. A step that comes late moves the pose no
-    farther than the velocity limits allow in one period, see :class:`TickPacer`. After a gap of more than 0.1 s it
-    begins from rest: the follower stands at the last pose.
+    If the target moves faster than the limit, it has jumped, and u is 0. Rotations are limited in the same way, by the
+    rotation vector from pose to target. All poses are in one frame. A late step moves the pose no farther than the
+    velocity limits allow in one period, see :class:`TickPacer`. After a gap of more than 0.1 s the motion begins from
+    rest, because whatever follows the pose stands at the last one.
     """
 
     def __init__(self, settings: GuardSettings, period: float) -> None:
-        """``period`` [s]: of the steps."""
+        """``period`` is the time between two steps [s]."""
         self.pose: pin.SE3 | None = None
-        self.clipped = 0  # steps in which a limit held the pose back, since the start
+        self.clipped = 0  # Number of steps since the start in which a limit held the pose back.
         self._linear, self._angular = _Limited(), _Limited()
         self._target: pin.SE3 | None = None
         self._now, self._period = -math.inf, period
         self.change(settings)
 
     def change(self, settings: GuardSettings) -> None:
-        """Other limits from the next step on. A pose that is faster than it may be now brakes at the acceleration."""
+        """Change the limits from the next step on. A pose that is too fast then brakes at the acceleration limit."""
         self.settings = settings
         self._linear.limits = settings.max_velocity, settings.max_acceleration
         self._angular.limits = settings.max_angular_velocity, settings.max_angular_acceleration
-        # A step changes the velocity first and moves by the new one for all of dt: |v| dt + a dt^2, not half of that.
+        # A step changes the velocity first and then moves by the new velocity for all of dt. The way of the
+        # acceleration is a dt^2, not half of that.
         velocities, accelerations = np.array([self._linear.limits, self._angular.limits]).T
         self._pacer = TickPacer(self._period, velocities, 2.0 * accelerations)
 
     @property
     def at_rest(self) -> bool:
-        """Whether the pose stands still, which it also does when there is none."""
+        """Whether the pose stands still; True if there is no pose."""
         return self.pose is None or (self._linear.speed < _REST and self._angular.speed < _REST)
 
     def reset(self, pose: pin.SE3 | None, now: float) -> None:
-        """Rest at ``pose``, or at none, from ``now`` [s] on."""
+        """Rest at ``pose`` from ``now`` [s] on; None if there is no pose yet."""
         self.pose, self._target, self._now = pose, None, now
         self._linear.velocity = self._angular.velocity = np.zeros(3)
 
     def step(self, target: pin.SE3 | None, now: float) -> pin.SE3 | None:
-        """The pose at ``now`` [s], nearer to ``target``; None or a target that is not finite: brake and hold.
+        """Return the pose at ``now`` [s], one step nearer to the target.
 
-        None before the first :meth:`reset`. A time that does not advance returns the same pose again.
+        Args:
+            target: The target; None, and one that is not finite, let the pose brake and hold.
+            now: The time [s]. If it does not advance, the pose stays the same.
+
+        Returns:
+            The pose; None before the first :meth:`reset`.
         """
         gap = now - self._now
         if self.pose is None or not gap > 0.0:
             return self.pose
-        if gap > LONGEST_DT:  # whatever follows has come to rest meanwhile, or is about to
+        if gap > LONGEST_DT:  # The follower has come to rest meanwhile, or will do so soon.
             self._linear.velocity = self._angular.velocity = np.zeros(3)
         dt = gap
         if gap > self._period:
@@ -136,7 +158,7 @@ class PoseRateLimiter:
             shift, turn = (motion.towards(np.zeros(3), dt)[0] for motion in (self._linear, self._angular))
         else:
             last, self._target = self._target or at, target
-            # Of a late step only the part that is moved now counts as the target's own motion; the rest is lag.
+            # In a late step only a share of the target's motion is followed now. The rest counts as lag.
             share = dt / gap
             lag, way = last.translation - at.translation, target.translation - last.translation
             shift, slow = self._linear.follow(lag + (1.0 - share) * way, share * way, dt)
@@ -150,10 +172,10 @@ class PoseRateLimiter:
 
 
 class _Limited:
-    """Velocity of a position or a rotation that is bounded together with its change."""
+    """The velocity of a position or a rotation, within limits of velocity and acceleration."""
 
     def __init__(self) -> None:
-        self.limits = 0.0, 0.0  # of velocity and acceleration
+        self.limits = 0.0, 0.0  # The limits of velocity and acceleration.
         self.velocity = np.zeros(3)
 
     @property
@@ -161,7 +183,13 @@ class _Limited:
         return math.hypot(*self.velocity)
 
     def follow(self, lag: Array, way: Array, dt: float) -> tuple[Array, bool]:
-        """The step in ``dt`` [s], ``lag`` behind a target that goes ``way``; whether it is less than asked for."""
+        """Return the step towards a moving target, and whether a limit has reduced it.
+
+        Args:
+            lag: Vector from here to the target (3,).
+            way: Motion of the target in this step (3,).
+            dt: Duration of the step [s].
+        """
         own, (fastest, a) = way / dt, self.limits
         if math.hypot(*own) > fastest:
             lag, own = lag + way, np.zeros(3)
@@ -173,7 +201,7 @@ class _Limited:
         return shift, limited or distance > fastest * dt
 
     def towards(self, wanted: Array, dt: float) -> tuple[Array, bool]:
-        """The step in ``dt`` [s] on the way to a ``wanted`` velocity, and whether that is not reached."""
+        """Return the step of ``dt`` [s] at the permitted velocity nearest to ``wanted``, and whether the two differ."""
         fastest, acceleration = self.limits
         change = _at_most(wanted, fastest) - self.velocity
         self.velocity = self.velocity + _at_most(change, acceleration * dt)

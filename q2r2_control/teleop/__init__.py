@@ -1,8 +1,8 @@
-"""From hand samples to tool targets: what one operator's hands ask the arms to do.
+"""Turn the samples of one operator's hands into targets for the tools.
 
-``teleop`` drives all arms, ``both_arms`` does what is for both and ``arm`` what is for one, by the table of
-``arm_states``. ``gate``, ``gestures`` and ``filters`` turn samples into poses and presses. ``hand_motion`` makes
-targets: ``relative`` maps a hand's motion to that of the tool, ``carry`` to that of two, and ``leash`` keeps a target
-near its tool. ``haptics`` makes the hands vibrate. ``policy_side`` lets a policy drive arms that no hand drives, by the
-time line that ``policy_motion`` makes of its actions.
+``teleop`` is the entry: one update per tick for all arms. ``both_arms`` carries out the actions for both arms, and
+``arm`` the actions for one arm, by the table in ``arm_states``. ``gate``, ``gestures`` and ``filters`` turn samples
+into poses and presses. ``hand_motion`` computes the targets: ``relative`` maps the motion of a hand to a tool,
+``carry`` to two tools, and ``leash`` keeps a target near its tool. ``haptics`` makes the hands vibrate. ``policy_side``
+lets a policy drive arms that no hand drives; ``policy_motion`` puts its actions on one time line.
 """

@@ -1,4 +1,4 @@
-"""Teleoperation of one arm: its hand, its controls, and the faults of both."""
+"""Teleoperate one arm: its hand, the hand's controls, and the faults of both."""
 
 from __future__ import annotations
 
@@ -18,30 +18,31 @@ from q2r2_control.teleop.gestures import GestureRecognizer, HeldControls, Press,
 from q2r2_control.teleop.hand_motion import ArmMeasurements, HandMotion, Shares
 from q2r2_control.types import Array, HandInputs, HandSample, Pose
 
-_SLACK = 0.05  # of a trigger's way at both ends, which not every controller reaches
-_HYSTERESIS = 0.02  # a trigger that trembles by less moves nothing
-_PICK_UP = 0.05  # how near the trigger has to come to the gripper
+# All three are shares of a trigger's whole way.
+_SLACK = 0.05  # Not every controller reaches the outermost part at either end.
+_HYSTERESIS = 0.02  # A trigger that moves by less than this is trembling.
+_PICK_UP = 0.05  # A trigger that is this near to the gripper's opening begins to move it.
 
 
 OPEN, CLOSED = 1.0, 0.0
 
 
 class AnalogGripper:
-    """The opening that a trigger asks for, 0 closed .. 1 fully open.
+    """The opening that a trigger asks for, from 0 for closed to 1 for fully open.
 
-    After a new connection, another stance or a stop, the trigger moves nothing until it has come to where the gripper
-    is, or past it. A gripper that holds something does not open because nobody presses yet.
+    After a new connection, a change of the stance or a stop, the trigger moves nothing until it reaches the opening
+    that the gripper has. A gripper that holds an object therefore does not open because nobody presses the trigger yet.
     """
 
     def __init__(self, bindings: BindingSettings, speed: float) -> None:
-        """``speed``: greatest, in openings a second."""
+        """``speed`` is the greatest change of the opening per second [1/s]."""
         bound = (binding.control for binding in bindings.bound() if binding.action is Action.GRIPPER_ANALOG)
         self._control = next(bound, None)
         self._speed, self._at = speed, -math.inf
         self.forget()
 
     def forget(self) -> None:
-        """The trigger has to come to where the gripper is before it counts."""
+        """Ignore the trigger until it reaches the opening that the gripper has."""
         self._wanted: float | None = None
         self._picked_up = False
 
@@ -58,7 +59,7 @@ class AnalogGripper:
             self._wanted = wanted
 
     def opening(self, opening: float, now: float) -> float:
-        """The opening at ``now`` [s] of a gripper that was commanded to ``opening`` at the last call."""
+        """Return the opening at ``now`` [s] of a gripper that was commanded to ``opening`` at the last call."""
         passed, self._at = now - self._at, now
         if self._wanted is None or not self._picked_up or not math.isfinite(passed):
             return opening
@@ -67,22 +68,23 @@ class AnalogGripper:
 
 
 class ArmTeleop:
-    """Teleoperation of one arm by one hand. Engaging anchors both at their current poses, see :class:`HandMotion`."""
+    """Drives one arm by one hand. Engaging anchors both of them at their present poses, see :class:`HandMotion`."""
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
         self.arm = arm
         self.state = ArmState.IDLE
         self.gripper = OPEN
-        self.offset: Array | None = None  # of the tool when the arm was last engaged (3,) [m]; None: none
+        # Distance of the measured tool from its command when the arm was last engaged (3,) [m]; None if not known.
+        self.offset: Array | None = None
         self.events: list[Event] = []
         self.motion = HandMotion(arm, settings)
         self._settings = settings
         self._gate = PoseGate(settings.gate)
         self._use_controls(settings)
-        self._inputs_stamp = -math.inf  # of the newest reading of the controls [s]
-        self.heard_of = False  # whether its hand has ever told its controls
+        self._inputs_stamp = -math.inf  # Time of the newest reading of the controls [s].
+        self.heard_of = False  # Whether a reading of the hand's controls has ever come.
         self._presses: list[Press] = []
-        self.gripped: bool | None = None  # the dead man was just held, or let go
+        self.gripped: bool | None = None  # True if the dead man was just pressed, False if it was just let go.
         self._aligned_at = 0.0
 
     def _use_controls(self, settings: TeleopSettings) -> None:
@@ -91,7 +93,13 @@ class ArmTeleop:
         self._gestures = GestureRecognizer(settings)
 
     def configure(self, settings: TeleopSettings, last: pin.SE3 | None, now: float) -> None:
-        """Other settings, of the controls only while the arm holds; an engaged one goes on from its ``last`` target."""
+        """Use other settings from now on. Settings of the controls may change only while the arm holds.
+
+        Args:
+            settings: The new settings.
+            last: The last target, from which an engaged arm goes on.
+            now: The time [s].
+        """
         if of_controls(settings) != of_controls(self._settings):
             self._use_controls(settings)
         self._settings = settings
@@ -106,9 +114,9 @@ class ArmTeleop:
         return self._gestures.chord
 
     def receive(self, sample: HandSample, now: float) -> Reason | None:
-        """Process one sample of this arm's hand; returns the fault that forbids to follow it any longer, or None."""
+        """Process one sample of this arm's hand; returns the fault for which the arm must stop, or None."""
         stamp = min(sample.inputs_stamp, now)
-        if -math.inf < stamp and self._inputs_stamp <= stamp:  # an older reading was overtaken, and says nothing
+        if -math.inf < stamp and self._inputs_stamp <= stamp:  # A newer message has overtaken an older reading.
             self._inputs_stamp, self.heard_of = stamp, True
             self._presses += self._gestures.receive(sample.inputs, stamp)
             before = self._held.actions
@@ -120,20 +128,20 @@ class ArmTeleop:
         if usable and fault is None and self._gate.pose is not None:
             self.motion.add(self._gate.pose, self._gate.stamp, now, self.state is ArmState.ENGAGED)
         if usable and self.state is ArmState.ALIGNING:
-            return None  # realigning makes the pose jump, and the arm is not following
+            return None  # Aligning makes the pose jump, and the arm does not follow it.
         return fault
 
     def watchdog(self, now: float) -> Reason | None:
-        """The fault of a stream that has stopped, or None."""
+        """Return a fault if poses or readings of the controls have ceased, else None."""
         timeout = self._settings.gate.timeout
         if self._gate.stale(now):
             return Reason.of(ReasonKind.POSE_SILENT, timeout=timeout)
-        if now - self._inputs_stamp > timeout:  # the operator could not stop the arm by a button
+        if now - self._inputs_stamp > timeout:  # The operator could not stop the arm by a button.
             return Reason.of(ReasonKind.INPUTS_SILENT, timeout=timeout)
         return None
 
     def change(self, cause: Cause, now: float, reason: Reason) -> None:
-        """Follow a cause that needs no tool, as those that engage do. Presses that began before do not count."""
+        """Change the state by a cause that does not engage the arm. Presses that began before are dropped."""
         self._gestures.cancel()
         self._presses.clear()
         self.gripped = None
@@ -142,23 +150,23 @@ class ArmTeleop:
             self._analog.forget()
 
     def record_event(self, now: float, reason: Reason) -> None:
-        """News for the operator while the state stays."""
+        """Record an event for the operator. The state stays the same."""
         self.events.append(Event(now, self.arm, self.state, self.state, reason))
 
     def take_presses(self, now: float) -> list[Press]:
-        """Gestures since the last call; those that nobody gives to :meth:`act` are lost."""
+        """Return the gestures since the last call. The caller passes them to :meth:`act`, or drops them."""
         presses, self._presses = self._presses + self._gestures.due(now), []
         if (stuck := self._gestures.take_stuck(now)) is not None:
             self.record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=stuck))
         return presses
 
     def press_to_engage(self) -> None:
-        """As if the hand had pressed; nothing happens where no press engages."""
+        """Press the button that engages, in the place of the hand. Nothing happens if no button engages."""
         bound = self._settings.bindings.bound()
         self._presses += [Press(one.control, one.gesture) for one in bound if one.action is Action.PAUSE_TOGGLE][:1]
 
     def forget(self) -> None:
-        """Drop everything received; controls count as held until they are seen released."""
+        """Forget everything that was received. A control counts again only after it was seen released."""
         self._gate.reset()
         self.motion.forget()
         self._inputs_stamp = -math.inf
@@ -169,12 +177,19 @@ class ArmTeleop:
         self.gripped = None
 
     def act(self, presses: Iterable[Press], around: ArmMeasurements, now: float, chord: bool) -> None:
-        """Change the state by this hand's gestures, and by chords; ``chord``: whether a hand holds one."""
+        """Change the state by this hand's gestures and by the alignment chord.
+
+        Args:
+            presses: The gestures of this hand.
+            around: The state of the arms.
+            now: The time [s].
+            chord: Whether either hand holds the alignment chord.
+        """
         if self.gripped is False:
             self.go(Cause.LET_GO, now, Reason(ReasonKind.DEAD_MAN_RELEASED))
         if chord:
             self._aligned_at = now
-            # The other hand's chord does not say what this one's press is.
+            # A press of this hand that is still undecided is not decided by the other hand's chord.
             if self.state is not ArmState.PAUSING or self.chord:
                 self.go(Cause.CHORD, now, Reason(ReasonKind.ALIGNMENT_CHORD))
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
@@ -188,7 +203,12 @@ class ArmTeleop:
             self.gripper = self._analog.opening(self.gripper, now)
 
     def target(self, now: float, expected: Pose | None = None) -> Pose:
-        """Of the tool of an engaged arm, or the frame that it carries, at ``now``; see :meth:`HandMotion.target`."""
+        """Return the target at ``now`` [s] of an engaged arm's tool, or of the frame of two tools that carry.
+
+        Args:
+            now: The time [s].
+            expected: See :meth:`HandMotion.target`.
+        """
         return self.motion.target(self._gate.pose, expected, self._shares(), now)
 
     def _press(self, press: Press, around: ArmMeasurements, now: float) -> None:
@@ -232,7 +252,7 @@ class ArmTeleop:
         return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
 
     def go(self, cause: Cause, now: float, reason: Reason) -> None:
-        """Follow a cause; presses that began before go on."""
+        """Change the state by ``cause``. Presses that began before go on."""
         state = next_state(self.state, cause)
         if state is not self.state:
             self.events.append(Event(now, self.arm, self.state, state, reason))
@@ -244,5 +264,5 @@ def pressed(control: str) -> Reason:
 
 
 def of_controls(settings: TeleopSettings) -> tuple[object, ...]:
-    """Settings of the hands' controls."""
+    """Return the settings of the hands' controls."""
     return settings.bindings, settings.chord_window, settings.hold_time, settings.gripper_speed

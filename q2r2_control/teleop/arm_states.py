@@ -1,4 +1,4 @@
-"""The states of an arm, and the causes that lead from one to another: the table of the code, and of the docs."""
+"""The states of an arm, and the causes that lead from one state to another. The docs show the same table."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from q2r2_control.events import REFUSALS, Event
 
 
 class ArmState(StrEnum):
-    """In every state but ENGAGED, CARRIED, POLICY and HOMING an arm holds."""
+    """The state of one arm. It holds in every state but ENGAGED, CARRIED, POLICY and HOMING."""
 
-    IDLE = "idle"  # was never engaged
+    IDLE = "idle"  # The arm was never engaged.
     ENGAGED = "engaged"
-    PAUSING = "pausing"  # stopped by a control, which may still turn out to be half a chord, or another gesture
+    PAUSING = "pausing"  # A button has stopped the arm, and may still become a chord or another gesture.
     PAUSED = "paused"
-    ALIGNING = "aligning"  # stopped by the alignment chord; anchored when the buttons are released
-    CARRIED = "carried"  # goes with the other arm, which is engaged: one hand moves both
-    POLICY = "policy"  # follows the actions of a policy
+    ALIGNING = "aligning"  # The alignment chord has stopped the arm. It is engaged when the buttons are released.
+    CARRIED = "carried"  # The arm moves with the other arm, which is engaged: one hand moves both.
+    POLICY = "policy"  # The arm follows the actions of a policy.
     HOMING = "homing"
-    LOST = "lost"  # stopped by what its operator did not press
-    STOPPED = "stopped"  # by its operator, until that is taken back
+    LOST = "lost"  # A fault has stopped the arm.
+    STOPPED = "stopped"  # The operator has stopped the arm, and has to end the stop.
 
 
 class Cause(StrEnum):
-    """The causes of a change of an arm's state, in the words of the docs."""
+    """The causes that change the state of an arm, in the words of the docs."""
 
     PAUSE_BEGINS = "the control that pauses goes down"
     PAUSE = "it was that control's gesture, and no chord"
@@ -46,7 +46,7 @@ class Cause(StrEnum):
 
 
 class Who(StrEnum):
-    """Whose state changes."""
+    """The arms whose state changes."""
 
     ARM = "the arm"
     LINKED = "both arms; with `linked: false` the arm"
@@ -54,7 +54,7 @@ class Who(StrEnum):
 
 
 class Transition(NamedTuple):
-    """One line of the table."""
+    """One row of the table."""
 
     sources: frozenset[ArmState]
     cause: Cause
@@ -63,7 +63,7 @@ class Transition(NamedTuple):
 
 
 _S = ArmState
-AT_REST = frozenset({_S.IDLE, _S.PAUSED, _S.LOST})  # may be engaged
+AT_REST = frozenset({_S.IDLE, _S.PAUSED, _S.LOST})  # An arm in one of these states may be engaged.
 HOLDING = AT_REST | {_S.STOPPED}
 FOLLOWING = frozenset({_S.ENGAGED, _S.PAUSING, _S.ALIGNING, _S.CARRIED, _S.POLICY})
 TRANSITIONS = (
@@ -90,15 +90,15 @@ _NEXT = {(source, line.cause): line.destination for line in TRANSITIONS for sour
 
 
 def next_state(state: ArmState, cause: Cause) -> ArmState:
-    """Where ``cause`` leads from ``state``; where it does not change anything, ``state``."""
+    """Return the state to which ``cause`` leads from ``state``; ``state`` itself if the cause has no effect there."""
     return _NEXT.get((state, cause), state)
 
 
 def is_refusal(event: Event) -> bool:
-    """Whether an operator wanted something that was not done: nothing changed."""
+    """Return whether the operator asked for something that was refused, so that nothing changed."""
     return event.kind in REFUSALS and event.source == event.destination
 
 
 def is_fault(event: Event) -> bool:
-    """Whether an arm stopped for another reason than what its operator pressed, or did not do what was pressed."""
+    """Return whether an arm stopped without a press of its operator, or refused a press."""
     return (event.destination == ArmState.LOST and event.source != event.destination) or is_refusal(event)

@@ -1,4 +1,4 @@
-"""Actions for both arms, whichever hand asks: the stop, the way home, carrying, the recording."""
+"""Carry out the actions for both arms, for which either hand may ask: stop, way home, carrying, recording."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ _OUTCOMES = {Action.RECORD_FAILURE: ReasonKind.EPISODE_FAILED, Action.RECORD_SUC
 
 
 class EpisodeMarks:
-    """Turns the controls of the recording into events, which are in the recording as all events are."""
+    """Turns presses that mark episodes into events. The recording has these events, as it has all events."""
 
     actions = (Action.RECORD_DISCARD, *_OUTCOMES, Action.RECORD_TOGGLE, Action.RECORD_MARK)
 
     def __init__(self) -> None:
-        self.recorded = False  # whether there is a recording
-        self.open = False  # whether an episode has begun and not ended
-        self.any = False  # whether there is an episode that could be discarded
+        self.recorded = False  # Whether the run is recorded.
+        self.open = False  # Whether an episode has begun and not ended.
+        self.any = False  # Whether there is an episode that could be discarded.
 
     def apply(self, action: Action) -> ReasonKind:
-        """Follow a control; returns the event's kind. An episode's outcome ends it."""
+        """Take a press of the operator; returns the kind of the event. Success and failure end the episode."""
         if not self.recorded:
             return ReasonKind.NO_RECORDING
         if action is Action.RECORD_MARK:
@@ -48,7 +48,7 @@ class EpisodeMarks:
         return ReasonKind.EPISODE_BEGINS if self.open else ReasonKind.EPISODE_ENDS
 
     def follow(self, kind: ReasonKind) -> None:
-        """Follow an event that happened elsewhere."""
+        """Take an event that somebody else has recorded."""
         if kind in _OUTCOMES.values():
             self.open = False
         elif kind in (ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED):
@@ -59,10 +59,10 @@ _Poses = Mapping[str, pin.SE3]
 
 
 class CarryMode:
-    """One hand moves both tools. It ends for both arms at once, or the one would pull at the object that both hold."""
+    """One hand moves both tools, which hold one object. Both arms stop together, so that neither pulls at it."""
 
     def __init__(self, leader: ArmTeleop, follower: ArmTeleop, tools: _Poses, now: float) -> None:
-        """``tools``: see :class:`CarriedTools`."""
+        """Begin to carry at time ``now`` [s]. See :class:`CarriedTools` for ``tools``."""
         self.leader, self._follower = leader, follower
         self._tools = CarriedTools(tools)
         self._keeper = RelationKeeper()
@@ -76,14 +76,17 @@ class CarryMode:
         return self.leader.state is ArmState.ENGAGED and self._follower.state is ArmState.CARRIED
 
     def end(self, now: float, reason: Reason) -> None:
-        """The arm that still follows holds."""
+        """Let both arms hold."""
         for arm in (self.leader, self._follower):
             arm.change(Cause.CARRY_ENDS, now, reason)
 
     def targets(self, now: float, expected: _Poses, at_once: _Poses) -> dict[str, pin.SE3]:
-        """Of both arms, in the world frame, as the arguments.
+        """Return the targets of both arms. All poses are in the world frame.
 
-        ``expected``: the tools by the controller's reference. ``at_once``: the same at one moment, or empty.
+        Args:
+            now: The time [s].
+            expected: The tools in the controller's reference.
+            at_once: The same tools, if both are of one moment; else empty.
         """
         tools, leader, follower = self._tools, self.leader.arm, self._follower.arm
         slowest = tools.slowest(tools.frames_of(expected))
@@ -102,7 +105,7 @@ class BothArms:
     def __init__(self, settings: TeleopSettings, names: Iterable[str]) -> None:
         self.arms = {name: ArmTeleop(name, settings) for name in names}
         self.carry: CarryMode | None = None
-        self.asks_home: str | None = None  # the arm whose hand asked for the way home; None: no hand did
+        self.asks_home: str | None = None  # The arm whose hand asked for the way home; None if no hand did.
         self.marks = EpisodeMarks()
         self.use(settings)
         self.assign_hands(settings.stance)
@@ -120,16 +123,16 @@ class BothArms:
         return all(arm.state in states for arm in self.arms.values())
 
     def change(self, cause: Cause, now: float, reason: Reason) -> None:
-        """Follow a cause that is for every arm."""
+        """Change the state of every arm by ``cause``."""
         for arm in self.arms.values():
             arm.change(cause, now, reason)
 
     def act(self, around: ArmMeasurements, now: float) -> dict[str, list[Press]]:
-        """Do what the hands ask for both arms; returns the presses that are left for each."""
+        """Carry out the actions for both arms; returns, for each arm, the presses that concern this arm only."""
         presses = {name: arm.take_presses(now) for name, arm in self.arms.items()}
         grips = any(arm.gripped or arm.chord for arm in self.arms.values())
         if not grips and not any(presses.values()):
-            return presses  # as at most ticks
+            return presses
         for action in self.marks.actions:
             if (name := self._asked(presses, action)) is not None:
                 self.arms[name].record_event(now, Reason(self.marks.apply(action)))
@@ -155,7 +158,13 @@ class BothArms:
         return {name: [] for name in self.arms}
 
     def home(self, now: float, asked_by: str | None, problem: Reason | None = None) -> None:
-        """Both arms shall go home, with the hand of the arm ``asked_by``; a ``problem`` becomes an event."""
+        """Let both arms go home, or record an event that says why they do not.
+
+        Args:
+            now: The time [s].
+            asked_by: The arm whose hand asks for it; None if a program does.
+            problem: Why the arms may not go home, if the caller knows a reason.
+        """
         if self.any_in(ArmState.ALIGNING):
             problem = problem or Reason(ReasonKind.ALIGNING)
         if self.any_in(ArmState.STOPPED):
@@ -172,13 +181,13 @@ class BothArms:
             arm.record_event(now, Reason(ReasonKind.NOT_HOMING, cause=problem))
 
     def end_carry(self, now: float, reason: Reason) -> None:
-        """If two arms carry, both hold."""
+        """End carrying, if two arms carry. Both arms hold then."""
         if self.carry is not None:
             self.carry.end(now, reason)
         self.carry = None
 
     def _take_up(self, arm: ArmTeleop, around: ArmMeasurements) -> Anchor | Reason:
-        """Where an arm's tool is when it begins to be carried, or why it may not be."""
+        """Return the tool's pose at which an arm begins to carry, or the reason why it may not."""
         if arm.state is not ArmState.ENGAGED:
             if arm.state not in AT_REST:
                 return Reason.of(ReasonKind.OTHER_ARM_BUSY, state=str(arm.state))
@@ -214,7 +223,7 @@ class BothArms:
         return None
 
     def _asked(self, presses: Mapping[str, Sequence[Press]], action: Action) -> str | None:
-        """The arm whose hand asked for ``action``, or None."""
+        """Return the arm whose hand asked for ``action``, or None."""
         for name, listed in presses.items():
             if any(self._bindings.action_of(*press) is action for press in listed):
                 return name

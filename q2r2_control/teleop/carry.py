@@ -1,8 +1,9 @@
-"""Two tools that one hand moves as one body, about the point between them: two arms that carry one box.
+"""Let one hand move two tools as one body, as two arms do that carry one box.
 
-The hand is anchored to a frame in the middle between both tools, turned as the world, and both tools keep their poses
-in it. Nothing jumps when it begins, and the targets' relation is exact while it lasts. Where an arm is held up, the
-frame waits for it on a leash that is shorter than that of one arm. The load is then neither torn nor crushed.
+The hand is anchored to a frame in the middle between both tools. The axes of this frame are those of the world at the
+beginning, and both tools keep their poses in it. Nothing jumps at the beginning, and the relation between both targets
+is exact. If an arm is held up, the frame waits for it, on a leash that is shorter than the leash of one arm. The load
+is then neither torn nor crushed.
 """
 
 from __future__ import annotations
@@ -16,48 +17,51 @@ from q2r2_control.quaternions import Vector, floats_of, se3_of
 from q2r2_control.teleop.leash import Workspace
 from q2r2_control.types import LONGEST_DT, Array, Pose, pose_of
 
-_GAIN = 20.0  # of keeping the relation [1/s]: a first-order loop is stable below pi/(2 T), late by T, here 0.07 s
-_MOST = 0.01, 0.05  # that it shifts a target by [m], [rad]
+# Gain of the loop that keeps the relation [1/s]. A first-order loop with the delay T, here 0.07 s, is stable below
+# pi / (2 T).
+_GAIN = 20.0
+_MAX_SHIFT = 0.01, 0.05  # By how much the loop shifts a target at most [m], [rad].
 
 
 class CarriedTools:
-    """The tools of both arms, as parts of one frame that moves."""
+    """The tools of both arms as parts of one moving frame."""
 
     def __init__(self, tools: Mapping[str, pin.SE3]) -> None:
-        """``tools``: where both are now, or are asked to be; world frame."""
+        """``tools`` are the present poses of both tools, measured or commanded, in the world frame."""
         middle = np.mean([tool.translation for tool in tools.values()], axis=0)
-        self.frame = pose_of(np.eye(3), middle)  # where it is asked to be
+        self.frame = pose_of(np.eye(3), middle)  # The target of the frame.
         self._in_frame = {arm: self.frame.actInv(tool) for arm, tool in tools.items()}
 
     def frames_of(self, tools: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
-        """Where each of ``tools`` has the frame."""
+        """Return, for each of ``tools``, the pose of the frame that belongs to the tool's pose."""
         return {arm: tools[arm] * placed.inverse() for arm, placed in self._in_frame.items() if arm in tools}
 
     def slowest(self, frames: Mapping[str, pin.SE3]) -> pin.SE3 | None:
-        """Of frames that disagree the one that is farther from where it is asked to be."""
+        """Return the one of ``frames`` that is farthest from the target of the frame."""
         return max(frames.values(), key=self._away, default=None)
 
     def tool_at(self, arm: str, frame: pin.SE3) -> pin.SE3:
-        """One tool, with the frame at ``frame``."""
+        """Return the pose of one tool if the frame is at ``frame``."""
         return frame * self._in_frame[arm]
 
     def at(self, frame: pin.SE3) -> dict[str, pin.SE3]:
-        """Both tools, with the frame at ``frame``."""
+        """Return the poses of both tools if the frame is at ``frame``."""
         return {arm: self.tool_at(arm, frame) for arm in self._in_frame}
 
     def _away(self, frame: pin.SE3) -> float:
-        """How far a frame is, as a tool feels it [m]."""
+        """Return the distance of a frame from its target, as the distance at the farther tool [m]."""
         lever = max(float(np.linalg.norm(tool.translation)) for tool in self._in_frame.values())
         turn = float(np.linalg.norm(pin.log3(frame.rotation @ self.frame.rotation.T)))
         return float(np.linalg.norm(frame.translation - self.frame.translation)) + lever * turn
 
 
 class RelationKeeper:
-    """Moves the frame of the tool that is carried so that both tools keep their relation, not only their targets.
+    """Shifts the target of the carried tool so that the tools themselves keep their relation, not only their targets.
 
-    Each arm follows its target some millimetres late, in its own way. The carried one's frame is shifted by c,
+    Each arm lags behind its target by some millimetres, each by others. The frame of the carried tool is shifted by c
+    with the first-order loop
 
-        dc/dt = g (frame of the leading tool - frame of the carried tool),  |c| bounded:  a loop of first order.
+        dc/dt = g (frame of the leading tool - frame of the carried tool),  |c| bounded.
     """
 
     def __init__(self) -> None:
@@ -65,16 +69,22 @@ class RelationKeeper:
         self._now: float | None = None
 
     def update_shift(self, leading: pin.SE3, carried: pin.SE3, now: float) -> None:
-        """Where the controller's reference has the frame of either tool at ``now`` [s], world frame."""
+        """Update the shift.
+
+        Args:
+            leading: Frame that belongs to the leading tool in the controller's reference.
+            carried: Frame that belongs to the carried tool there.
+            now: The time [s].
+        """
         dt = 0.0 if self._now is None else min(max(now - self._now, 0.0), LONGEST_DT)
         self._now = now
         gain = min(_GAIN * dt, 1.0)
-        self._shift = _at_most(self._shift + gain * (leading.translation - carried.translation), _MOST[0])
+        self._shift = _at_most(self._shift + gain * (leading.translation - carried.translation), _MAX_SHIFT[0])
         turn = pin.log3(pin.exp3(gain * pin.log3(leading.rotation @ carried.rotation.T)) @ self._turn)
-        self._turn = pin.exp3(_at_most(turn, _MOST[1]))
+        self._turn = pin.exp3(_at_most(turn, _MAX_SHIFT[1]))
 
     def frame(self, asked: pin.SE3) -> pin.SE3:
-        """The frame for the carried tool, where ``asked`` is that of the leading one."""
+        """Return the target of the carried tool's frame, if ``asked`` is that of the leading tool's frame."""
         return pose_of(self._turn @ asked.rotation, asked.translation + self._shift)
 
 
@@ -84,19 +94,22 @@ def _at_most(vector: Array, length: float) -> Array:
 
 
 class CarriedWorkspace:
-    """Keeps both tools in the boxes of their arms, by moving the frame."""
+    """Keeps both tools in the workspaces of their arms, by moving the frame."""
 
     def __init__(self, tools: CarriedTools, boxes: Mapping[str, Workspace]) -> None:
         self._tools, self._boxes = tools, boxes
         self.reset()
 
     def reset(self) -> None:
-        self.slip = 0.0  # how much of the hand's way was not made [m]
+        self.slip = 0.0  # The part of the hand's way that the frame has not followed [m].
         for box in self._boxes.values():
             box.reset()
 
     def hold(self, frame: Pose) -> Vector | None:
-        """Where the frame that is asked to be at ``frame`` may be; None: there. See :meth:`Workspace.hold`."""
+        """Return the permitted position of a frame whose target is ``frame``; None if ``frame`` itself is permitted.
+
+        See :meth:`Workspace.hold`.
+        """
         shift = np.zeros(3)
         tools = {arm: floats_of(tool) for arm, tool in self._tools.at(se3_of(frame)).items()}
         for arm, box in self._boxes.items():

@@ -1,9 +1,9 @@
-"""From irregular samples of a trembling hand to a smooth pose at every control tick, with one known delay.
+"""Turn the irregular samples of a trembling hand into a smooth pose at every control tick, with one known delay.
 
 :class:`Interpolator` plays the samples back a constant time after their receipt, so that the control loop sees straight
-lines instead of 13 ms steps. :class:`OneEuro` then takes the tremor out, and :class:`RestingPose` the noise of a hand
-that rests. Everything is in seconds and takes the dt of each tick, so neither the headset's rate nor the loop's changes
-what the operator feels. Rotations are filtered by their logarithm, so q and -q are the same.
+lines instead of steps every 13 ms. :class:`OneEuro` then removes the tremor, and :class:`RestingPose` the noise of a
+hand at rest. All parameters are in seconds. The operator therefore feels the same at every rate of the headset and of
+the loop. Rotations are filtered by their rotation vectors, for which q and -q are the same.
 """
 
 from __future__ import annotations
@@ -16,35 +16,42 @@ from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.quaternions import IDENTITY, Quaternion, Vector, normalized, turn_between, turned_by
 from q2r2_control.types import Pose
 
-_MIN_SPACING = 0.005  # closer samples are merged: over so short a time receipt jitter would look like speed [s]
-_USUAL_PERIOD = 1.0 / 75.0  # of a headset's samples, until they are known [s]
-_PHASE_SHARE, _PERIOD_SHARE = 0.2, 0.02  # of a sample's jitter that its time, and the period, follow
-_CATCH_UP = 0.5  # of a gap in the stream, the part in which what was missed is made up for
+_MIN_SPACING = 0.005  # Samples that are closer are merged, because the jitter of receipt would look like speed [s].
+_USUAL_PERIOD = 1.0 / 75.0  # Period of a headset's samples that is assumed until it is measured [s].
+_PHASE_SHARE, _PERIOD_SHARE = 0.2, 0.02  # Shares of a sample's jitter by which its time, and the period, are corrected.
+_CATCH_UP = 0.5  # After a gap in the stream, the missed motion is made up within this share of the gap.
 
 
 class Interpolator:
-    """Plays samples back ``delay`` seconds after their receipt, straight from each to the next.
+    """Plays samples back ``delay`` seconds after their receipt, on straight lines from sample to sample.
 
-    A headset measures evenly, and its samples come unevenly. A delay-locked loop (Adriaensen 2005) takes the jitter out
-    of their times, which would look like speed. It starts anew where a sample comes half a period early or late.
-    When no sample comes for longer than ``delay``, it rests at the newest: nothing is extrapolated. It then
-    makes up for the motion that it missed within a part of the gap, and not at once.
+    A headset measures at even times, and its samples arrive at uneven times. The jitter would look like speed. A
+    delay-locked loop (Adriaensen 2005) removes it. The loop starts anew when a sample is half a period early or late.
+    If no sample comes for longer than ``delay``, the output rests at the newest one, because nothing is extrapolated.
+    The motion that was missed is then made up within a part of the gap, and not at once.
     """
 
     def __init__(self, delay: float, period: float = _USUAL_PERIOD) -> None:
-        """``period``: of the samples, until it is known [s]."""
+        """Make an interpolator.
+
+        Args:
+            delay: From the receipt of a sample until it is played back [s].
+            period: Of the samples, until it is measured [s].
+        """
         self.delay, self._usual_period = delay, period
         self._knots: deque[tuple[float, Vector, Quaternion]] = deque()
-        self._velocity: tuple[Vector, Vector] | None = None  # from the first knot to the second; None: not known yet
+        # The velocity from the first knot to the second one; None until it is needed.
+        self._velocity: tuple[Vector, Vector] | None = None
 
     def reset(self, position: Vector, rotation: Quaternion, now: float) -> None:
         self._knots, self._velocity = deque([(now - self.delay, position, rotation)]), None
-        self._stamp, self._caught_up = now, -math.inf  # of the last sample, and the end of the way after a gap [s]
-        self._even = -math.inf  # when the last sample was measured, but for a constant [s]
+        # The time of the last sample, and the time at which the motion missed in a gap is made up [s].
+        self._stamp, self._caught_up = now, -math.inf
+        self._even = -math.inf  # The time at which the last sample was measured, plus a constant [s].
         self._period = self._usual_period
 
     def add(self, position: Vector, rotation: Quaternion, stamp: float, now: float) -> None:
-        """Append a sample received at ``stamp`` <= ``now`` [s]; ``reset`` has to come first."""
+        """Append a sample that was received at ``stamp`` <= ``now`` [s], after :meth:`reset`."""
         knots, self._velocity = self._knots, None
         gap, self._stamp = stamp - self._stamp, stamp
         if gap > 2.0 * self.delay:
@@ -56,12 +63,15 @@ class Interpolator:
         self._even = stamp
         while len(knots) > 1 and stamp - knots[-1][0] < _MIN_SPACING:
             knots.pop()
-        # A sample in time is reached after the whole delay; so is a late one, without a faster motion.
+        # The output reaches every sample after the whole delay, also a late one, so that it need not move faster.
         earliest = max(self._caught_up, knots[0][0] + max(self.delay / 2.0, _MIN_SPACING))
         knots.append((max(stamp, earliest), position, rotation))
 
     def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
-        """The position and rotation played back at ``now`` [s], which never goes back, and the turn since the last."""
+        """Return the position, the rotation, and the rotation vector since the last call, at ``now`` [s].
+
+        ``now`` must not go back.
+        """
         playhead, knots = now - self.delay, self._knots
         last, passed = knots[0][2], False
         while len(knots) > 1 and knots[1][0] <= playhead:
@@ -78,7 +88,7 @@ class Interpolator:
             x, y, z = x + dt * linear[0], y + dt * linear[1], z + dt * linear[2]
             turn = dt * angular[0], dt * angular[1], dt * angular[2]
             rotation = turned_by(rotation, turn)
-        # The next line starts here, so a sample that replaces another cannot make the output step.
+        # The next line starts here, so that a sample that replaces another one makes no step of the output.
         knots[0] = playhead, (x, y, z), rotation
         return (x, y, z), rotation, turn_between(last, rotation) if passed else turn
 
@@ -86,15 +96,16 @@ class Interpolator:
 class OneEuro:
     """One-Euro filter (Casiez, Roussel, Vogel, CHI 2012) of a vector or a rotation, with the same delay at every speed.
 
-    The cutoff rises with speed: f = min_cutoff + beta |v|. The original lags by tau = 1 / (2 pi f), thus by an amount
-    that changes along the path and bends it. Here the input is led by (tau - delay) v, v being the velocity estimate
-    that the filter has anyway. At any constant velocity the output lags by exactly ``delay``. Since tau v <= 1 / (2 pi
-    beta), the lead is bounded, and so is what it adds when the hand stops suddenly.
+    The cutoff rises with speed: f = min_cutoff + beta |v|. The original filter lags by tau = 1 / (2 pi f). Its delay
+    changes along a path, which bends the path. Here the input is moved ahead by (tau - delay) v, where v is the
+    filter's own estimate of the velocity. At constant velocity the output then lags by exactly ``delay``. This lead is
+    bounded, since tau v <= 1 / (2 pi beta), and so is the overshoot when the hand stops suddenly.
     """
 
     def __init__(self, min_cutoff: float, beta: float, derivative_cutoff: float, delay: float) -> None:
         self.delay = delay
-        self._least_rate, self._rate_per_speed = 2.0 * math.pi * min_cutoff, 2.0 * math.pi * beta  # of 1 / tau
+        # The rate 1 / tau is the first number plus the second one times the speed.
+        self._least_rate, self._rate_per_speed = 2.0 * math.pi * min_cutoff, 2.0 * math.pi * beta
         self._derivative_tau = 1.0 / (2.0 * math.pi * derivative_cutoff)
         self.reset()
 
@@ -102,10 +113,14 @@ class OneEuro:
         self._velocity = (0.0, 0.0, 0.0)
 
     def correction(self, error: Sequence[float], step: Sequence[float], dt: float) -> Vector:
-        """The output's change over a tick of ``dt`` > 0 [s].
+        """Return the change of the output in a tick.
 
-        ``error`` is input minus output before the tick, ``step`` input minus previous input; rotation vectors for
-        rotations. Backward Euler: stable for every dt, and the lag at constant velocity is exact for any constant dt.
+        The integration is a backward Euler step. It is stable for every dt, and exact at constant velocity and dt.
+
+        Args:
+            error: Input minus output before the tick, as a rotation vector for rotations.
+            step: Input minus the input of the tick before, likewise.
+            dt: Duration of the tick, above 0 [s].
         """
         x, y, z = self._velocity
         rate = 1.0 / (self._derivative_tau + dt)
@@ -117,9 +132,10 @@ class OneEuro:
 
 
 class PoseFilter:
-    """Interpolation and One-Euro filter of one hand's pose.
+    """Interpolates and filters the pose of one hand.
 
-    Constant velocity comes out :attr:`FilterSettings.delay` late; a change within about 1 / (2 pi derivative_cutoff).
+    At constant velocity the output lags by :attr:`FilterSettings.delay`. A change of velocity needs about
+    1 / (2 pi derivative_cutoff) to come through.
     """
 
     def __init__(self, settings: FilterSettings) -> None:
@@ -130,7 +146,7 @@ class PoseFilter:
         self.reset(((0.0, 0.0, 0.0), IDENTITY), 0.0)
 
     def reset(self, pose: Pose, now: float) -> None:
-        """Rest at ``pose``; earlier samples are forgotten."""
+        """Rest at ``pose`` from ``now`` [s] on, and forget earlier samples."""
         self._out = pose
         self._in, rotation = pose
         self._interpolator.reset(self._in, rotation, now)
@@ -140,12 +156,12 @@ class PoseFilter:
 
     def add(self, pose: Pose, stamp: float, now: float) -> None:
         """Add a sample received at ``stamp`` [s]."""
-        # Products of quaternions add rounding up; a few from one sample to the next do not matter.
+        # Rounding errors of quaternion products add up. The few products between two samples do not matter.
         self._out = self._out[0], normalized(self._out[1])
         self._interpolator.add(*pose, stamp, now)
 
     def at(self, now: float) -> Pose:
-        """The filtered pose at ``now`` [s]; a time that does not advance returns the same pose again."""
+        """Return the filtered pose at ``now`` [s]; the same pose again if the time does not advance."""
         dt = now - self._now
         if dt <= 0.0:
             return self._out
@@ -162,34 +178,36 @@ class PoseFilter:
         return self._out
 
 
-# A hand rests while the mean of its newest samples is this near to that of all since it came to rest. In addition no
-# sample is farther from it than a headset's noise makes one in thousands [m], [rad]. With more noise both bounds grow.
+# A hand is at rest if two conditions hold. The mean of its newest samples is this near to the mean of all samples since
+# it came to rest. No sample is farther from that mean than the noise of a headset makes one in thousands [m], [rad].
+# Both bounds grow if more noise is measured.
 _NEWEST, _DRIFTED, _FAR = 8, (0.35e-3, 2e-3), (1.0e-3, 5e-3)
-_NOISE, _NOISE_SAMPLES = (0.2e-3, 1.0e-3), (4, 50)  # per axis [m], [rad]; and for how many it counts, at first and most
-_LONGEST = 150  # samples of the mean: two seconds of a 75 Hz headset
-_TRUSTED = 10, 50  # the mean begins to count from so many samples on, and is all that counts from so many
-_LEAVING = 0.05  # the mean of a hand that moves again counts for so long, less and less [s]
-_TURNED = 0.3  # farther from its origin another rest begins: only short rotation vectors can be averaged [rad]
+_NOISE = 0.2e-3, 1.0e-3  # The noise of one axis that is assumed until it is measured [m], [rad].
+_NOISE_SAMPLES = 4, 50  # Weight of the assumed noise, and greatest weight of the measured noise, in samples.
+_LONGEST = 150  # Greatest number of samples in the mean: two seconds of a headset at 75 Hz.
+_TRUSTED = 10, 50  # Numbers of samples from which the mean begins to count, and from which it counts fully.
+_LEAVING = 0.05  # When the hand moves again, the weight of the mean falls to zero within this time [s].
+_TURNED = 0.3  # After a turn by more than this a new rest begins, since only short rotation vectors average well [rad].
 
-_Sample = Sequence[float]  # position [m] and rotation vector from the origin [rad]; a few floats cost less than NumPy
+_Sample = Sequence[float]  # Position [m] and rotation vector from the origin [rad]. Six floats cost less than NumPy.
 
 
 class RestingPose:
-    """Draws a filtered pose towards the mean of a hand that rests."""
+    """Draws the filtered pose of a hand at rest towards the mean of its samples."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        self._origin = IDENTITY  # rotations are told as vectors from here
+        self._origin = IDENTITY  # The rotation from which rotation vectors are measured.
         self._newest: deque[_Sample] = deque(maxlen=_NEWEST)
         self._mean: _Sample = (0.0,) * 6
-        self._count = 0  # samples that are known of this rest
-        self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # the mean that is drawn to
-        self._leaving = False  # that mean is of a rest that is over
+        self._count = 0  # Number of samples of this rest.
+        self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # The mean towards which the pose is drawn.
+        self._leaving = False  # Whether that mean belongs to a rest that is over.
         self._share, self._now = 0.0, 0.0
         self._last: deque[_Sample] = deque(maxlen=2)
-        self._noise, self._noise_count = [one**2 for one in _NOISE], _NOISE_SAMPLES[0]  # variance of an axis
+        self._noise, self._noise_count = [one**2 for one in _NOISE], _NOISE_SAMPLES[0]  # The variance of one axis.
 
     def add(self, pose: Pose) -> None:
         position, rotation = pose
@@ -215,13 +233,13 @@ class RestingPose:
                 self._leave(newest, _NEWEST)
 
     def begin(self, newest: Pose, now: float) -> Pose:
-        """Where the hand is at ``now`` [s]: at the mean if it rests, else at its ``newest`` pose."""
+        """Return the pose of the hand at ``now`` [s]: the mean if the hand is at rest, else its ``newest`` pose."""
         self._now, self._leaving, self._share = now, False, self._trusted
         self._held = self._mean_pose() if self._share > 0.0 else newest
         return self._held
 
     def draw(self, pose: Pose, now: float) -> Pose:
-        """The filtered ``pose`` at ``now`` [s], drawn towards the mean as far as that is to be trusted."""
+        """Return the filtered ``pose`` at ``now`` [s], drawn towards the mean by the weight of the mean."""
         passed, self._now = max(now - self._now, 0.0) / _LEAVING, now
         if self._leaving:
             self._share = max(self._share - passed, 0.0)
@@ -229,7 +247,7 @@ class RestingPose:
         else:
             self._share = min(self._trusted, self._share + passed)
         if self._share == 0.0:
-            return pose  # as while a hand moves
+            return pose  # The hand moves.
         if not self._leaving:
             self._held = self._mean_pose()
         share, ((x, y, z), rotation), ((to_x, to_y, to_z), to) = self._share, pose, self._held
@@ -247,7 +265,10 @@ class RestingPose:
         return (x, y, z), turned_by(self._origin, (a, b, c))
 
     def _measure_noise(self, sample: _Sample) -> None:
-        """From second differences, which steady motion has none of, and white noise six times its variance."""
+        """Measure the noise by second differences, which are zero in steady motion.
+
+        The mean square of second differences of white noise is six times its variance.
+        """
         if len(self._last) == 2:
             self._noise_count = min(self._noise_count + 1, _NOISE_SAMPLES[1])
             bends = [new - 2.0 * last + before for before, last, new in zip(*self._last, sample, strict=True)]

@@ -1,4 +1,4 @@
-"""Checks every hand pose before it may move an arm."""
+"""Check every pose of a hand before it may move an arm."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.quaternions import Quaternion
 from q2r2_control.types import HandSample, Pose
 
-_MAX_COORDINATE = 1e6  # no tracking system reaches as far [m]
-_QUATERNION_LENGTHS = (1e-6, 1e6)  # outside this range it is not a rotation with rounding errors
-_SPEED_WINDOW = 0.05  # of a speed, at least: messages that a network held up come within a millisecond [s]
+_MAX_COORDINATE = 1e6  # No tracking system reaches as far [m].
+_QUATERNION_LENGTHS = (1e-6, 1e6)  # A quaternion of another length is no rotation with rounding errors.
+# Least time over which a speed is measured [s]. Messages that a network held up arrive within a millisecond.
+_SPEED_WINDOW = 0.05
 
 
 class PoseGate:
     """Accepts usable poses of one hand, and gives the reason against the others.
 
-    Time is receipt time: a stamp later than ``now`` counts as ``now``, so that it cannot disable the watchdog. A sample
-    with an older stamp than the last was overtaken by a newer message, and is ignored.
+    All times are times of receipt. A stamp later than ``now`` counts as ``now``, so that it cannot disable the
+    watchdog. A sample that is older than the last one was overtaken by a newer message, and is ignored.
     """
 
     def __init__(self, settings: GateSettings) -> None:
@@ -30,22 +31,28 @@ class PoseGate:
         self.reset()
 
     def reset(self) -> None:
-        self.pose: Pose | None = None  # the newest, in the input's frame; None: there is none, or it was not usable
-        self.stamp = -math.inf  # receipt time of the newest pose [s], usable or not; -inf before the first
+        # The newest pose, in the input's frame; None if there is none, or if it was not usable.
+        self.pose: Pose | None = None
+        self.stamp = -math.inf  # Time of the newest pose, whether it was usable or not [s].
         self._problem: Reason | None = None
-        self._way: deque[tuple[float, Pose]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
+        self._way: deque[tuple[float, Pose]] = deque()  # Recent poses. The first one is about _SPEED_WINDOW old.
 
     @property
     def problem(self) -> Reason | None:
-        """Why no arm may be anchored to the newest pose, None where it may."""
+        """Why no arm may be anchored to the newest pose; None if one may."""
         return None if self.pose is not None else self._problem or Reason(ReasonKind.NO_POSE)
 
     def stale(self, now: float) -> bool:
-        """Whether no pose was received for ``timeout``."""
+        """Return whether no pose was received for longer than ``timeout``."""
         return now - self.stamp > self.settings.timeout
 
     def receive(self, sample: HandSample, now: float) -> tuple[bool, Reason | None]:
-        """Whether a sample's pose is new and may be anchored to, as after a jump, and why not to follow it, or None."""
+        """Judge the pose of a sample.
+
+        Returns:
+            Whether the pose is new and usable, so that an arm may be anchored to it; and the reason why an engaged arm
+            must not follow it, or None. After a jump both are given: the new place may be an anchor.
+        """
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):
             return False, Reason(ReasonKind.POSE_WITHOUT_STAMP)
@@ -59,7 +66,7 @@ class PoseGate:
             self._way.clear()
             return False, self._problem or Reason(ReasonKind.POSE_UNUSABLE)
         if jump := None if previous is None else self._jump(previous, pose, gap):
-            self._way.clear()  # no speed is taken across it
+            self._way.clear()  # No speed is measured across the jump.
         return True, jump or self._speed(pose, stamp)
 
     def _jump(self, previous: Pose, pose: Pose, gap: float) -> Reason | None:
@@ -75,7 +82,7 @@ class PoseGate:
         return None
 
     def _speed(self, pose: Pose, stamp: float) -> Reason | None:
-        """The fault of the hand's mean speed over the last ``_SPEED_WINDOW`` or a little more, or None."""
+        """Return a fault if the hand's mean speed over the last ``_SPEED_WINDOW`` is too high, else None."""
         way = self._way
         way.append((stamp, pose))
         while len(way) > 1 and stamp - way[1][0] >= _SPEED_WINDOW:
@@ -94,7 +101,7 @@ class PoseGate:
 
 
 def _pose_of(sample: HandSample) -> Pose | None:
-    """The sample's pose with its quaternion normalised, or None."""
+    """Return the sample's pose with a unit quaternion, or None if it is not usable."""
     position, quaternion = _numbers(sample.position, 3), _numbers(sample.quaternion, 4)
     if position is None or quaternion is None or max(map(abs, position)) > _MAX_COORDINATE:
         return None
@@ -114,5 +121,5 @@ def _numbers(values: object, size: int) -> list[float] | None:
 
 
 def _angle(one: Quaternion, other: Quaternion) -> float:
-    """Between two unit quaternions [rad]; within 1e-7 of none it is no better than that."""
+    """Return the angle between two unit quaternions [rad], with an error of up to 1e-7 near zero."""
     return 2.0 * math.acos(min(abs(sum(map(mul, one, other))), 1.0))

@@ -1,4 +1,4 @@
-"""A hand's controls: taps and holds, told from the headset's alignment chord, and actions that are held."""
+"""Recognise taps, holds and the alignment chord of a hand's controls, and the actions that last while held."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.types import HandInputs
 
-_STUCK_AFTER = 1.0  # for so long a control is held from the first reading on before somebody is told [s]
-# A control is held from the first of these on and let go below the second, so that noise in between changes nothing.
+_STUCK_AFTER = 1.0  # Delay before the operator is told of a control that was held from the first reading on [s].
+# A control counts as held above the first number and as let go below the second one. Noise in between changes nothing.
 _HELD, _LET_GO = 0.6, 0.4
 
 
 class Press(NamedTuple):
-    """A gesture of one control."""
+    """One gesture of one control."""
 
     control: str
     gesture: Gesture
 
 
 def travel(control: str, inputs: HandInputs) -> float:
-    """How far a control is pressed or pushed, 0 at rest and 1 at its end."""
+    """Return how far a control is pressed or pushed, from 0 at rest to 1 at its end."""
     if control not in DEVICE_NAMES:
         return float(inputs.more.get(control, 0.0))
     name, way = DEVICE_NAMES[control]
@@ -31,15 +31,14 @@ def travel(control: str, inputs: HandInputs) -> float:
 
 
 def _is_held(control: str, inputs: HandInputs, was_held: bool) -> bool:
-    """Whether a control is far enough from rest; what is not a number is let go."""
+    """Return whether a control is held. A reading of NaN counts as let go."""
     return travel(control, inputs) >= (_LET_GO if was_held else _HELD)
 
 
 class HeldControls:
-    """The actions of one hand that are held.
+    """The actions of one hand that last while their control is held.
 
-    A control counts as held only once it was seen let go, since the connection came up. A reading that is not a number
-    lets go.
+    A control counts only after it was seen released since the connection came up. A reading of NaN counts as let go.
     """
 
     def __init__(self, bindings: BindingSettings) -> None:
@@ -51,7 +50,7 @@ class HeldControls:
         self.forget()
 
     def forget(self) -> None:
-        """Nothing is held, and what is has to be let go before it counts."""
+        """Count all controls as let go. A control that is held now counts again only after it was seen released."""
         self._seen_let_go: set[str] = set()
         self.actions: frozenset[Action] = frozenset()
 
@@ -66,16 +65,16 @@ class HeldControls:
 
 
 class GestureRecognizer:
-    """Turns the levels of buttons, triggers and stick into gestures, each reported once.
+    """Turns the levels of buttons, triggers and stick into gestures. Each gesture is reported once.
 
-    The two buttons of a chord never go down in the same sample. A tap of a button is therefore delayed by
-    ``chord_window`` [s] (or until release, if that is earlier). When the other button follows, it was a chord and
-    neither tap is reported. Where a control is bound to a hold too, a tap is over at release, and a hold after
-    ``hold_time``. Only stopping must not wait: ``DOWN`` reports a control at once, and may only be used to stop motion,
-    which a chord does as well.
+    The two buttons of a chord hardly ever go down in the same sample. A tap of a button is therefore reported after
+    ``chord_window`` [s], or at its release if that is earlier. If the other button goes down meanwhile, it was a chord,
+    and no tap is reported. If a control is bound to a hold as well, a tap is reported at its release, and a hold after
+    ``hold_time``. A stop must not wait: ``DOWN`` reports a press at once. It may only be used to stop motion, because
+    the press may still become a chord, which stops motion as well.
 
     A button that goes down while the other one is held makes a chord at any time. After a chord both buttons have to be
-    released before either counts again; a control that is held from the first reading on, likewise.
+    released before either of them counts again. The same holds for a control that is held at the first reading.
     """
 
     def __init__(self, settings: TeleopSettings) -> None:
@@ -94,20 +93,20 @@ class GestureRecognizer:
         self.forget()
 
     def cancel(self) -> None:
-        """Drop gestures that are not over, but a stop; what is held has to be released before it counts again."""
+        """Drop all unfinished gestures but a stop. A control that is held has to be released before it counts again."""
         for control in self._controls.values():
             control.mute()
 
     def forget(self) -> None:
-        """Drop everything, and treat all controls as held until they are seen released."""
-        self.chord = False  # both buttons were pressed together, and not all released since
-        self._first = -math.inf  # of the readings since then [s]
+        """Drop everything. A control counts again only after it was seen released."""
+        self.chord = False  # Whether both buttons were pressed together, and one of them is still held.
+        self._first = -math.inf  # Time of the first reading since then [s].
         self._told_stuck = False
         for control in self._controls.values():
             control.forget()
 
     def receive(self, inputs: HandInputs, stamp: float) -> list[Press]:
-        """Process a new reading, received at ``stamp`` [s]."""
+        """Process a reading that was received at ``stamp`` [s]; returns the gestures that it completes."""
         if self._first == -math.inf:
             self._first = stamp
         found, rose = [], False
@@ -120,7 +119,7 @@ class GestureRecognizer:
             control.seen_up |= not level
             if gesture is not None:
                 found.append(Press(name, gesture))
-            # With the other button it is a chord, or the rest of one.
+            # Together with the other button the press is a chord, or the end of one.
             if rises and not (name in BUTTONS and (self.chord or (inputs.button_upper and inputs.button_lower))):
                 control.begin(stamp)
                 found.append(Press(name, Gesture.DOWN))
@@ -135,7 +134,7 @@ class GestureRecognizer:
         return found
 
     def take_stuck(self, now: float) -> Reason | None:
-        """The reason, returned once, if controls do nothing since they are held for long from the first reading on."""
+        """Return a reason, once, if controls have no effect because they were held from the first reading on."""
         if self._told_stuck or self._first == -math.inf or now - self._first <= _STUCK_AFTER:
             return None
         stuck = [name for name, control in self._controls.items() if control.down and not control.seen_up]
@@ -143,21 +142,27 @@ class GestureRecognizer:
         return Reason.of(ReasonKind.CONTROLS_HELD, controls=stuck) if stuck else None
 
     def due(self, now: float) -> list[Press]:
-        """Gestures that are over because time has passed."""
+        """Return the gestures that are complete because enough time has passed at ``now`` [s]."""
         begun = [(name, control) for name, control in self._controls.items() if control.began is not None]
         return [Press(name, gesture) for name, control in begun if (gesture := control.due(now)) is not None]
 
 
 class _Control:
-    """One control's level, and its press while that may still become another gesture."""
+    """The level of one control, and its press as long as the gesture is not decided."""
 
     def __init__(self, waits: float, hold: float, stops: Gesture | None) -> None:
-        """``waits`` for the other button [s]; ``hold``: of a hold, inf: none [s]; ``stops``: the gesture that does."""
+        """Make a control that counts as held.
+
+        Args:
+            waits: Time for which a tap waits for the other button of a chord [s].
+            hold: Duration of a hold; infinite if the control has no hold [s].
+            stops: The gesture of this control that stops the arms, if any.
+        """
         self._waits, self._hold, self._stops = waits, hold, stops
         self.forget()
 
     def forget(self) -> None:
-        self.down = True  # as held until seen released, so that only a press that was seen from its start counts
+        self.down = True  # Until it is seen released, so that only a press that was seen from its start counts.
         self.seen_up = False
         self.cancel()
 
@@ -168,7 +173,7 @@ class _Control:
 
     def cancel(self) -> None:
         self._muted = False
-        self.began: float | None = None  # of a press that is not over [s]
+        self.began: float | None = None  # Beginning of the press that is not decided yet [s].
 
     def begin(self, stamp: float) -> None:
         self.began, self._muted = stamp, False

@@ -1,4 +1,4 @@
-"""From the usable poses of one hand to targets."""
+"""Turn the usable poses of one hand into targets of its tool."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array, Pose, moved_by
 
-Shares = tuple[float, float]  # of the scales of positions and rotations
+Shares = tuple[float, float]  # The present shares of the scales of positions and of rotations.
 
 
 class HandMotion:
-    """One hand's motion as that of a tool, or of the frame between two tools that carry.
+    """Maps the motion of one hand to a tool, or to the frame between two tools that carry one object.
 
-    There is no catch-up motion after :meth:`anchor`, because no state holds the hand's motion before.
+    After :meth:`anchor` the tool never makes up for earlier motion of the hand, because no state has that motion.
     """
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
@@ -32,19 +32,19 @@ class HandMotion:
         self.configure(settings)
 
     def configure(self, settings: TeleopSettings) -> None:
-        """Other settings from now on. Before the next target there has to be an anchor."""
+        """Use other settings from now on. The next target needs a new :meth:`anchor`."""
         self._settings = settings
         self._filter = PoseFilter(settings.filter)
         self._rest = RestingPose()
         self._motion, self._unslipped = RelativeMotion.of(settings), RelativeMotion.of(settings)
         self._shares: Shares = (1.0, 1.0)
-        self.filtered: Pose | None = None  # the hand's pose that the last target was made of
-        # The newest hand pose, and where it would have the tool if nothing had slipped.
+        self.filtered: Pose | None = None  # The filtered pose of the hand from which the last target was computed.
+        # The newest pose of the hand, and the target for it if nothing had slipped.
         self._newest: tuple[Pose, Pose] | None = None
         self._bound_one_tool()
 
     def _bound_one_tool(self) -> None:
-        """Targets are those of this arm's tool from now on, and nothing has slipped."""
+        """Move this arm's tool only, from now on, without any slip so far."""
         self._carried: CarriedTools | None = None
         self._leash = Leash(self._settings.leash)
         self._workspace: Workspace | CarriedWorkspace = self.workspace()
@@ -54,20 +54,27 @@ class HandMotion:
 
     @property
     def slip(self) -> tuple[float, float]:
-        """How far the target has slipped along since the anchor, with the tool or along its workspace [m, rad]."""
+        """How far the target was held back since the anchor, by the leash and the workspace [m], [rad]."""
         return self._leash.position.slip + self._workspace.slip, self._leash.rotation.slip
 
     def forget(self) -> None:
         self._rest.forget()
 
     def add(self, hand: Pose, stamp: float, now: float, engaged: bool) -> None:
-        """A usable pose of the hand, received at ``stamp`` [s]; followed if its arm is ``engaged``, so anchored."""
+        """Take a usable pose of the hand.
+
+        Args:
+            hand: The pose in the input's frame.
+            stamp: The time of receipt [s].
+            now: The time [s].
+            engaged: Whether the arm is engaged, so that it follows the pose.
+        """
         self._rest.add(hand)
         if engaged:
             self._filter.add(hand, stamp, now)
 
     def anchor(self, hand: Pose, tool: Pose, shares: Shares, now: float) -> None:
-        """The newest pose of the ``hand`` and ``tool``, in the world, correspond from now on."""
+        """Let the newest pose of the ``hand`` correspond to ``tool`` (world frame) from now on."""
         if self._carried is not None:
             self._bound_one_tool()
         hand = self._rest.begin(hand, now)
@@ -77,17 +84,28 @@ class HandMotion:
         self._workspace.reset()
 
     def carry(self, tools: CarriedTools, other: str, box: Workspace, now: float) -> None:
-        """Move the frame of ``tools`` from now on, until the next anchor; ``box``: that of the ``other`` arm."""
+        """Move the frame of ``tools`` from now on, until the next anchor.
+
+        Args:
+            tools: Both tools.
+            other: The other arm.
+            box: The workspace of the other arm.
+            now: The time [s].
+        """
         self._carried = tools
         self._leash = Leash(self._settings.leash.carried())
         self._workspace = CarriedWorkspace(tools, {self._arm: self.workspace(), other: box})
         self._rescale(self._hand(now), floats_of(tools.frame), self._shares)
 
     def target(self, newest: Pose | None, expected: Pose | None, shares: Shares, now: float) -> Pose:
-        """Where the tool, or the frame, should be at ``now`` [s] in the world.
+        """Return the target of the tool, or of the frame, in the world frame.
 
-        ``newest``: the hand's newest pose; ``expected``: the tool or the frame by the controller's reference, which no
-        target is farther from than the leash. Without either there is no leash.
+        Args:
+            newest: The newest pose of the hand; without it there is no leash.
+            expected: The tool, or the frame, in the controller's reference. The leash keeps the target near it; without
+                it there is no leash.
+            shares: The present shares of the scales.
+            now: The time [s].
         """
         hand = self.filtered = self._hand(now)
         if expected is None or newest is None:
@@ -100,7 +118,7 @@ class HandMotion:
             target = held, target[1]
             self._motion.anchor_position(hand[0], held)
         if self._shares != shares:
-            self._rescale(hand, target, shares)  # from here on, so the target does not jump
+            self._rescale(hand, target, shares)  # The new scale counts from here on, so that the target does not jump.
             self._leash.anchor_anew()
         return target
 
@@ -108,34 +126,37 @@ class HandMotion:
         return self._rest.draw(self._filter.at(now), now)
 
     def _rescale(self, hand: Pose, tool: Pose, shares: Shares) -> None:
-        """Anchor hand and tool, with the scales that hold from now on."""
+        """Anchor hand and tool, and use other shares of the scales from now on."""
         self._shares, self._newest = shares, None
         self._motion.rescale(*shares, hand, tool)
         self._unslipped.rescale(*shares, hand, tool)
 
 
-MAX_OFFSET = 0.05, 0.1  # of a tool from its command [m], [rad]
+MAX_OFFSET = 0.05, 0.1  # Greatest plausible distance of a measured tool from its command [m], [rad].
 
 
 class Anchor(NamedTuple):
-    """Where a tool is when its arm is engaged, world frame."""
+    """The pose at which an arm is engaged, in the world frame."""
 
-    tool: pin.SE3  # measured position, commanded orientation
-    offset: Array | None = None  # (3,) [m]; None: none
+    tool: pin.SE3  # The measured position and the commanded orientation of the tool.
+    offset: Array | None = None  # Measured position less commanded position (3,) [m]; None if not known.
 
 
 @dataclass(slots=True)
 class ArmMeasurements:
-    """State of the arms themselves in one tick; poses are in the world."""
+    """The state of the arms in one tick. All poses are in the world frame."""
 
-    tools: Mapping[str, pin.SE3]  # measured
-    targets: Mapping[str, pin.SE3]  # the last ones
-    commanded: Mapping[str, pin.SE3] | None = None  # by the controller's reference
-    obstacles: Mapping[str, Reason] = field(default_factory=dict)  # arm -> why it may not be engaged
-    in_step: bool = True  # ``commanded`` is of one moment
+    tools: Mapping[str, pin.SE3]  # The measured tools.
+    targets: Mapping[str, pin.SE3]  # The targets of the last tick.
+    commanded: Mapping[str, pin.SE3] | None = None  # The tools in the controller's reference.
+    obstacles: Mapping[str, Reason] = field(default_factory=dict)  # For each arm that may not be engaged, the reason.
+    in_step: bool = True  # Whether all poses in ``commanded`` are of one moment.
 
     def anchor(self, arm: str) -> Anchor | None:
-        """The measured position and the commanded orientation, or else that of the last target; None: not known."""
+        """Return the pose at which ``arm`` may be engaged; None if its tool is not known.
+
+        The orientation is the commanded one, or the one of the last target if no command is known.
+        """
         measured = self.tools.get(arm)
         if measured is None:
             return None
@@ -145,11 +166,11 @@ class ArmMeasurements:
         return Anchor(tool, offset if offset is not None and math.hypot(*offset) <= MAX_OFFSET[0] else None)
 
     def last_target(self, arm: str) -> Anchor | None:
-        """Where a policy left the target; None: there is none."""
+        """Return the last target as an anchor, for a hand that takes over from a policy; None if there is no target."""
         return Anchor(self.targets[arm]) if arm in self.targets else None
 
     def expected(self, arm: str, offset: Array | None) -> Pose | None:
-        """Where a tool with this offset is to be measured, by what is commanded. None: not known."""
+        """Return where the command should bring the tool, if it is measured with this ``offset``; None if not known."""
         if self.commanded is None or (commanded := self.commanded.get(arm)) is None:
             return None
         (x, y, z), rotation = pose = floats_of(commanded)
@@ -159,11 +180,11 @@ class ArmMeasurements:
         return (x + by_x, y + by_y, z + by_z), rotation
 
     def lag(self, arm: str, offset: Array | None) -> float:
-        """From where the controller has a tool to its last target [m]."""
+        """Return the distance of the tool in the controller's reference from its last target [m]."""
         pose, target = self.expected(arm, offset), self.targets.get(arm)
         return 0.0 if pose is None or target is None else math.dist(pose[0], target.translation)
 
 
 def with_offset(commanded: pin.SE3, offset: Array | None) -> pin.SE3:
-    """Where a tool is to be measured that is commanded to be at ``commanded``."""
+    """Return where a tool should be measured that is commanded to be at ``commanded``."""
     return commanded if offset is None else moved_by(commanded, offset)

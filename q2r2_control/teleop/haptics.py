@@ -1,4 +1,4 @@
-"""Short vibrations that tell a hand about its arm."""
+"""Short vibrations that tell a hand about the state of its arm."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from q2r2_control.types import HapticFeedback
 class Pulse(NamedTuple):
     """One vibration."""
 
-    frequency: float  # 0..1
-    amplitude: float  # 0..1
+    frequency: float  # 0 .. 1
+    amplitude: float  # 0 .. 1
     duration: float  # [s]
     meaning: str
-    strongest: float | None = None  # amplitude that it grows to
+    strongest: float | None = None  # The amplitude to which it grows, if it grows.
 
     def grown(self, share: float) -> Pulse:
-        """The same at a share of the way to its strongest."""
+        """Return the vibration with a share of its growth, from 0 to 1."""
         most = self.amplitude if self.strongest is None else self.strongest
         return self._replace(amplitude=self.amplitude + (most - self.amplitude) * min(share, 1.0))
 
@@ -41,7 +41,7 @@ EPISODE_DISCARDED = Pulse(0.2, 0.65, 0.25, "an episode is discarded, or failed")
 EPISODE_REJECTED = Pulse(0.15, 0.7, 0.5, "the verdict on an episode: discard")
 STOPPED = Pulse(0.9, 0.9, 0.25, "stopped, by the control that stops")
 FAULT = Pulse(1.0, 1.0, 0.3, "lost: stopped by a fault (lost data, a jump, a stop), or a press that was refused")
-# The weakest first: where two are due at once, the stronger one is felt. The docs' table is this one.
+# The weakest vibration comes first. If two are due at once, the stronger one is felt. The docs show this table.
 VOCABULARY = (
     *(NEAR, SLIP, CONTACT, LIMIT, PAUSED, EPISODE_ENDS, ENGAGED, EPISODE_KEPT, EPISODE_BEGINS, GRASP, HOMING),
     *(EPISODE_DISCARDED, EPISODE_REJECTED, STOPPED, FAULT),
@@ -63,28 +63,31 @@ _WHILE_STATE_STAYS = {
     ReasonKind.EPISODE_DISCARDED: EPISODE_DISCARDED,
 }
 
-_SLIP_STEP = 0.02  # the target slips by this between two pulses [m]
-_SLIP_ANGLE_STEP = 0.1  # or by this [rad]
-_NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # [m]
-_FORCE_STEP, _FORCE_TO = 5.0, 50.0  # [N]
-_PAUSE = 0.05  # between two vibrations, so that they are felt as two [s]
+_SLIP_STEP = 0.02  # Slip of the target's position from pulse to pulse [m].
+_SLIP_ANGLE_STEP = 0.1  # Slip of the target's rotation from pulse to pulse [rad].
+_NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # Approach from pulse to pulse, and the distance at which pulses begin [m].
+_FORCE_STEP, _FORCE_TO = 5.0, 50.0  # Force from pulse to pulse, and the force of the strongest pulse [N].
+_PAUSE = 0.05  # Pause between two vibrations, so that they are felt as two [s].
 
 
 class ArmCondition(NamedTuple):
-    """Surroundings and joints of an arm, which its hand feels."""
+    """The surroundings and the joints of an arm, as its hand feels them."""
 
-    spare: float  # how much nearer it may come to what it has to keep away from; inf: nothing is there [m]
-    limits: frozenset[str]  # joints at a position limit
-    force: float | None  # contact force at the tool, None: not measured [N]
+    spare: float  # By how much the arm may still approach another body; infinite if none is near [m].
+    limits: frozenset[str]  # Joints at a position limit.
+    force: float | None  # Contact force at the tool; None if it is not measured [N].
 
 
 class HapticPulses:
-    """Vibrations of one arm's hand, see :data:`VOCABULARY`; the end of each is a message, since the app goes on."""
+    """The vibrations of one arm's hand, see :data:`VOCABULARY`.
+
+    A message ends each of them, because the headset's app vibrates until it is told to stop.
+    """
 
     def __init__(self, settings: HapticSettings | None = None) -> None:
-        self.strength = (settings or HapticSettings()).strength  # of all vibrations, 0: none
+        self.strength = (settings or HapticSettings()).strength  # Factor of all amplitudes, from 0 for none to 1.
         self._ends: float | None = None
-        self._next = 0.0  # no vibration begins before [s]
+        self._next = 0.0  # Earliest time of the next vibration [s].
         self._amplitude, self._felt_by = 0.0, ""
         self._slipped = _Steps(_SLIP_STEP), _Steps(_SLIP_ANGLE_STEP)
         self._nearness, self._force = _Steps(_NEAR_STEP), _Steps(_FORCE_STEP)
@@ -107,13 +110,13 @@ class HapticPulses:
             self._want(PAUSED)
 
     def slip(self, slip: float, slip_angle: float) -> None:
-        """How far the target has slipped since engaging [m, rad]."""
+        """Take how far the target has slipped since the arm was engaged [m], [rad]."""
         position, rotation = self._slipped
-        if position.grew(slip) | rotation.grew(slip_angle):  # both count
+        if position.grew(slip) | rotation.grew(slip_angle):  # Both have to be updated.
             self._want(SLIP)
 
     def notice(self, condition: ArmCondition) -> None:
-        """The arm comes near to something, touches it, or is limited by a joint."""
+        """Start a pulse if the arm comes near to something, touches it, or reaches a joint limit."""
         nearness = max(_NEAR_FROM - condition.spare, 0.0)
         if self._nearness.grew(nearness):
             self._want(NEAR.grown(nearness / _NEAR_FROM))
@@ -124,16 +127,16 @@ class HapticPulses:
             self._want(CONTACT.grown(condition.force / _FORCE_TO))
 
     def grasps(self, holds: bool) -> None:
-        """Whether the gripper is closed on something."""
+        """Take whether the gripper holds something."""
         if holds and not self._grasps:
             self._want(GRASP)
         self._grasps = holds
 
     def at(self, now: float, hand: str) -> HapticFeedback | None:
-        """The vibration for ``hand``, which drives the arm at ``now`` [s], or None."""
+        """Return the message for ``hand``, which drives the arm at ``now`` [s], or None."""
         if self._ends is not None and now >= self._ends:
             self._ends, self._next = None, now + _PAUSE
-            return HapticFeedback(self._felt_by, 0.0, 0.0)  # which may not drive the arm any more
+            return HapticFeedback(self._felt_by, 0.0, 0.0)  # This hand may not drive the arm any more.
         pulse = self._waiting
         if pulse is None or (self._ends is None and now < self._next and pulse is not FAULT):
             return None
@@ -149,7 +152,7 @@ class HapticPulses:
 
 
 class _Steps:
-    """Counts steps that a quantity has grown by; it may shrink by two before they count anew."""
+    """Counts the steps by which a quantity grows. It may shrink by two steps before they are counted anew."""
 
     def __init__(self, step: float) -> None:
         self._step, self._counted = step, 0

@@ -1,18 +1,19 @@
-"""The leash between a tool and its target: it bounds how far a target gets from a tool that cannot follow.
+"""The leash between a tool and its target. It bounds the distance of a target from a tool that cannot follow.
 
 An arm that is stretched out or blocked cannot follow its hand. Without a leash the hand would have to come all the way
-back before the arm moves again. Where a target would go beyond the leash, the anchor of the relative motion shifts. The
-target stays where the leash ends and the hand moves it from there. Position and rotation have a leash each.
+back before the arm moves again. If a target would go beyond the leash, the anchor of the relative motion shifts. The
+target stays at the end of the leash, and the hand moves it from there. Position and rotation have a leash each.
 
-**Slack.** A leash is taut, the tool is blocked in its direction, and the hand comes back by more than tremor. Then the
-target is put at the tool, which follows the hand from there. Whether the hand comes back is read from its unfiltered
-poses: when a hand stops, the filtered ones swing back by millimetres. Position and rotation are put there together. A
-blocked tool rests where the pulls of both balance, and would follow the one that is left, up to 50 mm.
+**Slack.** Suppose that a leash is taut, that the tool is blocked in its direction, and that the hand comes back by more
+than its tremor. Then the target is put at the tool, which follows the hand from there. The unfiltered poses decide
+whether the hand comes back, because the filtered ones swing back by millimetres when a hand stops. Position and
+rotation are put at the tool together. A blocked tool rests where the pulls of both targets balance, and would follow
+the one that is left, by up to 50 mm.
 
 **Why the arm does not jump.** The only state of the controller is its reference, which is at rest while the tool is
-blocked. A target at the tool therefore asks for no motion. The controller also follows its target's own velocity, but
-not that of a step faster than three times the tool's limit, 9 m/s or 30 rad/s at most. Slack is dropped in a tick that
-is short enough to make such a step.
+blocked. A target at the tool therefore asks for no motion. The controller also follows the velocity of its target. It
+ignores a step that is faster than three times the tool's limit, which is 9 m/s or 30 rad/s at most. The slack is
+dropped only in a tick that is short enough for the step to be that fast.
 """
 
 from __future__ import annotations
@@ -24,18 +25,21 @@ from q2r2_control.quaternions import Vector, turn_between, turned_by
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Interval, Pose
 
-# The way back that drops the slack: more than tremor, 0.2 mm and 0.2 degrees to either side, and a headset's noise. Of
-# the noise seven times 0.2 mm and 0.03 degrees lie between the farthest samples of a hand that rests.
-_WAY_BACK = 1.5e-3, 12e-3  # [m, rad]
-_HELD_UP = 0.05, 0.2  # a slower tool counts as blocked; it stops within a fraction of a millimetre [m/s, rad/s]
-_NO_MOTION = 10.0, 35.0  # a faster step is no motion of a target, whatever the controller's settings [m/s, rad/s]
-_ROUNDING = 1e-9  # [m], and of a cosine
+# The way back of a hand that drops the slack [m], [rad]. It is more than tremor, which is 0.2 mm and 0.2 degrees to
+# either side, and more than the noise of a headset. The farthest samples of a hand at rest are about seven standard
+# deviations apart, of 0.2 mm and 0.03 degrees.
+_WAY_BACK = 1.5e-3, 12e-3
+# A tool that is slower counts as blocked [m/s], [rad/s]. It stops within a fraction of a millimetre.
+_HELD_UP = 0.05, 0.2
+# No controller takes a faster step of a target as its motion, whatever its settings are [m/s], [rad/s].
+_NO_MOTION = 10.0, 35.0
+_ROUNDING = 1e-9  # Of a distance [m], and of a cosine.
 
-_Tick = tuple[Pose, Pose, float]  # the tool, the newest hand and the time [s], which the next tick looks at
+_Tick = tuple[Pose, Pose, float]  # The tool, the newest pose of the hand, and the time [s] of the last tick.
 
 
 class ComponentLeash:
-    """The leash of a position or of a rotation; displacements are vectors in the world frame [m or rad]."""
+    """The leash of a position or of a rotation. Displacements are vectors in the world frame [m or rad]."""
 
     def __init__(self, length: float | None, way_back: float, held_up: float, no_motion: float) -> None:
         self._length = math.inf if length is None else length
@@ -43,18 +47,22 @@ class ComponentLeash:
         self.reset()
 
     def reset(self) -> None:
-        """Slack, nothing slipped."""
-        self.slip = 0.0  # how far the target has slipped since then, to and fro counted [m or rad]
+        """Begin with a slack leash and no slip."""
+        self.slip = 0.0  # The sum of all shifts of the target since the reset [m or rad].
         self.taut = False
-        self._back = 0.0  # of the hand, since it was farthest
+        self._back = 0.0  # The way back of the hand since it was farthest [m or rad].
 
     def releases_slack(self, way: Vector, by_hand: Vector, by_tool: Vector, dt: float) -> bool:
-        """Whether to drop the slack.
+        """Return whether the slack is to be dropped.
 
-        ``way``: from the tool to the target; ``by_hand``, ``by_tool``: of the unfiltered hand and the tool in ``dt``.
+        Args:
+            way: From the tool to the target.
+            by_hand: Motion of the unfiltered hand in this tick.
+            by_tool: Motion of the tool in this tick.
+            dt: Duration of the tick [s].
         """
         distance = math.hypot(*way)
-        # Below half of the length the tool has followed by itself.
+        # Below half of its length a leash is slack again: the tool has followed by itself.
         self.taut = distance >= self._length or (self.taut and distance >= 0.5 * self._length)
         if not self.taut:
             self._back = 0.0
@@ -69,7 +77,7 @@ class ComponentLeash:
         return 0.0, 0.0, 0.0
 
     def hold(self, way: Vector) -> Vector | None:
-        """The way to a target that the leash holds; None: the leash is not taut."""
+        """Return the shortened way from the tool to the target; None if the leash does not reach its end."""
         distance = math.hypot(*way)
         if distance <= self._length:
             return None
@@ -79,37 +87,42 @@ class ComponentLeash:
 
 
 class Leash:
-    """Keeps one arm's target near its tool; see the module's text. Starts slack at every :meth:`reset`."""
+    """Keeps the target of one arm near its tool, as the module's text says."""
 
     def __init__(self, settings: LeashSettings) -> None:
         limits = list(zip(_WAY_BACK, _HELD_UP, _NO_MOTION, strict=True))
         self.position = ComponentLeash(settings.distance, *limits[0])
         self.rotation = ComponentLeash(settings.angle, *limits[1])
         self._components = self.position, self.rotation
-        # A little less than the leash's, so that it is looked at in time; of the angle, the cosine of half of it.
+        # Distance and cosine of half the angle at which the leash is looked at, just before it ends.
         self._distance = math.inf if settings.distance is None else settings.distance - _ROUNDING
         self._cosine = -math.inf if settings.angle is None else math.cos(0.5 * settings.angle) + _ROUNDING
         self._last: _Tick | None = None
 
     def reset(self) -> None:
-        """Slack, nothing slipped: for a new anchor."""
+        """Begin with a slack leash and no slip, at a new anchor."""
         self.position.reset()
         self.rotation.reset()
         self._last = None
 
     def anchor_anew(self) -> None:
-        """The hand was anchored anew where it is, its way since the last tick is not known; the slip stays."""
+        """Forget the last tick, because the hand was anchored anew where it is. The slip stays."""
         self._last = None
 
     def target(self, motion: RelativeMotion, hand: Pose, newest: Pose, tool: Pose, now: float) -> Pose:
-        """The target of ``hand`` at ``now`` [s], no farther from ``tool`` (world frame) than the leash reaches.
+        """Return the target for ``hand``, no farther from the tool than the leash reaches.
 
-        ``newest`` is where the unfiltered hand would have the tool if nothing had ever slipped. Where the leash pulls,
-        ``motion`` is anchored anew, so that the hand moves the target from there.
+        Args:
+            motion: Maps the hand to its target. If the leash pulls, it is anchored anew, so that the hand moves the
+                target from there.
+            hand: The filtered pose of the hand.
+            newest: The target for the unfiltered hand if nothing had ever slipped.
+            tool: The tool, in the world frame.
+            now: The time [s].
         """
         target, last = motion.target_floats(hand), self._last
         self._last = this = tool, newest, now
-        # The first target is the anchor, which must not move the arm wherever the plant says the tool is.
+        # The first target is the anchor. It must not move the arm, wherever the plant measures the tool.
         if last is None or not (self.position.taut or self.rotation.taut or self._ends(tool, target)):
             return target
         way, turn = self._pull(target, last, this)
@@ -121,24 +134,24 @@ class Leash:
         return target
 
     def hold(self, target: Pose, tool: Pose) -> Pose:
-        """A target that no hand moves, no farther from ``tool`` (world frame) than the leash reaches."""
+        """Return a target that no hand moves, no farther from ``tool`` (world frame) than the leash reaches."""
         if not self._ends(tool, target):
             return target
         way, turn = (component.hold(way) for component, way in zip(self._components, _ways(tool, target), strict=True))
         return _put(target, tool, way, turn)
 
     def _ends(self, tool: Pose, target: Pose) -> bool:
-        """Whether the target is as far as a leash reaches, told with little work: at most ticks it is not."""
+        """Return whether the target is as far away as a leash reaches. This is cheap, as it is False in most ticks."""
         (start, (a, b, c, d)), (end, (x, y, z, w)) = tool, target
-        # Of two unit quaternions the scalar product is the cosine of half the angle between them, but for its sign.
+        # The scalar product of two unit quaternions is the cosine of half the angle between them, up to its sign.
         return math.dist(start, end) >= self._distance or abs(a * x + b * y + c * z + d * w) <= self._cosine
 
     def _pull(self, target: Pose, last: _Tick, this: _Tick) -> list[Vector | None]:
-        """Ways from the tool to the target's new position and rotation, None for what the leash leaves alone."""
+        """Return the ways from the tool to the new position and rotation of the target; None for one that stays."""
         (last_tool, last_newest, before), (tool, newest, now) = last, this
         ways = _ways(tool, target)
         moves = zip(self._components, ways, _ways(last_newest, newest), _ways(last_tool, tool), strict=True)
-        # All are asked, since each component has to see every tick.
+        # Both components are asked, since each of them has to see every tick.
         dt = now - before
         releases = [leash.releases_slack(way, by_hand, by_tool, dt) for leash, way, by_hand, by_tool in moves]
         if any(releases):
@@ -152,7 +165,7 @@ def _ways(start: Pose, end: Pose) -> tuple[Vector, Vector]:
 
 
 def _put(target: Pose, tool: Pose, way: Vector | None, turn: Vector | None) -> Pose:
-    """The target at this way and turn from the tool; None: where it is."""
+    """Return the target moved to this ``way`` and ``turn`` from the tool; None leaves its position or rotation."""
     (position, rotation), ((x, y, z), tool_rotation) = target, tool
     if way is not None:
         position = x + way[0], y + way[1], z + way[2]
@@ -164,19 +177,19 @@ def _dot(one: Vector, other: Vector) -> float:
 
 
 class Workspace:
-    """Keeps one arm's targets in its box, or no farther out than its tool was at the anchor; None: there is no box."""
+    """Keeps the targets of one arm in a box, or no farther outside than its tool was at the anchor."""
 
     def __init__(self, settings: WorkspaceSettings | None) -> None:
         self._sides: tuple[Interval, ...] = () if settings is None else (settings.x, settings.y, settings.z)
         self.reset()
 
     def reset(self) -> None:
-        """For a new anchor: the next target is where the tool is, wherever that may be."""
+        """Begin at a new anchor. The next target is at the tool, which may be outside of the box."""
         self._bounds: list[Interval] | None = None
-        self.slip = 0.0  # how much of the hand's way was not made since the reset [m]
+        self.slip = 0.0  # The part of the hand's way that targets have not followed since the reset [m].
 
     def hold(self, target: Pose) -> Vector | None:
-        """The position, world frame, that ``target`` may have and the hand is to be anchored to; None: its own."""
+        """Return the position to which ``target`` (world frame) is held back, for a new anchor; None if it is not."""
         asked = target[0]
         if self._bounds is None:
             self._bounds = [(min(side[0], at), max(side[1], at)) for side, at in zip(self._sides, asked, strict=False)]
@@ -187,7 +200,7 @@ class Workspace:
         return allowed
 
     def clip(self, position: Vector) -> Vector:
-        """The nearest position that a target may have, world frame [m]."""
+        """Return the permitted position that is nearest to ``position`` (world frame) [m]."""
         if not self._bounds:
             return position
         x, y, z = (min(max(at, least), greatest) for (least, greatest), at in zip(self._bounds, position, strict=True))

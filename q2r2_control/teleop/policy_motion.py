@@ -1,9 +1,10 @@
-"""From the chunks of a policy to the targets of one arm, on one time line.
+"""Turn the action chunks of a policy into targets of one arm, on one time line.
 
-A chunk is followed from its first time on, or from now on if it is late, and replaces what older ones say from there
-on. Positions between two actions are cubic, rotations turn evenly. Where two chunks disagree at the moment of the
-change, the difference fades instead of a jump; of motions there is none, since they begin where the target is. The last
-action counts for :data:`SILENT`, and then the arm rests: an action that is repeated for ever is no policy.
+A chunk is followed from its first time on, or from now on if it is late. From there on it replaces all older chunks.
+Positions between two actions are cubic in time, and rotations turn evenly. If two chunks differ at the moment of the
+change, the difference fades out, so that the target does not jump. Chunks of motions have no such difference, because
+they begin at the target. The last action counts for :data:`SILENT`. After that the arm rests, because a policy that
+sends nothing has failed.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from q2r2_control.quaternions import Vector, floats_of, normalized, rotation_of,
 from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.types import ActionChunk, Array, Pose
 
-SILENT = 0.5  # without an action that counts, after which an arm rests [s]
-_FADING = 0.5, 2.0  # how fast the difference of two chunks fades, at most [m/s], [rad/s]
-_AHEAD = 10.0  # a chunk whose time is farther off is on another clock [s]
+SILENT = 0.5  # Time without a new action, after which an arm rests [s].
+_FADING = 0.5, 2.0  # Greatest speed at which the difference between two chunks fades [m/s], [rad/s].
+_AHEAD = 10.0  # A chunk whose time is farther from now was stamped by another clock [s].
 
 
 class _Plan(NamedTuple):
-    """The part of a chunk that is one arm's."""
+    """The part of a chunk that concerns one arm."""
 
-    start: float  # followed from here on [s]
+    start: float  # Time from which the plan is followed [s].
     chunk: ActionChunk
-    times: list[float]  # of the poses [s]
-    poses: list[Pose]  # in the world, or of motions, from where the first of them begins
-    grippers: list[float]  # empty: not commanded
+    times: list[float]  # Times of the poses [s].
+    poses: list[Pose]  # In the world frame; for motions, in the frame in which the first motion begins.
+    grippers: list[float]  # Openings of the gripper; empty if the policy does not command it.
 
     @property
     def end(self) -> float:
@@ -42,12 +43,12 @@ class _Plan(NamedTuple):
 
 
 class PolicyMotion:
-    """The policy's motion of one arm. Times are those of the loop's clock [s]."""
+    """Follows the actions of a policy with one arm. All times are of the loop's clock [s]."""
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
         self._arm = arm
-        self._plans: list[_Plan] = []  # those whose time comes, in their order
-        self._plan: _Plan | None = None  # the one that is followed
+        self._plans: list[_Plan] = []  # The plans that have not begun, in order of time.
+        self._plan: _Plan | None = None  # The plan that is followed.
         self.configure(settings)
 
     def configure(self, settings: TeleopSettings) -> None:
@@ -57,16 +58,19 @@ class PolicyMotion:
 
     @property
     def following(self) -> bool:
-        """Whether an arm has begun to follow, and the actions have not been forgotten since."""
+        """Whether the arm follows a plan."""
         return self._plan is not None
 
     def forget(self) -> None:
-        """Nothing of the past counts any more."""
+        """Forget all plans."""
         self._plans.clear()
         self._plan = None
 
     def receive(self, chunk: ActionChunk, now: float) -> Reason | None:
-        """A chunk that came at ``now``; returns why it cannot be used, or None. One that is too late is left out."""
+        """Take a chunk that came at ``now``; returns why it cannot be used, or None.
+
+        A chunk whose actions are all in the past is ignored.
+        """
         if self._arm not in chunk.tools and self._arm not in chunk.motions:
             return None
         times = chunk.times.tolist()
@@ -78,7 +82,7 @@ class PolicyMotion:
             poses = [_pose(numbers) for numbers in chunk.tools[self._arm].tolist()]
         else:
             poses = _added_up(chunk.motions[self._arm].tolist())
-            if len(times) == 1:  # the whole motion, as late as it comes: what is left out would be missing for good
+            if len(times) == 1:  # A single motion is made in full even if it is late, or a part would be missing.
                 times[0] = max(times[0], now)
             times.append(times[-1] + chunk.period)
         if jump := self._jump(times, poses):
@@ -92,7 +96,7 @@ class PolicyMotion:
         return None
 
     def _jump(self, times: list[float], poses: list[Pose]) -> Reason | None:
-        """Two actions that are farther apart than the gate lets a hand go."""
+        """Return a fault if two actions are farther apart than a hand may move, else None."""
         gate = self._settings.gate
         for (before, start), (after, end) in pairwise(zip(times, poses, strict=True)):
             distance, angle = math.dist(start[0], end[0]), math.hypot(*turn_between(start[1], end[1]))
@@ -103,19 +107,24 @@ class PolicyMotion:
         return None
 
     def counts(self, now: float) -> bool:
-        """Whether there is an action that an arm may begin to follow."""
+        """Return whether there is a plan for ``now`` that the arm may begin to follow."""
         return any(plan.start <= now < plan.end for plan in self._plans)
 
     def begin(self, tool: Pose, now: float) -> Reason | None:
-        """Follow the newest action that counts, from ``tool`` on, world frame; returns why not, or None."""
+        """Begin to follow the newest plan with the tool at ``tool`` (world frame); returns why not, or None."""
         self._plan = None
         self._workspace.reset()
         return self.advance(tool, now)
 
     def advance(self, tool: Pose | None, now: float) -> Reason | None:
-        """Go on to the chunk that is followed at ``now``; returns why none can be, or None. ``tool``: the reference's.
+        """Change to the plan for ``now``; returns why the arm cannot follow one, or None.
 
-        Arms that something holds up have their target on the leash: a chunk may begin there or where the last one led.
+        If something holds the arm up, the leash holds its target. A new chunk may begin at this target, or where the
+        last chunk led.
+
+        Args:
+            tool: The tool in the controller's reference; None if not known.
+            now: The time [s].
         """
         due = [plan for plan in self._plans if plan.start <= now]
         self._plans = self._plans[len(due) :]
@@ -130,7 +139,7 @@ class PolicyMotion:
         return None
 
     def _change(self, plan: _Plan, places: list[Pose], now: float) -> Reason | None:
-        """Follow ``plan`` from the one of ``places`` on that it is nearest to."""
+        """Follow ``plan``, beginning at the nearest of ``places``; returns why not, or None."""
         if self._arm in plan.chunk.motions:
             plan = plan._replace(poses=_moved_to(places[0], _interpolated(plan, now), plan.poses))
         planned, turned = _interpolated(plan, now)
@@ -148,7 +157,7 @@ class PolicyMotion:
         return None
 
     def _at(self, now: float) -> Pose:
-        """Where the plan that is followed has the tool, with the difference to the one before that is left."""
+        """Return the pose of the plan at ``now``, plus what is left of the difference from the plan before."""
         assert self._plan is not None
         (x, y, z), rotation = _interpolated(self._plan, now)
         left = 1.0 - min((now - self._began) / self._fades, 1.0)
@@ -160,21 +169,26 @@ class PolicyMotion:
         )
 
     def target(self, tool: Pose | None, now: float) -> Pose:
-        """Where the tool should be, world frame: in its workspace, and on the leash of ``tool``, the reference's."""
+        """Return the target of the tool (world frame), within its workspace and its leash.
+
+        Args:
+            tool: The tool in the controller's reference; None if not known.
+            now: The time [s].
+        """
         target = self._at(now)
         if (held := self._workspace.hold(target)) is not None:
             target = held, target[1]
         return target if tool is None else self._leash.hold(target, tool)
 
     def gripper(self, now: float) -> float | None:
-        """The opening of the newest action at or before ``now``; None: the policy says nothing of it."""
+        """Return the opening of the newest action at or before ``now``; None if the policy does not command it."""
         if self._plan is None or not self._plan.grippers:
             return None
         index = bisect_right(self._plan.times, now) - 1
         return self._plan.grippers[min(max(index, 0), len(self._plan.grippers) - 1)]
 
     def posture(self, now: float) -> Array | None:
-        """Joint positions of the whole robot that the actions have at ``now`` (nv,) [rad]; None: none are asked for."""
+        """Return the joint positions that the actions ask for at ``now`` (nv,) [rad]; None if they ask for none."""
         if self._plan is None or self._plan.chunk.postures is None:
             return None
         postures, (index, share) = self._plan.chunk.postures, _place(self._plan.times, now)
@@ -194,7 +208,7 @@ def _pose(numbers: list[float]) -> Pose:
 
 
 def _added_up(motions: list[list[float]]) -> list[Pose]:
-    """Poses that motions lead to, one after the other, in the frame of where they begin."""
+    """Return the poses to which the motions lead one after the other, in the frame in which they begin."""
     at = pin.SE3.Identity()
     poses = [floats_of(at)]
     for x, y, z, a, b, c in motions:
@@ -204,13 +218,13 @@ def _added_up(motions: list[list[float]]) -> list[Pose]:
 
 
 def _moved_to(place: Pose, origin: Pose, poses: list[Pose]) -> list[Pose]:
-    """The same motion as that of ``poses``, with ``origin`` at ``place``."""
+    """Return ``poses`` moved as a whole, so that ``origin`` comes to ``place``."""
     move = se3_of(place) * se3_of(origin).inverse()
     return [floats_of(move * se3_of(pose)) for pose in poses]
 
 
 def _place(times: list[float], t: float) -> tuple[int, float]:
-    """The index of the action before ``t``, and the share of the way to the next one."""
+    """Return the index of the action before ``t``, and the share of the time to the next one that has passed."""
     index = min(max(bisect_right(times, t) - 1, 0), max(len(times) - 2, 0))
     if len(times) == 1:
         return 0, 0.0
@@ -218,7 +232,11 @@ def _place(times: list[float], t: float) -> tuple[int, float]:
 
 
 def _interpolated(plan: _Plan, t: float) -> Pose:
-    """Between two actions: a cubic that goes through all of them with their mean velocities, and an even turn."""
+    """Return the pose of a plan at ``t``.
+
+    Positions are a cubic Hermite spline through all actions, with the mean velocity of the neighbours at each action.
+    Rotations turn evenly from action to action.
+    """
     times, poses = plan.times, plan.poses
     index, share = _place(times, t)
     if len(times) == 1:
@@ -237,7 +255,7 @@ def _interpolated(plan: _Plan, t: float) -> Pose:
 
 
 def _velocity(times: list[float], poses: list[Pose], index: int) -> Vector:
-    """Of the position at an action, from those beside it [m/s]."""
+    """Return the mean velocity at an action, from the actions beside it [m/s]."""
     first, last = max(index - 1, 0), min(index + 1, len(times) - 1)
     h, start, end = times[last] - times[first], poses[first][0], poses[last][0]
     return (end[0] - start[0]) / h, (end[1] - start[1]) / h, (end[2] - start[2]) / h

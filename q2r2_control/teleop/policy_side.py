@@ -1,4 +1,4 @@
-"""Which arms follow a policy: those that no operator drives, from their tools on, until its actions end or break."""
+"""Decide which arms follow a policy: those that no operator drives, until the actions end or have a fault."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from q2r2_control.types import ActionChunk, Array
 
 
 class PolicySide:
-    """The policy of all arms.
+    """Lets a policy drive the arms.
 
-    An operator who has a device is asked first: after a fault, arms wait for a press. Without one, they go on with the
-    next chunk that begins at the tool. Linked arms begin together or not at all: both those that a chunk has actions
-    for and those that a fault has stopped together. Two hands may hold one object.
+    If an operator has a device, arms wait for a press after a fault. Without an operator they go on with the next chunk
+    that begins at the tool. Linked arms begin together or not at all, since they may hold one object. This holds for
+    all arms for which a chunk has actions, and for all arms that a fault has stopped together.
     """
 
     def __init__(self, arms: Mapping[str, ArmTeleop], settings: TeleopSettings) -> None:
         self._arms = arms
         self._motions = {name: PolicyMotion(name, settings) for name in arms}
-        self._told: dict[str, ReasonKind] = {}  # arm -> what its last refused actions were refused for
+        self._told: dict[str, ReasonKind] = {}  # For each arm, why its last actions were refused.
         self._linked = settings.linked
-        self._asked: set[str] = set()  # arms that the newest chunk has actions for
-        self._stopped: set[str] = set()  # linked arms that a fault stopped, and nothing else has moved on since
-        self.seen = False  # whether a policy has sent anything in this run
+        self._asked: set[str] = set()  # Arms for which the newest chunk has actions.
+        self._stopped: set[str] = set()  # Linked arms that a fault stopped, and that nothing has moved since.
+        self.seen = False  # Whether a policy has sent anything in this run.
 
     def configure(self, settings: TeleopSettings) -> None:
         self._linked = settings.linked
@@ -41,7 +41,14 @@ class PolicySide:
     def update(
         self, chunks: Sequence[ActionChunk], around: ArmMeasurements, now: float, clock_fault: Reason | None
     ) -> None:
-        """One tick: take the chunks, stop arms whose actions end or cannot be used, and begin with those that can."""
+        """Take the chunks of a tick, stop arms whose actions have ended or have a fault, and begin with other arms.
+
+        Args:
+            chunks: The new chunks.
+            around: The state of the arms.
+            now: The time [s].
+            clock_fault: Why the loop's clock cannot be trusted, or None.
+        """
         if chunks:
             self.seen = True
         elif not self.seen:
@@ -49,7 +56,7 @@ class PolicySide:
         faults: dict[str, Reason] = {}
         for name, motion in self._motions.items():
             if motion.following and self._arms[name].state is not ArmState.POLICY:
-                motion.forget()  # stopped or taken over: the next chunk says where to go on
+                motion.forget()  # The arm was stopped or taken over. It goes on with the next chunk.
         for chunk in chunks:
             self._asked = {*chunk.tools, *chunk.motions} or self._asked
             for name, motion in self._motions.items():
@@ -68,7 +75,7 @@ class PolicySide:
         return [name for name, arm in self._arms.items() if arm.state in states]
 
     def _refuse(self, faults: Mapping[str, Reason], now: float) -> None:
-        """Arms that follow stop; of others it is told once, not for every chunk."""
+        """Stop arms that follow. For other arms the fault is recorded once, not for every chunk."""
         following = self._in(ArmState.POLICY)
         for name, fault in faults.items():
             self._motions[name].forget()
@@ -93,7 +100,7 @@ class PolicySide:
         return not any(self._arms[other].heard_of for other in lost)
 
     def _begin(self, around: ArmMeasurements, now: float) -> None:
-        """Let arms follow that may, and for which an action counts: linked ones all at once."""
+        """Let arms follow that may and for which there is a plan. Linked arms begin all at once."""
         ready = [name for name in self._arms if self._may_begin(name, around) and self._motions[name].counts(now)]
         if not ready or (self._linked and not self._wanted().issubset(ready)):
             return
@@ -107,17 +114,17 @@ class PolicySide:
                 self._motions[name].forget()
             elif name not in faults:
                 self._told.pop(name, None)
-                self._arms[name].offset = None  # actions are what the controller is asked for
+                self._arms[name].offset = None  # Actions are targets for the controller, without an offset.
                 self._arms[name].go(Cause.POLICY_ACTS, now, Reason(ReasonKind.POLICY_ACTS))
 
     def _wanted(self) -> set[str]:
-        """Linked arms that have to begin together: those that nobody moves now."""
+        """Return the linked arms that have to begin together, because nobody moves them now."""
         self._stopped = {name for name in self._stopped if self._arms[name].state is ArmState.LOST}
         moved = self._in(ArmState.POLICY, ArmState.ENGAGED, ArmState.CARRIED)
         return (self._stopped | (self._asked & self._arms.keys())).difference(moved)
 
     def target(self, name: str, around: ArmMeasurements, now: float) -> pin.SE3:
-        """The target of an arm that follows the policy, which also says how far its gripper is open."""
+        """Return the target of an arm that follows the policy, and set the opening of its gripper."""
         motion = self._motions[name]
         if (opening := motion.gripper(now)) is not None:
             self._arms[name].gripper = opening

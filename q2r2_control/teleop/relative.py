@@ -1,4 +1,4 @@
-"""Relative motion: the tool repeats what the hand has done since both were anchored."""
+"""Relative motion: the tool repeats the motion of the hand since both were anchored."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from q2r2_control.quaternions import (
 )
 from q2r2_control.types import Array, Pose
 
-_REFLECTION = np.diag([1.0, -1.0, 1.0])  # left and right change sign, forward and up do not
-# Past this angle the anchor moves along: a rotation vector has no continuous continuation past a full turn.
+_REFLECTION = np.diag([1.0, -1.0, 1.0])  # Left and right change sign. Forward and up do not.
+# Beyond this angle the anchor follows the hand, because rotation vectors are not continuous beyond a full turn.
 _REANCHOR_ANGLE = 1.5 * math.pi
-_CONTINUOUS = 1.0  # two rotation vectors of one continuous motion are closer than this between two calls [rad]
+_CONTINUOUS = 1.0  # Rotation vectors of one continuous motion differ by less than this between two calls [rad].
 
 
 class RelativeMotion:
@@ -41,14 +41,15 @@ class RelativeMotion:
         rotation  base frame:  exp(rotation_scale log(R R0')) Rtool0
                   tool frame:  Rtool0 exp(rotation_scale log(R0' R))
 
-    as in Quest2ROS2 (HRI 2026) for scales of 1 in the base frame. Which hand drives which arm is not decided here.
+    as in Quest2ROS2 (HRI 2026) for scales of 1 in the base frame. The caller decides which hand drives which arm.
 
-    Every rotation has a second, longer rotation vector. The one that continues the previous call's is used. With a
-    scale other than 1 the tool then does not flip when the hand passes half a turn.
+    Every rotation has a second, longer rotation vector. The one that continues the vector of the previous call is used.
+    With a scale other than 1 the tool then does not flip when the hand passes half a turn.
 
-    Methods that take floats are those of the loop, and check nothing.
+    Methods that take tuples of floats are for the loop. They check nothing.
 
-    Raises :class:`ConfigError` for a value that is not allowed in :class:`TeleopSettings`.
+    Raises:
+        ConfigError: If a value is not allowed in :class:`TeleopSettings`.
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class RelativeMotion:
         if settings.stance is Stance.MIRROR_REFLECTED:
             self._map = _REFLECTION @ self._map
         self._axes = self._scaled_axes()
-        # M exp(w) M' = exp(det(M) M w): where M reflects, what turns one way turns the other way.
+        # M exp(w) M' = exp(det(M) M w): if M reflects, a turn becomes a turn the other way.
         self._turn_map: Array = np.linalg.det(self._map) * self._map
         self._turn_axes = _axes_of(self._turn_map)
         self._hand_position: Vector | None = None
@@ -84,9 +85,10 @@ class RelativeMotion:
         return cls(settings.stance, settings.position_scale, settings.rotation_frame, *scales)
 
     def anchor(self, hand: pin.SE3, tool: pin.SE3) -> None:
-        """Make ``hand`` (input's frame) and ``tool`` (world frame) correspond from now on.
+        """Let ``hand`` (input's frame) correspond to ``tool`` (world frame) from now on.
 
-        Raises :class:`Q2R2Error` for what is no finite pose, as :meth:`target` and :meth:`hand` do.
+        Raises:
+            Q2R2Error: If one of them is not a finite pose, as in :meth:`target` and :meth:`hand`.
         """
         self.anchor_floats(_checked_floats("anchor: hand", hand), _checked_floats("anchor: tool", tool))
 
@@ -95,17 +97,17 @@ class RelativeMotion:
         self.anchor_rotation(hand[1], tool[1])
 
     def rescale(self, position: float, rotation: float, hand: Pose, tool: Pose) -> None:
-        """From now on scale by these shares of the scales; ``hand`` and ``tool`` are anchored, so nothing jumps."""
+        """Use these shares of the scales from now on, and anchor ``hand`` and ``tool``, so that nothing jumps."""
         self._scale, self._rotation_scale = position * self._full[0], rotation * self._full[1]
         self._axes = self._scaled_axes()
         self.anchor_floats(hand, tool)
 
     def anchor_position(self, hand: Vector, tool: Vector) -> None:
-        """Make only the positions correspond from now on; rotations go on as they were."""
+        """Let only the positions correspond from now on. Rotations keep their anchor."""
         self._hand_position, self._tool_position = hand, tool
 
     def anchor_rotation(self, hand: Quaternion, tool: Quaternion) -> None:
-        """Make only the rotations correspond from now on; positions go on as they were."""
+        """Let only the rotations correspond from now on. Positions keep their anchor."""
         self._hand_rotation = normalized(hand)
         self._hand_back = inverse(self._hand_rotation)
         self._tool_rotation = tool = normalized(tool)
@@ -114,9 +116,10 @@ class RelativeMotion:
         self._vector = (0.0, 0.0, 0.0)
 
     def target(self, hand: pin.SE3) -> pin.SE3:
-        """Tool pose in the world frame for a hand pose in the input's frame.
+        """Return the tool's target in the world frame for a hand pose in the input's frame.
 
-        Raises :class:`Q2R2Error` when nothing has been anchored.
+        Raises:
+            Q2R2Error: If nothing has been anchored.
         """
         return se3_of(self.target_floats(_checked_floats("target: hand", hand)))
 
@@ -133,8 +136,8 @@ class RelativeMotion:
         return position, turned
 
     def _turned_tool(self, hand: Quaternion) -> Quaternion:
-        # Not scaled, M R R0' M' Rtool0 = (M R M') (M R0' M' Rtool0), or Rtool0 M R0' R M' = (Rtool0 M R0' M') (M R M')
-        # in the tool's frame. All that does not depend on R is known since the anchor.
+        # Without a scale, M R R0' M' Rtool0 = (M R M') (M R0' M' Rtool0). In the tool's frame, Rtool0 M R0' R M' =
+        # (Rtool0 M R0' M') (M R M'). The factors without R are computed at the anchor.
         if self._rotation_scale == 1.0:
             turn, tool = hand, self._turned_back
         else:
@@ -147,15 +150,18 @@ class RelativeMotion:
         return product(tool, turn) if self._in_tool_frame else product(turn, tool)
 
     def _in_world(self, turn: Quaternion) -> Quaternion:
-        """A turn of the hand as it counts in the world: M R M'."""
+        """Return a rotation of the hand in the world frame: M R M'."""
         (i, a), (j, b), (k, c) = self._turn_axes
         return a * turn[i], b * turn[j], c * turn[k], turn[3]
 
     def hand(self, tool: pin.SE3) -> pin.SE3:
-        """The hand pose, in the input's frame, whose :meth:`target` is ``tool``: where an operator has to put the hand.
+        """Return the hand pose in the input's frame whose :meth:`target` is ``tool``.
 
-        Of rotations beyond half a turn from the anchor the shorter one is taken. With a scale of 0 the hand keeps its
-        position or rotation. Raises :class:`Q2R2Error` when nothing has been anchored.
+        If the rotation is more than half a turn from the anchor, the shorter way round is taken. With a scale of 0 the
+        hand keeps its position or rotation.
+
+        Raises:
+            Q2R2Error: If nothing has been anchored.
         """
         if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.hand: call anchor(hand, tool) first")
@@ -177,7 +183,7 @@ class RelativeMotion:
 
 
 def _checked_floats(name: str, pose: pin.SE3) -> Pose:
-    """The pose as floats. Raises :class:`Q2R2Error` for no pose, and one that is not finite or no rotation."""
+    """Return a pose as floats; raises :class:`Q2R2Error` if it is not a pose, not finite, or not a rotation."""
     if not isinstance(pose, pin.SE3) or not np.allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-3):
         raise Q2R2Error(f"RelativeMotion.{name} = {shown(pose)}: allowed: a pin.SE3 with a proper rotation")
     if not np.isfinite(pose.translation).all():
@@ -186,13 +192,13 @@ def _checked_floats(name: str, pose: pin.SE3) -> Pose:
 
 
 def _axes_of(matrix: Array) -> list[tuple[int, float]]:
-    """Of a signed permutation that may be scaled: where each axis comes from, and by how much of that it goes."""
+    """Return, for each axis of a scaled signed permutation, the axis that it comes from, and the factor."""
     sources = np.abs(matrix).argmax(axis=1)
     return [(int(j), float(row[j])) for row, j in zip(matrix, sources, strict=True)]
 
 
 def _continued(vector: Vector, previous: Vector) -> Vector:
-    """Of the two rotation vectors of one rotation, shorter than a turn, the one that continues ``previous``."""
+    """Return the rotation vector that continues ``previous``, of the two that describe one rotation."""
     angle = math.hypot(*vector)
     if angle == 0.0:
         return vector

@@ -1,4 +1,4 @@
-"""Teleoperation of all arms: from hand samples to tool targets, once per control tick."""
+"""Teleoperate all arms: turn hand samples into targets of the tools, once per control tick."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from q2r2_control.teleop.policy_side import PolicySide
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample
 
 _BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
-_LED = FOLLOWING - {ArmState.CARRIED, ArmState.POLICY}  # by their own hand, which moves no other arm
+_LED = FOLLOWING - {ArmState.CARRIED, ArmState.POLICY}  # States in which an arm follows its own hand.
 
 
 class Teleop:
-    """Hands drive arms relative to anchors; faults stop them. The table of transitions is that of :mod:`arm_states`.
+    """Lets hands drive arms relative to anchors, and stops the arms at faults. :mod:`arm_states` has the transitions.
 
-    Faults of the data stop an engaged arm: no pose or no button data for ``gate.timeout`` of receipt time, a pose that
-    is not finite or not a rotation, a jump or a speed past the gate. Faults around it do so too: one that the input
-    found, a lost connection, a stalled loop, or a clock that went back by more than ``gate.timeout``. With ``linked``
-    they stop the other arm too. Only a new press engages again. The alignment chord of either hand stops both arms,
-    since it moves the frame of both hands.
+    An engaged arm stops if no pose or no reading of the buttons comes for ``gate.timeout`` of receipt time, if a pose
+    is not finite or not a rotation, and if the hand jumps or is faster than the gate allows. It also stops at a fault
+    that the input reports, a lost connection, a stalled loop, and a clock that went back by more than ``gate.timeout``.
+    With ``linked`` the other arm stops as well. Only a new press engages again. The alignment chord of either hand
+    stops both arms, because it moves the frame of both hands.
 
-    Of presses at once, a stop comes first, then the alignment chord, then a pause, then the rest. Either hand may ask
-    for actions of both arms. The way home is the caller's to go while :attr:`homing`.
+    If several presses come at once, a stop goes first, then the alignment chord, then a pause, then the others. Either
+    hand may ask for actions of both arms. While :attr:`homing`, the caller moves the arms home.
 
-    No input makes :meth:`update` raise: samples of unknown hands, old, doubled or in bursts, and any ``now``.
+    :meth:`update` raises for no input: samples of unknown hands, old, repeated or in bursts, and any ``now``.
     """
 
     def __init__(self, settings: TeleopSettings, arms: Sequence[str]) -> None:
         self._pair = BothArms(settings, arms)
         self._arms = self._pair.arms
         self._policy = PolicySide(self._arms, settings)
-        self.marks = self._pair.marks  # the operator's, of the recording
+        self.marks = self._pair.marks  # The operator's marks of episodes in the recording.
         self._commanded: dict[str, pin.SE3] = {}
         self._now: float | None = None
         self._use(settings)
@@ -51,9 +51,10 @@ class Teleop:
         self._linked, self._stall = settings.linked, settings.gate.timeout
 
     def change(self, settings: TeleopSettings, now: float) -> Reason | None:
-        """Other settings from now on, without a jump; returns why that is not possible now, or None.
+        """Use other settings from now on, without a jump; returns why that is not possible now, or None.
 
-        Which hand drives an arm, which way its axes go and what its controls mean may change only while the arms hold.
+        The hand of an arm, the directions of its axes and the meaning of its controls may change only while the arms
+        hold.
         """
         before = self.settings
         turned = (before.stance, before.axes) != (settings.stance, settings.axes)
@@ -78,12 +79,12 @@ class Teleop:
 
     @property
     def engaged(self) -> dict[str, bool]:
-        """Whether each arm follows a hand or a policy now."""
+        """For each arm, whether it follows a hand or a policy now."""
         return {name: arm.state in (*_BY_HANDS, ArmState.POLICY) for name, arm in self._arms.items()}
 
     @property
     def interventions(self) -> dict[str, bool]:
-        """Whether a hand moves each arm in the place of a policy, which has sent actions before."""
+        """For each arm, whether a hand moves it in the place of a policy that has sent actions before."""
         return {name: self._policy.seen and arm.state in _BY_HANDS for name, arm in self._arms.items()}
 
     @property
@@ -93,15 +94,15 @@ class Teleop:
 
     @property
     def homing(self) -> bool:
-        """Whether both arms are to be brought home."""
+        """Whether the caller has to move both arms home."""
         return self._pair.any_in(ArmState.HOMING)
 
     def hand_of(self, arm: str) -> str:
-        """The hand that drives ``arm``."""
+        """Return the hand that drives ``arm``."""
         return next(hand for hand, driven in self._pair.arm_of_hand.items() if driven == arm)
 
     def take_events(self) -> list[Event]:
-        """State changes and refused presses since the last call, in order of time."""
+        """Return the changes of state and the refused presses since the last call, in order of time."""
         events = sorted((event for arm in self._arms.values() for event in arm.events), key=lambda event: event.t)
         for arm in self._arms.values():
             arm.events.clear()
@@ -117,12 +118,21 @@ class Teleop:
         in_step: bool = True,
         chunks: Sequence[ActionChunk] = (),
     ) -> dict[str, ArmTarget]:
-        """One tick: process the samples, and a policy's ``chunks``, and compute every arm's target.
+        """Process the samples of one tick and the chunks of a policy, and compute the target of every arm.
 
-        ``tools``: measured tool poses in the world frame. ``commanded``: those of the controller's reference, which the
-        leash is tied to; without it there is no leash. ``obstacles``: reasons outside of this layer against engaging an
-        arm now. ``in_step``: ``commanded`` has all tools at one moment, so that it may correct the relation of tools
-        that carry. ``now`` [s] is the clock of the samples' stamps.
+        Args:
+            samples: The new samples of all hands.
+            tools: The measured poses of the tools, in the world frame.
+            now: The time, of the same clock as the samples' stamps [s].
+            commanded: The tools in the controller's reference, near which the leash keeps targets; without it there is
+                no leash.
+            obstacles: For each arm that may not be engaged now, the reason from outside of this layer.
+            in_step: Whether all poses in ``commanded`` are of one moment, so that they may correct the relation of two
+                tools that carry.
+            chunks: The new action chunks of a policy.
+
+        Returns:
+            The target of every arm.
         """
         now, clock_fault = self._clock(now)
         faults: dict[str, Reason] = {}
@@ -169,37 +179,37 @@ class Teleop:
         return targets
 
     def home(self, now: float) -> None:
-        """Both arms shall go home, because a program says so. An obstacle is told as an event."""
+        """Let both arms go home because a program asks for it. If they may not, an event says why."""
         self._pair.home(now, None)
 
     def end_homing(self, now: float, outcome: Reason) -> None:
-        """The way home is over, with this ``outcome``: at home, without a way there, or by a fault."""
+        """End the way home with an ``outcome``: the arms have arrived, cannot go on, or have stopped by a fault."""
         fault = outcome.kind in (ReasonKind.HOMING_FAULT, ReasonKind.NOT_HOMING)
         self._pair.change(Cause.FAULT if fault else Cause.HOMED, now, outcome)
 
     def record_event(self, now: float, reason: Reason) -> None:
-        """The things that the operator should know of both arms."""
+        """Record an event of both arms for the operator."""
         for arm in self._arms.values():
             arm.record_event(now, reason)
 
     def mark(self, now: float, action: Action) -> None:
-        """A program marks the recording, as a hand may; see :class:`EpisodeMarks`."""
+        """Mark the recording for a program, as a hand may do; see :class:`EpisodeMarks`."""
         next(iter(self._arms.values())).record_event(now, Reason(self.marks.apply(action)))
 
     def reset(self, now: float, arm: str, reason: Reason) -> None:
-        """An arm holds, its hand has to be seen anew before it drives the arm, and a stop of all arms is over."""
+        """Let an arm hold, forget everything that came from its hand, and end a stop of all arms."""
         self.hold(now, reason, arm)
         self._arms[arm].forget()
         self._pair.change(Cause.GO_ON, now, reason)
 
     def hold(self, now: float, reason: Reason, arm: str) -> None:
-        """An arm holds because a program asks for it, which is an event also where it holds already."""
+        """Let an arm hold because a program asks for it. This is an event even if the arm holds already."""
         if self._arms[arm].state in AT_REST:
             self._arms[arm].record_event(now, reason)
         self.pause(now, reason, arm)
 
     def connection_lost(self, now: float) -> None:
-        """The input is lost: every arm that a hand drives stops, and everything received is forgotten."""
+        """Stop every arm that a hand drives, and forget everything received, because the input is lost."""
         now, _ = self._clock(now)
         if not self.homing or self._pair.asks_home is not None:
             self._pair.change(Cause.FAULT, now, Reason(ReasonKind.CONNECTION_LOST))
@@ -207,9 +217,10 @@ class Teleop:
             arm.forget()
 
     def pause(self, now: float, reason: Reason, arm: str | None = None) -> None:
-        """Every arm holds until a new press, for a reason outside of this layer.
+        """Let every arm hold until a new press, for a reason from outside of this layer.
 
-        With ``arm`` the reason is of that arm: others that follow their hands hold too where they are linked.
+        If ``arm`` is given, the reason concerns that arm. Other arms that follow their hands then hold only if they are
+        linked.
         """
         now, _ = self._clock(now)
         if arm is None or self.homing:
@@ -218,12 +229,12 @@ class Teleop:
             self._stop({arm: reason}, now)
 
     def press_to_engage(self, arm: str | None = None) -> None:
-        """As if the hand of an arm, or both, had pressed what engages it; where a dead man does, nothing happens."""
+        """Press the button that engages, in the place of one hand or both. A dead man cannot be pressed like this."""
         for name in self._arms if arm is None else (arm,):
             self._arms[name].press_to_engage()
 
     def give_back(self, now: float) -> None:
-        """No hand drives an arm or is waited for: the policy may go on, until a hand is heard of again."""
+        """Let the policy go on, because no hand drives an arm any more, until a hand sends again."""
         now, _ = self._clock(now)
         reason = Reason(ReasonKind.POLICY_REQUESTED)
         self._pair.end_carry(now, reason)
@@ -232,7 +243,7 @@ class Teleop:
             arm.heard_of = False
 
     def _clock(self, now: float) -> tuple[float, Reason | None]:
-        """The time from now on, which does not go back a little, and the fault of a clock that cannot be followed."""
+        """Return the time that counts, which does not go back, and a fault if the clock went back by too much."""
         last = self._now
         if not math.isfinite(now):
             return last or 0.0, Reason(ReasonKind.CLOCK_NOT_FINITE)
@@ -248,7 +259,7 @@ class Teleop:
         return now, Reason.of(ReasonKind.CLOCK_WENT_BACK, duration=last - now)
 
     def _disengage(self, faults: Mapping[str, Reason], now: float) -> None:
-        """Stop the arms whose hand has a fault; that of a hand whose arm holds anyway has no effect."""
+        """Stop the arms whose hand has a fault. A fault has no effect if the arm holds anyway."""
         if self.homing:
             if (fault := faults.get(self._pair.asks_home or "")) is not None:
                 self._pair.change(Cause.FAULT, now, Reason(ReasonKind.HOMING_FAULT, cause=fault))

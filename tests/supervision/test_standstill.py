@@ -14,6 +14,7 @@ from q2r2_control.supervision.standstill import (
     JOINTS,
     LAGGING_JOINTS,
     LAGGING_TOOL,
+    WINDOW,
     StandstillLimits,
     StandstillWatch,
 )
@@ -126,6 +127,16 @@ def test_nothing_is_judged_where_the_loop_or_the_states_have_a_gap() -> None:
     assert list(findings(JOINTS, asked, heard=gap)) == []
     found = next(findings(JOINTS, asked, ticks=gap, lag=0.008, frozen_at=1.0))
     assert 1.0 < found <= 1.0 + WITHIN
+
+
+def test_nothing_is_judged_before_a_whole_window_was_seen() -> None:
+    """The command runs away at once, and the arm is measured where it was."""
+    watch, still = StandstillWatch(JOINTS), np.zeros(3)
+    for step in range(40):
+        t = step * DT
+        found = watch.look(np.full(3, 2.0 * t), still, t, t)
+        assert found is None or t >= WINDOW
+    assert found is not None
 
 
 def test_states_that_come_fifty_times_a_second_are_enough() -> None:

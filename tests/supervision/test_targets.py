@@ -84,6 +84,13 @@ def test_one_publisher_may_lose_numbers_and_one_that_takes_over_is_one_break_and
     assert found[-1] == 0
 
 
+def test_a_break_counts_for_one_second_and_a_message_that_comes_twice_is_one() -> None:
+    watch = SequenceWatch()
+    found = [watch.take(number, now, STREAM_TIMEOUT) for number, now in ((5, 0.0), (5, 0.1), (6, 0.2), (6, 0.3))]
+    assert found == [0, 1, 1, 2]
+    assert [watch.take(7 + k, 0.35 + 0.1 * k, STREAM_TIMEOUT) for k in range(12)] == [2] * 8 + [1, 1, 0, 0]
+
+
 def test_numbers_begin_anew_after_a_silence_for_who_was_started_again() -> None:
     watch = SequenceWatch()
     for number in range(100):
@@ -133,6 +140,8 @@ def test_the_way_is_the_targets_own() -> None:
         middle = found.translation - np.array([0.5, 0.0, 0.4])
         assert np.linalg.norm(middle) == pytest.approx(RADIUS, abs=2e-4)
         angle = math.atan2(middle[1], middle[0])
+        tilt = found.rotation[2, :2]
+        assert np.abs(tilt).max() < 1e-9
         turned = math.remainder(pin.log3(found.rotation)[2] - angle, math.tau)
         assert abs(turned) < 2e-3
 
@@ -164,6 +173,16 @@ def test_stamps_that_say_nothing_let_targets_be_taken_as_they_are(stamps: list[f
         target = circling(k * SENDER)
         line.put(target, stamp)
         assert line.at(stamp + 0.004) is target
+
+
+def test_a_target_that_is_due_before_the_last_one_is_taken_as_it_is() -> None:
+    line = TargetExtrapolator()
+    for k in range(10):
+        line.put(circling(k * SENDER), k * SENDER)
+    line.put(circling(7 * SENDER), 7 * SENDER)
+    older = circling(4 * SENDER)
+    line.put(older, 4 * SENDER)
+    assert line.at(5 * SENDER) is older
 
 
 def test_a_new_stream_owes_nothing_to_the_one_before() -> None:

@@ -80,6 +80,13 @@ def test_time_begins_anew_after_a_long_gap_and_where_it_was_set_back(gap: float)
     assert clock.at(now + PERIOD) == pytest.approx(now + PERIOD)
 
 
+def test_time_stands_still_while_a_clock_is_back_by_less_than_a_period() -> None:
+    clock = ten_ticks()
+    last = clock.at(10 * PERIOD)
+    assert clock.at(9.5 * PERIOD) == last
+    assert clock.at(8.5 * PERIOD) == 8.5 * PERIOD, "it was set back, and time begins anew"
+
+
 DT = 0.01
 LIMITS = GuardSettings(max_velocity=0.5, max_acceleration=5.0, max_angular_velocity=2.0, max_angular_acceleration=20.0)
 FASTEST = np.array([LIMITS.max_velocity, LIMITS.max_angular_velocity])

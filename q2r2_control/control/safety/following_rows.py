@@ -1,11 +1,13 @@
-"""Rows of the QP for an arm that moves after another one, which may stop alone (arm_skew.py).
+"""Write the rows of the QP for an arm that follows another one, which may stop alone (arm_skew.py).
 
-The arm in front may be where it was a window D ago. Along the pair's normal n the arm behind it has free
+The arm in front may still be where it was a window D ago. Along the normal n of a pair the arm behind has the free
+distance
 
     B = d - min_distance - buffer - n'(the front's way in the window) - n'(the way of the stop behind).
 
-As in separation_rows.py a step uses up no more than a share of it, B+ >= (1 - gain h) B. The motion of the one in front
-now counts after D only. In a step B therefore changes by its way of D ago, and by what the one behind decides now.
+As in separation_rows.py, a step may use up only a share of it: B+ >= (1 - gain h) B. The present motion of the arm in
+front counts only after D. In a step B therefore changes by the way that this arm went D ago, and by the present motion
+of the arm behind.
 """
 
 from __future__ import annotations
@@ -20,14 +22,24 @@ from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 def append_following_row(
     model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, gain: float, count: int
 ) -> int:
-    """Add the row of pair ``p`` of two arms as number ``count`` where one follows the other, and the row may bind.
+    """Add the row of pair ``p`` of two arms if one arm follows the other and the row may bind.
 
-    The step takes ``h``, the certified stop from here ``duration`` [s]. Returns the number of rows then.
+    Args:
+        model: The model.
+        data: The data.
+        p: The pair.
+        h: Duration of the step [s].
+        duration: Duration of the certified stop [s].
+        gain: See separation_rows.py [1/s].
+        count: Number of rows so far.
+
+    Returns:
+        The number of rows then.
     """
     pairs, history, v, row = model.collision.pairs, data.history, data.state.v, data.rows.matrix[count]
     distance = measure(model.collision, data.collision, p)
     if distance < model.min_distance[p] or history.counted[0] == 0:
-        return count  # one that is too close has to open, whoever is in front
+        return count  # A pair that is too close has to open, whichever arm is in front.
     distance_row(model.collision, data.collision, p, row)
     first, second = 0.0, 0.0
     for k in range(pairs.joint.shape[1]):

@@ -1,4 +1,4 @@
-"""Joint limits as one interval of next velocities per joint, never empty.
+"""Turn joint limits into one interval of next velocities per joint, which is never empty.
 
 The reference moves with constant acceleration during a step h <= H (H is the longest step):
 
@@ -13,12 +13,13 @@ then full braking keeps P for any h in (0, H], and the interval below contains f
 *Proof.* Let v > 0. If v >= a h, braking gives w = v - a h and r' = r - v h + a h^2 / 2. Then
 w^2/(2a) + H w = v^2/(2a) + H v - v h + a h^2/2 - a h H <= r - v h + a h^2/2 - a h H <= r'. If v < a h, braking gives
 w = 0 and r' = r - v h / 2 >= v^2/(2a) + H v - v h / 2 >= 0 because h <= H. If v <= 0, r' >= r. The bound is the largest
-v+ for which P holds after the step, so every v+ at or below it that the acceleration allows keeps P. Velocity and
-acceleration intervals contain full braking too, and by symmetry so does the bound for the lower limit. Between two
-steps q stays inside as well: a velocity that changes sign within a step travels at most |v| h / 2 <= H |v|. []
+v+ for which P holds after the step. Every v+ at or below it that the acceleration limit allows therefore keeps P. The
+intervals of the velocity and acceleration limits contain full braking too, and by symmetry so does the bound for the
+lower limit. Between two steps q stays inside as well, because a velocity that changes its sign within a step travels at
+most |v| h / 2 <= H |v|. []
 
-A state that starts outside P (beyond a limit, too fast to stop, above the velocity limit) has no interval that keeps
-every limit. Then the acceleration limit wins, and the joint brakes and returns inward at bounded speed.
+For a state outside P (beyond a limit, too fast to stop, above the velocity limit) no interval keeps every limit. The
+acceleration limit is kept then, and the joint brakes and returns inward at bounded speed.
 """
 
 from __future__ import annotations
@@ -32,30 +33,29 @@ from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import kernel
 from q2r2_control.types import Array
 
-# Inward speed per radian outside, and how far inside the return aims so that it ends after finite time.
-_RETURN_GAIN = 4.0  # [1/s]
-_RETURN_DEPTH = 1e-3  # [rad]
+_RETURN_GAIN = 4.0  # Inward speed per radian outside of the limit [1/s].
+_RETURN_DEPTH = 1e-3  # The return aims this far inside, so that it ends after a finite time [rad].
 
-NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3  # what may hold a joint back
+NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3  # The kinds of limits that hold a joint back.
 
 
 class JointLimits(NamedTuple):
     """The limits that every joint keeps."""
 
-    lower: Array  # (nv,) positions, the margin taken off [rad]
-    upper: Array  # (nv,)
+    lower: Array  # (nv,) Least positions, with the margin [rad].
+    upper: Array  # (nv,) Greatest positions, with the margin [rad].
     velocity: Array  # (nv,) [rad/s]
     acceleration: Array  # (nv,) [rad/s^2]
     longest_step: float  # H [s]
-    return_speed: float  # inward, of a joint outside its limits [rad/s]
+    return_speed: float  # Inward speed of a joint outside its limits [rad/s].
 
 
 class VelocityBox(NamedTuple):
-    """Interval of next velocities per joint, and which limit makes each side of it."""
+    """The interval of next velocities of each joint, and the kind of limit at each of its ends."""
 
     lower: Array  # (nv,) [rad/s]
-    upper: Array  # (nv,)
-    lower_limit: IntArray  # (nv,) POSITION, VELOCITY or ACCELERATION
+    upper: Array  # (nv,) [rad/s]
+    lower_limit: IntArray  # (nv,) POSITION, VELOCITY or ACCELERATION.
     upper_limit: IntArray  # (nv,)
 
     @classmethod
@@ -65,9 +65,17 @@ class VelocityBox(NamedTuple):
 
 @kernel
 def fastest_towards(room: float, v: float, a: float, h: float, longest: float, return_speed: float) -> float:
-    """Largest next velocity towards a limit [rad/s] that keeps P, given the ``room`` to it [rad]; see the proof above.
+    """Return the largest next velocity towards a limit that keeps P [rad/s]; see the proof above.
 
-    It solves w^2/(2a) + (H + h/2) w = room - v h / 2 for w. Outside the limit it asks for motion inward.
+    It solves w^2/(2a) + (H + h/2) w = room - v h / 2 for w. Outside the limit it is a motion inward.
+
+    Args:
+        room: Distance to the limit [rad].
+        v: Present velocity towards the limit [rad/s].
+        a: Acceleration limit [rad/s^2].
+        h: Duration of the step [s].
+        longest: The longest step H [s].
+        return_speed: Greatest inward speed outside the limit [rad/s].
     """
     remaining = room - 0.5 * v * h
     if room < 0.0:
@@ -75,15 +83,15 @@ def fastest_towards(room: float, v: float, a: float, h: float, longest: float, r
     if remaining < 0.0:
         return 0.0
     c = longest + 0.5 * h
-    # The root written without the difference of two nearly equal numbers.
+    # This form of the root has no difference of two nearly equal numbers.
     return 2.0 * remaining / (c + np.sqrt(c * c + 2.0 * remaining / a))
 
 
 @kernel
 def next_velocity_box(limits: JointLimits, q: Array, v: Array, h: float, box: VelocityBox) -> bool:
-    """Fill ``box`` for a step of ``h`` from ``q`` [rad] and ``v`` [rad/s], (nv,) each.
+    """Write ``box`` for a step of ``h`` [s] from ``q`` (nv,) [rad] and ``v`` (nv,) [rad/s].
 
-    Returns False where some joint is outside P, that is, recovers.
+    Returns False if a joint is outside P, so that it recovers.
     """
     inside = True
     for j in range(q.shape[0]):
@@ -96,7 +104,7 @@ def next_velocity_box(limits: JointLimits, q: Array, v: Array, h: float, box: Ve
         up = min(up, limits.velocity[j])
         down = max(down, -limits.velocity[j])
         if up < slowest or down > fastest or up < down:
-            # A last bit lost to rounding is not recovery.
+            # A joint that is outside by rounding does not recover.
             scale = 1e-9 * (1.0 + abs(v[j]))
             if up < slowest - scale or down > fastest + scale or up < down - scale:
                 inside = False

@@ -1,4 +1,4 @@
-"""Recent postures of the reference, where real arms may still be: arm_skew.py needs them. Compiled."""
+"""Keep recent postures of the reference, at which lagging arms may still be, for arm_skew.py (compiled)."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.kernel_pointers import KernelPointers, pointers_to
 from q2r2_control.types import Array
 
-LONGEST_WINDOW = 0.1  # that the postures of the past reach back [s]
+LONGEST_WINDOW = 0.1  # The longest time for which past postures are kept [s].
 _POSTURES = 21
-_SPACING = LONGEST_WINDOW / (_POSTURES - 1)  # of these in time, or the length of a longer step [s]
-_LONG_AGO = 1e3  # since when arms at rest count as resting [s]
+_SPACING = LONGEST_WINDOW / (_POSTURES - 1)  # Time between two of them, if steps are not longer [s].
+_LONG_AGO = 1e3  # The age of the posture of arms that have rested [s].
 
 
 class ReferenceHistory(NamedTuple):
     """Recent postures of the reference, sorted from the newest to the oldest."""
 
-    window: Array  # (2,) in force, and asked for; 0: all arms are one body [s]
+    window: Array  # (2,) The present window, and the one asked for [s]; 0 if all arms move as one body.
     q: Array  # (m, nv) [rad]
     v: Array  # (m, nv) [rad/s]
-    a: Array  # (m, nv) greatest acceleration from each posture to the next newer one [rad/s^2]
-    age: Array  # (m,) of each posture [s]
-    known: Array  # (m,) 1 where the bodies of a posture are placed
-    samples: KernelPointers  # (m,) CollisionData at each
-    counted: IntArray  # (1,) number of postures that the window reaches back to
-    time: Array  # (1,) how far it reaches back [s]
-    travel: Array  # (nv,) the farthest that a joint was in the window from where it is now [rad or m]
-    off: Array  # (nv,) the most that it was off v t there, with what turning adds [rad or m]
-    speed: Array  # (nv,) its greatest speed there [rad/s]
-    # Its share in how far corners are off straight lines: in the window; and on the whole way, looked at coarsely or
-    # finely (3, nv).
+    a: Array  # (m, nv) Greatest acceleration from each posture to the next newer one [rad/s^2].
+    age: Array  # (m,) Age of each posture [s].
+    known: Array  # (m,) 1 if the bodies of a posture are placed.
+    samples: KernelPointers  # (m,) CollisionData at each posture.
+    counted: IntArray  # (1,) Number of postures in the window.
+    time: Array  # (1,) Age of the oldest of them [s].
+    travel: Array  # (nv,) Greatest distance of a joint in the window from its present position [rad or m].
+    off: Array  # (nv,) Greatest deviation of a joint from v t in the window, plus the effect of turning [rad or m].
+    speed: Array  # (nv,) Greatest speed of a joint in the window [rad/s].
+    # Share of each joint in the deviation of corners from straight lines (3, nv): in the window, and on the whole way
+    # with instants that are far apart, or close together.
     bend: Array
-    deviation: Array  # (nv,) the most that it is off v t on the whole way, with what turning adds [rad or m]
+    deviation: Array  # (nv,) Greatest deviation from v t on the whole way, plus the effect of turning [rad or m].
 
     @classmethod
     def empty(cls, model: CollisionModel, shared: CollisionData) -> ReferenceHistory:
-        """At rest at zero; the samples have their scratch in common with ``shared``."""
+        """Return a history of arms at rest at zero. The samples share their scratch with ``shared``."""
         nv = len(model.chain.parent) - 1
         samples = []
         for _ in range(_POSTURES):
@@ -66,13 +66,13 @@ class ReferenceHistory(NamedTuple):
 
     @property
     def kept(self) -> tuple[Array, ...]:
-        """The arrays that say where the reference was; the others are made of them."""
+        """The arrays from which all others are computed."""
         return self.window, self.q, self.v, self.a, self.age
 
 
 @kernel
 def rest_always(history: ReferenceHistory, q: Array) -> None:
-    """Let the arms have rested at ``q`` (nv,)."""
+    """Write the history of arms that have always rested at ``q`` (nv,)."""
     history.window[0] = history.window[1]
     for i in range(history.age.shape[0]):
         history.age[i] = _LONG_AGO
@@ -82,7 +82,7 @@ def rest_always(history: ReferenceHistory, q: Array) -> None:
 
 @kernel
 def remember(history: ReferenceHistory, q: Array, v: Array, v_next: Array, h: float) -> None:
-    """Before the reference leaves ``q``, ``v`` (nv,) and has ``v_next`` after ``h`` [s]: keep it for the window."""
+    """Remember the reference ``q``, ``v`` (nv,) before a step of ``h`` [s] that leads to the velocities ``v_next``."""
     if history.window[1] == 0.0:
         history.window[0] = 0.0
         return
@@ -108,9 +108,9 @@ def remember(history: ReferenceHistory, q: Array, v: Array, v_next: Array, h: fl
 
 @kernel
 def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Array) -> None:
-    """Find out where the joints were in the window, seen from the reference ``q``, ``v`` (nv,)."""
+    """Compute how far the joints were in the window from the reference ``q``, ``v`` (nv,)."""
     if history.window[0] == 0.0 and history.counted[0] == 0:
-        return  # all arms are one body, and all that is found here is 0 already
+        return  # All arms move as one body, and all results are 0 already.
     history.counted[0], history.time[0] = 0, 0.0
     history.travel[:], history.off[:], history.speed[:], history.bend[0, :] = 0.0, 0.0, 0.0, 0.0
     longest, newer, window = 0.0, 0.0, history.window[0]
@@ -122,7 +122,7 @@ def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Arr
         for j in range(q.shape[0]):
             later = v[j] if i == 0 else history.v[i - 1, j]
             moved |= history.v[i, j] != 0.0 or history.a[i, j] != 0.0 or later != 0.0
-        # Arms that rested did so for as long as they are asked about.
+        # Arms at rest have rested for the whole window.
         age = history.age[i] if moved else min(history.age[i], max(newer, window))
         if moved:
             longest = max(longest, age - newer)
@@ -149,7 +149,7 @@ def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Arr
 
 @inlined_kernel
 def turning(model: CollisionModel, way: Array, j: int) -> float:
-    """w_j (w_j + 2 sum_(i before j) w_i) of ``way`` (nv,): what a joint's motion and its turning of others add."""
+    """Return w_j (w_j + 2 sum_(i before j) w_i) for ``way`` (nv,): the effect of joint j's motion and turning."""
     before = 0.0
     joint = model.chain.parent[j + 1]
     while joint != 0:

@@ -1,4 +1,4 @@
-"""The reference's state and the arrays that the safety kernels write anew at each tick."""
+"""The state of the reference, and the arrays that the safety kernels write in each tick."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from q2r2_control.control.safety.speed_bound import BodyVelocities
 from q2r2_control.control.safety.tool_speed import ToolLimits, ToolSpeeds
 from q2r2_control.types import Array
 
-# A pair that is closer than its distance by less than this is not too close, see stop_certificate.py.
+# A pair counts as too close if it lacks more than this of its distance, see stop_certificate.py.
 ROUNDING = 1e-9  # [m]
 
 
 class Approach(NamedTuple):
-    """How pairs may approach each other in the QP."""
+    """The rules by which pairs may approach each other in the QP."""
 
-    stop_distance: Array  # (p,) min_distance + buffer [m]
-    gain: Array  # (1,), which may change between ticks, see separation_rows.py [1/s]
-    contact_speed: Array  # (p,) of pairs that may touch, in the contact zone [m/s]; of the others infinite
-    contact_zone: Array  # (p,) free distance from which on that holds [m]; of the others 0
+    stop_distance: Array  # (p,) min_distance plus buffer [m].
+    gain: Array  # (1,) It may change between ticks, see separation_rows.py [1/s].
+    contact_speed: Array  # (p,) Greatest speed in the contact zone of pairs that may touch; infinite for others [m/s].
+    contact_zone: Array  # (p,) Free distance at which the contact zone begins; 0 for other pairs [m].
     recovery_speed: float  # [m/s]
 
 
 class SafetyModel(NamedTuple):
-    """Data that do not change in a tick; between ticks bodies of fingers, kept distances and the rows' gain may."""
+    """Data that do not change in a tick. Between ticks bodies of fingers, kept distances and the gain may change."""
 
     collision: CollisionModel
     limits: JointLimits
     approach: Approach
-    min_distance: Array  # (p,) of every pair [m]; minus infinity: it does not count now
-    arm: IntArray  # (nv,) number of the arm that a joint belongs to; joints of none share the last number
-    of_two_arms: IntArray  # (p,) 1: both bodies move, and no joint moves both
+    min_distance: Array  # (p,) Distance that every pair keeps [m]; minus infinity if the pair does not count now.
+    arm: IntArray  # (nv,) Number of the arm of each joint. Joints outside of all arms share the last number.
+    of_two_arms: IntArray  # (p,) 1 if both bodies move, and no joint moves both.
     tools: ToolLimits
 
 
-_SAMPLES = 65  # of a stop, both ends among them
-INSTANTS = (0, 20, 64)  # of 64, where a row looks at the stop: the start, half of the way, and the end
-# The closest points and four segment ends at each, and one of an arm that follows another.
+_SAMPLES = 65  # Number of samples of a stop, with both ends.
+INSTANTS = (0, 20, 64)  # Samples at which a row looks at the stop: its start, half of its way, and its end.
+# The closest points and four segment ends at each instant, and one row for an arm that follows another one.
 _ROWS_PER_PAIR = 5 * len(INSTANTS) + 1
 
 
@@ -52,47 +52,51 @@ class ReferenceState(NamedTuple):
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
-    a: Array  # (nv,) mean of this tick [rad/s^2]
+    a: Array  # (nv,) Mean acceleration in this tick [rad/s^2].
 
 
 class SeparationRows(NamedTuple):
-    """Rows ``matrix v >= lower`` of the QP; the first ``used[0]`` are valid."""
+    """Rows ``matrix v >= lower`` of the QP. The first ``used[0]`` rows are valid."""
 
-    matrix: Array  # (m, nv)
-    lower: Array  # (m,) [m/s]; of unit rows [rad/s]
-    pair: IntArray  # (m,)
-    used: IntArray  # (1,) number of valid rows
-    ahead: Array  # (instants,) scratch: how far a pair is apart at each [m]
+    matrix: Array  # (m, nv) Rows of unit norm.
+    lower: Array  # (m,) [rad/s]
+    pair: IntArray  # (m,) The pair of each row.
+    used: IntArray  # (1,) Number of valid rows.
+    ahead: Array  # (instants,) Scratch: the distance of a pair at each instant [m].
 
 
 class Candidate(NamedTuple):
-    """The state after a step that is being looked at, and the stop from there."""
+    """A state after the step that may be taken, and a stop from there."""
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
-    deceleration: Array  # (nv,) of the stop [rad/s^2]
+    deceleration: Array  # (nv,) Decelerations of the stop [rad/s^2].
 
 
 class QuadraticPiece(NamedTuple):
-    """How the joints move in a piece of time: D_j(t) = rate t + change t^2 / 2, or anywhere from 0 to ``loose``."""
+    """The motion of the joints in a piece of time.
+
+    Joint j moves by D_j(t) = rate t + change t^2 / 2. If it comes to rest in the piece, all that is known is that D_j
+    is between 0 and ``loose``.
+    """
 
     rate: Array  # (nv,) [rad/s]
     change: Array  # (nv,) [rad/s^2]
     loose: Array  # (nv,) [rad]
-    travel: Array  # (nv,) total variation [rad]
+    travel: Array  # (nv,) Total variation of D_j [rad].
 
 
 class Rollout(NamedTuple):
-    """Scratch of the stop certificate: samples of a stop."""
+    """Samples of a stop, which the stop certificate writes."""
 
     q: Array  # (s, nv)
     v: Array  # (s, nv)
-    samples: KernelPointers  # (s,) CollisionData at each; rotations of joint frames and contact are shared scratch
-    known: Array  # (s,) 1 where the sample's bodies are placed
-    step: QuadraticPiece  # from the reference to the candidate
-    stop: QuadraticPiece  # all of the candidate's stop
-    piece: QuadraticPiece  # a part of it
-    deviation: Array  # (nv,) most of each joint from straight on, see speed_bound.py [rad or m]
+    samples: KernelPointers  # (s,) CollisionData at each sample. Frame rotations and contact are shared scratch.
+    known: Array  # (s,) 1 if the bodies of the sample are placed.
+    step: QuadraticPiece  # The step from the reference to the candidate.
+    stop: QuadraticPiece  # The whole stop of the candidate.
+    piece: QuadraticPiece  # A part of the stop.
+    deviation: Array  # (nv,) Greatest deviation of each joint from motion at its speed, see speed_bound.py [rad or m].
 
     @classmethod
     def empty(cls, model: CollisionModel) -> Rollout:
@@ -116,30 +120,30 @@ class Rollout(NamedTuple):
 
 
 class ActiveBounds(NamedTuple):
-    """The limits that held the last step back; the first ``used[0]`` are valid."""
+    """The limits that held the last step back. The first ``used[0]`` entries are valid."""
 
-    kind: IntArray  # (k,) POSITION, VELOCITY or ACCELERATION of a joint, SEPARATION of a pair, TOOL_SPEED of a tool
-    subject: IntArray  # (k,) index of the joint, the pair or the tool
-    used: IntArray  # (1,)
+    kind: IntArray  # (k,) POSITION, VELOCITY or ACCELERATION of a joint, SEPARATION of a pair, TOOL_SPEED of a tool.
+    subject: IntArray  # (k,) Index of the joint, the pair or the tool.
+    used: IntArray  # (1,) Number of valid entries.
 
 
 class SafetyData(NamedTuple):
-    """The reference's state and what is measured and decided about it."""
+    """The state of the reference, and the results of the safety kernels."""
 
     state: ReferenceState
-    collision: CollisionData  # at the reference
+    collision: CollisionData  # Placements and contact at the reference.
     velocities: BodyVelocities
-    distance: Array  # (p,) of each pair, or a lower bound where it is far [m]
-    near: IntArray  # (p,) 1 where a row may bind
+    distance: Array  # (p,) Distance of each pair, or a lower bound of it for pairs that are far apart [m].
+    near: IntArray  # (p,) 1 if a row of the pair may bind.
     rows: SeparationRows
     box: VelocityBox
-    wanted: Array  # (nv,) the solver's next velocities within the box [rad/s]
-    braked: Array  # (nv,) next velocities of the certified stop [rad/s]
-    certified: Array  # (nv,) decelerations of the certified stop [rad/s^2]
+    wanted: Array  # (nv,) The solver's next velocities, clamped to the box [rad/s].
+    braked: Array  # (nv,) The next velocities of the certified stop [rad/s].
+    certified: Array  # (nv,) The decelerations of the certified stop [rad/s^2].
     candidate: Candidate
     rollout: Rollout
     active: ActiveBounds
-    unproven: IntArray  # (1,) pair that the last certificate failed for
+    unproven: IntArray  # (1,) The pair for which the last certificate failed.
     history: ReferenceHistory
     tools: ToolSpeeds
 
@@ -174,13 +178,11 @@ class SafetyData(NamedTuple):
 
 
 def provable_distances(model: SafetyModel, data: SafetyData) -> Array:
-    """d - S of every pair (p,) [m]: the stop that is at hand brings it no closer than that (stop_certificate.py).
+    """Return d - S of every pair (p,) [m]: the known stop brings no pair closer than that (stop_certificate.py).
 
-    Nor does what the arms may still be at, see arm_skew.py.
-
-    Needs the distances at the reference as it is. A pair may be asked to keep as much from now on. Then the stop at
-    hand is proven with that, as if it had always been so.
+    This also holds for the places where lagging arms may still be, see arm_skew.py. It needs the distances at the
+    present reference. A pair may be asked to keep this distance from now on, since the known stop is certified with it.
     """
     pairs, travel = model.collision.pairs, np.maximum(0.5 * data.state.v**2 / data.certified, data.history.travel)
-    way = (pairs.reach * travel[pairs.joint - 1]).sum(axis=1)  # reach is 0 where there is no joint
+    way = (pairs.reach * travel[pairs.joint - 1]).sum(axis=1)  # The reach is 0 for entries without a joint.
     return np.asarray(data.distance - way)

@@ -1,7 +1,7 @@
-"""Take the solver's velocities as far as they can be certified, and move the reference, compiled.
+"""Move the reference by the part of the solver's velocities that can be certified (compiled).
 
-The last tick's certified stop is always at hand. If nothing better can be certified, its next piece is executed, and
-what is left of it stays certified (stop_certificate.py).
+The certified stop of the last tick is always known. If nothing better can be certified, its next piece is executed, and
+the rest of it stays certified (stop_certificate.py).
 """
 
 from __future__ import annotations
@@ -22,20 +22,28 @@ from q2r2_control.control.safety.tool_speed import keeps_tool_speed
 from q2r2_control.types import Array
 
 FOLLOWED, REDUCED, STOPPED = 0, 1, 2
-SEPARATION = ACCELERATION + 1  # what may hold a pair of bodies back, next to the limits of joints
-TOOL_SPEED = SEPARATION + 1  # what may hold a tool back
+SEPARATION = ACCELERATION + 1  # The kind of limit that holds a pair of bodies back.
+TOOL_SPEED = SEPARATION + 1  # The kind of limit that holds a tool back.
 _BISECTIONS = 4
-_ACTIVE = 1e-7  # [rad/s] from a bound
+_ACTIVE = 1e-7  # A velocity that is this near to a bound has met it [rad/s].
 
 
 @kernel
 def apply_safety_filter(
     model: SafetyModel, data: SafetyData, solution: Array, usable: bool, h: float, share: float
 ) -> tuple[int, float]:
-    """Move the reference by ``h`` [s] with the next velocities ``solution`` (nv,), or the stop if not ``usable``.
+    """Move the reference by one step.
 
-    ``share`` is the step's part of the tick, whose mean acceleration it adds to. Returns what was done (FOLLOWED,
-    REDUCED towards the stop, STOPPED) and the largest violation of a row [rad/s].
+    Args:
+        model: The model.
+        data: The data.
+        solution: The solver's next velocities (nv,) [rad/s].
+        usable: Whether there is a solution. If not, the certified stop is executed.
+        h: Duration of the step [s].
+        share: The step's part of the tick, to whose mean acceleration it adds.
+
+    Returns:
+        FOLLOWED, REDUCED towards the stop, or STOPPED; and the largest violation of a row [rad/s].
     """
     q, v, candidate = data.state.q, data.state.v, data.candidate
     outcome = STOPPED
@@ -43,7 +51,7 @@ def apply_safety_filter(
     if usable:
         total = 0.0
         for j in range(q.shape[0]):
-            # A solver's tolerance is larger than the contract's. NaN may pass through clamps: the sum shows it.
+            # A solver's tolerance is larger than the contract's. NaN may pass through clamps, but the sum shows it.
             total += solution[j]
             data.wanted[j] = clamp(solution[j], data.box.lower[j], data.box.upper[j])
             total += data.wanted[j]
@@ -53,7 +61,7 @@ def apply_safety_filter(
         brake(q, v, data.certified, h, candidate.q, candidate.v)
     remember(data.history, q, v, candidate.v, h)
     for j in range(q.shape[0]):
-        # Rounding of a difference over a tiny h may exceed the limit that the velocities keep.
+        # The velocities keep the acceleration limit. Their difference over a tiny h may exceed it by rounding.
         limit = model.limits.acceleration[j]
         data.state.a[j] += share * clamp((candidate.v[j] - v[j]) / h, -limit, limit)
         q[j] = candidate.q[j]
@@ -66,9 +74,9 @@ def apply_safety_filter(
 
 @kernel
 def certify_start(model: SafetyModel, data: SafetyData) -> bool:
-    """Whether a full stop from the reference as it is keeps all apart; it becomes the stop that is at hand.
+    """Find a full stop from the reference that keeps all pairs apart; returns whether there is one.
 
-    Where none does, joints that stop together are what is at hand.
+    It becomes the known stop. If no shape of stop can be certified, the joints stop together.
     """
     stay_with_stop(data)
     proven = _some_stop_certified(model, data, 0.0, SHAPES)
@@ -80,17 +88,22 @@ def certify_start(model: SafetyModel, data: SafetyData) -> bool:
 
 @kernel
 def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int:
-    """The pair in the way of bodies that have ``grown`` (g,) since the reference was certified and measured; -1: none.
+    """Return the pair that forbids bodies which have grown since the reference was certified; -1 if there is none.
 
-    They may be as they are where each of their pairs keeps its distance at the reference, and the stop at hand keeps
-    all apart. Then the invariant holds with the grown bodies as if they had always been so. No other stop takes its
-    place: the arms may be braking along it already. A pair that is too close already must not be made closer.
+    The grown bodies are allowed if each of their pairs keeps its distance at the reference, and the known stop keeps
+    all pairs apart. The invariant then holds as if the bodies had always been so. No other stop is tried, because the
+    arms may already be braking along the known one. A pair that is too close must not be made closer.
+
+    Args:
+        model: The model, with the grown bodies.
+        data: The data.
+        grown: 1 for each body that has grown (g,).
     """
     pairs, any_grown = model.collision.pairs, False
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            if data.distance[p] < model.min_distance[p]:  # no rounding: it could have grown less
+            if data.distance[p] < model.min_distance[p]:  # no rounding is allowed: the body could have grown less
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
@@ -100,16 +113,17 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
 
 @kernel
 def _keep_stop(data: SafetyData) -> None:
-    """The candidate's stop is the one that is at hand."""
+    """Make the stop of the candidate the known stop."""
     for j in range(data.candidate.v.shape[0]):
         data.certified[j] = data.candidate.deceleration[j]
 
 
 @kernel
 def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
-    """Make the wanted velocities the candidate if they can be certified, else the most of them that can.
+    """Make the wanted velocities the candidate if they can be certified, else the largest share of them that can.
 
-    The certified stop lies in the box as the wanted velocities do, and the box is convex, so every mixture lies in it.
+    The certified stop and the wanted velocities both lie in the box. The box is convex, and so every mixture of them
+    lies in it.
     """
     too_close = False
     for p in range(data.distance.shape[0]):
@@ -120,7 +134,7 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
         return FOLLOWED
     unproven = data.unproven[0]
     if unproven >= 0 and is_too_close(model, data, unproven) and not data.state.v.any():
-        return STOPPED  # less of a motion from rest would come closer too, and trying takes long beside many pairs
+        return STOPPED  # From rest a smaller motion would also come closer, and trying it takes long with many pairs.
     low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):
         share = 0.5 * (low + high)
@@ -137,10 +151,15 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
 
 @kernel
 def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: float, together: bool) -> bool:
-    """Whether some shape of stop proves a mixture, which becomes the candidate; the first that does is kept.
+    """Make a mixture the candidate; returns whether it can be certified with some shape of stop.
 
-    Out of a position that is too close the joints stop ``together`` or not at all: then a pair that was opening goes on
-    opening.
+    Args:
+        model: The model.
+        data: The data.
+        share: Share of the wanted velocities, from 0 for the certified stop to 1.
+        h: Duration of the step [s].
+        together: Whether only a stop of all joints together is tried. This is so if a pair is too close: a pair that
+            opens then goes on opening.
     """
     _mix(data, share, h)
     return _some_stop_certified(model, data, h, 1 if together else SHAPES)
@@ -148,7 +167,7 @@ def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: floa
 
 @kernel
 def _some_stop_certified(model: SafetyModel, data: SafetyData, h: float, shapes: int) -> bool:
-    """Whether one of the first ``shapes`` of stops proves the candidate; it is the candidate's then."""
+    """Try the first ``shapes`` of stops; returns whether one of them certifies the candidate, which keeps it."""
     data.unproven[0] = -1
     for shape in range(shapes):
         write_stop(model, data.candidate.q, data.candidate.v, shape, data.candidate.deceleration)
@@ -159,7 +178,7 @@ def _some_stop_certified(model: SafetyModel, data: SafetyData, h: float, shapes:
 
 @kernel
 def _mix(data: SafetyData, share: float, h: float) -> None:
-    """Candidate between the certified stop and the wanted velocities."""
+    """Write the candidate as a mixture of the certified stop and a ``share`` of the wanted velocities."""
     state, candidate = data.state, data.candidate
     for j in range(state.q.shape[0]):
         braked, wanted = data.braked[j], data.wanted[j]
@@ -169,7 +188,7 @@ def _mix(data: SafetyData, share: float, h: float) -> None:
 
 @kernel
 def _note_active(data: SafetyData) -> float:
-    """List the limits and pairs that the new velocities meet; returns the largest violation of a row [rad/s]."""
+    """List the limits and pairs that hold the new velocities back; returns the largest violation of a row [rad/s]."""
     v, box, rows, active = data.state.v, data.box, data.rows, data.active
     count = 0
     for j in range(v.shape[0]):
@@ -198,7 +217,7 @@ def _note_active(data: SafetyData) -> float:
 
 @kernel
 def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
-    """List the pairs that were too close when nothing could be certified: they hold the arms."""
+    """List the pairs that hold the arms because they are too close and nothing could be certified."""
     active = data.active
     for p in range(data.distance.shape[0]):
         count = active.used[0]
@@ -210,8 +229,8 @@ def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
 def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     """Measure every pair at the reference; returns the closest one.
 
-    Needs the placements and velocities there. ``data.distance`` receives the exact distance where it matters (a row
-    could bind, the closest pair) and a lower bound elsewhere, ``data.near`` where a row could bind.
+    It needs the placements and velocities there. ``data.distance`` gets the exact distance of the closest pair and of
+    pairs whose row may bind, and a lower bound for others. ``data.near`` marks the pairs whose row may bind.
     """
     collision, approach, distance, v = model.collision, model.approach, data.distance, data.state.v
     pairs = collision.pairs
@@ -223,18 +242,18 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     fastest = 2.0 * fastest_body(data.velocities)
     for p in range(pairs.first.shape[0]):
         data.near[p] = 0
-        if model.min_distance[p] == -np.inf:  # of an object that is not held
+        if model.min_distance[p] == -np.inf:  # The pair belongs to an object that is not held.
             distance[p] = np.inf
             continue
         distance[p] = at_least(collision, data.collision, p)
-        # The fastest that the pair can close in after this step. Farther than twice what the gain needs for that, and
-        # the way of the stop, a row would bind at very low leverage. It would add comfort, and safety needs none.
+        # The greatest speed at which the pair can close in after this step. A pair that is farther away than the way of
+        # the stop, and twice what the gain needs at that speed, gets no row. Safety needs no row.
         always = approach.stop_distance[p] + approach.contact_zone[p] + horizon * pairs.leverage[p] * surge
         far = distance[p] >= least
         if far and distance[p] > always + horizon * fastest:
-            continue  # whichever its bodies are, without a look at them
+            continue  # This holds for all bodies, so that these need not be measured.
         first, second = pairs.first[p], pairs.second[p]
-        if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:  # either may stop alone
+        if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:  # Either arm may stop alone.
             approach_speed = speed_of(data.velocities, first) + speed_of(data.velocities, second)
         else:
             approach_speed = fastest_approach(data.velocities, first, second)

@@ -1,7 +1,7 @@
-"""Proof that two geometries stay apart while the joints move, where their distance alone leaves no room, compiled.
+"""Prove by a plane between two bodies that they stay apart, if their distance alone leaves no room (compiled).
 
-The bound by reach (stop_certificate.py) counts every way a joint travels as if it led straight to the other body. A
-pair that rests at min_distance to the micrometre could then never be shown to part again. Here the direction counts.
+The bound by reach (stop_certificate.py) treats every joint as if it moved straight towards the other body. A pair that
+rests at min_distance to the micrometre could then never be proven to part again. Here the direction of motion counts.
 
 **Claim.** Let n be the unit normal of two convex cores that do not meet, and e_1 and e_2 their corners (the ends of a
 segment, the corners of a box). Let J_e be the Jacobian of a corner at the start, and r the joints' reach. If the joints
@@ -39,12 +39,12 @@ from q2r2_control.types import Array
 
 
 class Gap(NamedTuple):
-    """A corner's share in the gap between the bodies along the normal: now, in a piece, in another one after it."""
+    """The share of a corner in the gap between the bodies along the normal, in a piece and in the one after it."""
 
-    now: float  # [m]
+    now: float  # Share at the start of the piece [m].
     rate: float  # [m/s]
     change: float  # [m/s^2]
-    loose: float  # the least that loose joints add [m]
+    loose: float  # The least that joints which come to rest add [m].
     then_rate: float
     then_change: float
     then_loose: float
@@ -61,9 +61,10 @@ def stays_beyond(
     then_length: float,
     threshold: float,
 ) -> bool:
-    """Whether the plane between pair ``p`` proves it beyond ``threshold`` [m] in a ``piece`` and in ``then``, after it.
+    """Return whether the plane between the bodies of pair ``p`` proves that they stay farther apart than ``threshold``.
 
-    Their lengths are in s; that of ``then`` may be 0. The pair has been measured in ``data``, where the piece begins.
+    This holds in a ``piece`` of motion and in the piece ``then`` after it. Their lengths are in seconds, and the length
+    of ``then`` may be 0. The pair was measured in ``data``, at the start of the piece. ``threshold`` is in metres.
     """
     pairs, bodies, posed = model.pairs, model.bodies, data.posed
     first, second = pairs.first[p], pairs.second[p]
@@ -84,7 +85,7 @@ def stays_beyond(
 
 @kernel
 def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) -> float:
-    """K_1 + K_2 [m] of ways ``travel`` and a ``share`` of ``then``, (nv,) each.
+    """Return K_1 + K_2 [m] for ways ``travel`` (nv,) plus a ``share`` of the ways ``then`` (nv,).
 
     The joints of a pair are listed from the base outwards.
     """
@@ -105,7 +106,7 @@ def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) ->
 
 @inlined_kernel
 def _write_corner(bodies: CollisionBodies, posed: BodyPlacements, body: int, number: int, out: Array) -> None:
-    """One of a segment's two ends or a box's eight corners into ``out`` (3,)."""
+    """Write one of the two ends of a segment, or of the eight corners of a box, into ``out`` (3,)."""
     for k in range(3):
         out[k] = posed.end[body, k] if number == 0 else posed.start[body, k]
         if bodies.box[body] == 1:
@@ -155,7 +156,7 @@ def _gap(
 
 @inlined_kernel
 def _opens(corner: Gap, other: Gap, needed: float, length: float, then_length: float) -> bool:
-    """Whether the gap between two corners stays beyond what is ``needed`` [m] in a piece and in the one after it."""
+    """Return whether the gap between two corners stays above ``needed`` [m] in a piece and in the one after it."""
     gap = corner.now + other.now - needed
     rate, change, loose = corner.rate + other.rate, corner.change + other.change, corner.loose + other.loose
     if _least_on_the_way(gap, rate, change, length) + loose < 0.0:
@@ -170,7 +171,7 @@ def _opens(corner: Gap, other: Gap, needed: float, length: float, then_length: f
 
 @kernel
 def _least_on_the_way(value: float, rate: float, change: float, h: float) -> float:
-    """Minimum of value + rate t + change t^2 / 2 over t in [0, h]."""
+    """Return the minimum of value + rate t + change t^2 / 2 over t in [0, h]."""
     least = min(value, value + rate * h + 0.5 * change * h * h)
     if change > 0.0 and 0.0 < -rate < change * h:
         least = min(least, value - rate * rate / (2.0 * change))

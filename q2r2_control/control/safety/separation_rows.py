@@ -1,28 +1,29 @@
-"""Rows of the QP that keep monitored pairs apart.
+"""Write the rows of the QP that keep monitored pairs apart.
 
-The rows tell the QP what the stop can do. Let B be the least free distance of a pair on the certified stop from here,
+The rows tell the QP what the certified stop can do. Let B be the least free distance of a pair on this stop,
 
     B = min over the stop of  d - min_distance - buffer.
 
-It may be used up no faster than at a rate, B(q+, v+) >= (1 - gain h) B(q, v). This is a control barrier function made
-of a backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its distance uses up nothing and is not
-slowed; motion that closes in is slowed in time for the stop. B is linearised at the instants of the stop where it is
-least, or may soon be, so that no row comes and goes from tick to tick. The rest beyond B may be used up at 50 /s. At t
-of a stop that takes T joints that stop together have travelled v s, s = t - t^2 / 2T. With the same T after the step,
+A step may use up only a share of it: B(q+, v+) >= (1 - gain h) B(q, v). This is a control barrier function made of a
+backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its distance uses up nothing and is not
+slowed. Motion that closes in is slowed in time for the stop. B is linearised at the instants of the stop at which it is
+least, or may soon be, so that rows do not come and go from tick to tick. The free distance beyond B may be used up at
+50 /s. If a stop takes T, joints that stop together have travelled v s at its time t, with s = t - t^2 / 2T. With the
+same T after the step,
 
     D q = h (v + v+) / 2 + s (v+ - v),    n'(J_2 - J_1) D q >= -gain h B.
 
-For a pair at rest this is the usual row, n'(J_2 - J_1) v+ >= -gain B. The change of speed counts alike for all joints,
-in every shape of stop, so that the row is along the pair's own normal. With a lever for each joint its direction would
-change from tick to tick as the shape does.
+For a pair at rest this is the usual row, n'(J_2 - J_1) v+ >= -gain B. The change of speed has the same lever for all
+joints and shapes of stop, so that the row is along the normal of the pair. With a lever for each joint its direction
+would change from tick to tick with the shape.
 
-Closer than the buffer the row asks for opening, as fast as a part of the acceleration limits gives. Pairs that may
-touch have a distance below zero. Before and in contact they have a zone where B is used up no faster than a speed of
-their own. The rows give comfort only: they are soft, so that the QP always has a solution; safety is the certificate's.
+If a pair is closer than its buffer, the row asks it to open, as fast as a part of the acceleration limits allows. Pairs
+that may touch have a distance below zero. Around contact they have a zone in which B is used up no faster than at their
+own speed. The rows are for comfort only. They are soft, so that the QP always has a solution, and the certificate alone
+keeps the arms safe.
 
-**The gain may change between any two ticks.** The certificate reads no row and no gain. It reads distances, and a
-distance that is only a lower bound proves less, never more. The part that is taken of a solution is therefore proven
-whatever the gain is.
+**The gain may change between any two ticks.** The certificate reads no row and no gain. It reads distances, and a lower
+bound of a distance proves less, never more. The executed part of a solution is therefore certified for every gain.
 """
 
 from __future__ import annotations
@@ -43,31 +44,32 @@ from q2r2_control.types import Array
 
 
 class StopTime(NamedTuple):
-    """When of the stop a row looks at its pair."""
+    """The moment of the stop at which a row looks at its pair."""
 
-    along: bool  # the pair is measured at the stop's start, and the row follows the tangent to the end
-    h: float  # length of the step that the row is for [s]
-    lever: float  # what the next speeds add to the way until the moment [s]
-    least: float  # B: what the pair has free where it is nearest on the stop [m]
-    ahead: float  # how far in time the row looks: half of the stop, which is as far as it leads, and 1 / gain [s]
+    along: bool  # True if the pair is measured at the start of the stop, and the row follows the tangent to its end.
+    h: float  # Duration of the step [s].
+    lever: float  # Way until the moment per next speed [s].
+    least: float  # B, the least free distance of the pair on the stop [m].
+    ahead: float  # Time that the row looks ahead: half of the stop, and 1 / gain [s].
 
 
 _SHARE = 0.25
-# Ends of near-parallel capsules get rows of their own, unless the closest point is practically there already.
+# An end of a near-parallel capsule gets a row of its own if it is farther than this from the closest point.
 _SAME_POINT = 0.005  # [m]
-# An instant of the stop that may soon be the nearest has a row already, so that nothing switches from tick to tick.
+# An instant whose distance is greater than the least one by less than this has a row already, so that rows do not
+# switch from tick to tick.
 _SAME_DISTANCE = 0.002  # [m]
-# A stop that takes a pair's points off the tangent by less than this is looked at from its start, along the tangent.
+# If a stop bends the ways of a pair's points by less than this, the row looks along the tangent at its start.
 _STRAIGHT = 1e-5  # [m]
-# How fast the rest of the stop may lose what it has free more than where the pair is nearest [1/s].
+# Rate at which instants other than the nearest one may use up their additional free distance [1/s].
 _CATCH_UP = 50.0
 
 
 @kernel
 def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> None:
-    """Rows of the pairs that can bind in a step of ``h`` [s] from the measured reference, of unit norm.
+    """Write the rows of pairs that can bind in a step of ``h`` [s] from the measured reference, with unit norm.
 
-    Uses the candidate and its rollout for the certified stop from here.
+    The candidate and its rollout are used for the certified stop.
     """
     stay_with_stop(data)
     duration = begin_rollout(data)
@@ -81,7 +83,8 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
         for i in range(len(INSTANTS)):
             t = duration * INSTANTS[i] / INSTANTS[-1]
             s = t - 0.5 * t * t / duration if duration > 0.0 else 0.0
-            lever = max(s, 0.5 * h) + 0.5 * h  # at rest a faster step lengthens the stop by as much as the step itself
+            # At rest a faster step lengthens the stop by as much as the step itself.
+            lever = max(s, 0.5 * h) + 0.5 * h
             if data.rows.ahead[i] > least + _SAME_DISTANCE or (i > 0 and lever <= h):
                 continue
             along = straight and i > 0
@@ -101,9 +104,9 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
 
 @kernel
 def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: float, straight: bool) -> float:
-    """Write how far pair ``p`` is apart at the instants, infinite where none is looked at; returns the least [m].
+    """Write the distance of pair ``p`` at each instant, infinite for instants that are skipped; returns the least [m].
 
-    On a straight way it is nearest at one of both ends. One that is too close has to open from where it is.
+    On a straight way the pair is nearest at one of both ends. A pair that is too close has to open from where it is.
     """
     ahead, last = data.rows.ahead, len(INSTANTS) - 1
     ahead[:] = np.inf
@@ -111,7 +114,7 @@ def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: flo
     if ahead[0] < model.min_distance[p]:
         return ahead[0]
     if straight:
-        row = data.rows.matrix[-1]  # scratch: so many rows are never in use
+        row = data.rows.matrix[-1]  # The last row is never in use, and serves as scratch.
         distance_row(model.collision, data.collision, p, row)
         ahead[last] = ahead[0] + _tangent(data, row)
         return min(ahead[0], ahead[last])
@@ -124,7 +127,7 @@ def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: flo
 
 @inlined_kernel
 def _tangent(data: SafetyData, row: Array) -> float:
-    """By how much the certified stop opens a pair with the given ``row`` along the tangent [m]."""
+    """Return by how much the certified stop opens a pair with the given ``row`` along the tangent [m]."""
     v, change = data.state.v, 0.0
     for j in range(row.shape[0]):
         change += row[j] * 0.5 * v[j] * abs(v[j]) / data.certified[j]
@@ -135,10 +138,10 @@ def _tangent(data: SafetyData, row: Array) -> float:
 def _append_row(
     model: SafetyModel, data: SafetyData, at: CollisionData, p: int, distance: float, moment: StopTime, count: int
 ) -> int:
-    """Keep the row if some velocity that the acceleration allows (v +- a h) breaks it; any other cannot bind.
+    """Add a row if some velocity that the acceleration limit allows (v +- a h) breaks it; other rows cannot bind.
 
-    Pair ``p`` has been measured in ``at``, the posture at the ``moment``, or at the start of a straight stop whose end
-    the row looks at along the tangent. It gets unit norm, so that what it lacks is a joint speed.
+    Pair ``p`` was measured in ``at``, the posture at the ``moment``, or at the start of a straight stop whose end the
+    row sees along the tangent. The row gets unit norm, so that its violation is a joint speed.
     """
     h = moment.h
     a, v, row, lever = model.limits.acceleration, data.state.v, data.rows.matrix[count], moment.lever
@@ -146,8 +149,8 @@ def _append_row(
     free = distance - model.approach.stop_distance[p]
     if moment.along:
         free += _tangent(data, row)
-    rate = dot(row, v)  # of the distance [m/s]: with v kept up, B changes by as much in a second
-    change = 0.0  # how much the acceleration can do about that in this step [m]
+    rate = dot(row, v)  # Change of the distance, and of B, per second at constant v [m/s].
+    change = 0.0  # By how much the acceleration can change this in the step [m].
     for j in range(row.shape[0]):
         change += abs(row[j]) * a[j]
     change *= h * lever
@@ -158,8 +161,8 @@ def _append_row(
     if slow < np.inf:
         allowed = max(allowed, -h * max(slow, gain * (free - model.approach.contact_zone[p])))
     if free < 0.0:
-        # Asked for more than the joints can do in this step, rows of several pairs would be weighed against each other.
-        # The deeper pair would be opened at the cost of closing another one.
+        # Rows that ask for more than the joints can do would be weighed against each other, and a deep pair would open
+        # at the cost of closing another one.
         allowed = min(allowed, model.approach.recovery_speed * h, max(h * rate, 0.0) + _SHARE * change)
     if h * rate - change >= allowed or change <= 0.0:
         return count
@@ -174,10 +177,11 @@ def _append_row(
 def _append_end_rows(
     model: SafetyModel, data: SafetyData, at: CollisionData, p: int, distance: float, moment: StopTime, count: int
 ) -> int:
-    """Rows at those ends of both bodies of a pair that may soon be as close as its ``distance``, measured in ``at``.
+    """Add rows at those ends of both bodies of a pair that may soon be as close as its ``distance``.
 
-    The closest points of near-parallel bodies jump from end to end; rows at the ends leave nothing to jump. An end that
-    is farther by more than the bodies turn it towards each other while the row looks ahead does not take part.
+    The closest points of near-parallel bodies jump from end to end. With rows at the ends, no row jumps. An end gets no
+    row if the bodies cannot turn it as close as that within the time that the row looks ahead. The pair was measured in
+    ``at``.
     """
     bodies, posed, contact, angular = model.collision.bodies, at.posed, at.contact, data.velocities.angular
     first, second = model.collision.pairs.first[p], model.collision.pairs.second[p]

@@ -1,7 +1,7 @@
-"""How fast geometries move, and how much closer two of them come in a step and the stop after it at most, compiled.
+"""Bound how much closer two bodies come in a step and the stop after it, by their present speeds (compiled).
 
-The bound by reach (stop_certificate.py) takes every joint's way for one that leads straight to the other body. Most
-pairs of two moving arms need no more than the speeds of their bodies. Joints that stop together go on as they began,
+The bound by reach (stop_certificate.py) treats every joint as if it moved straight towards the other body. For most
+pairs of two moving arms the speeds of the bodies suffice: joints that stop together keep the direction of their motion,
 and arms that move alike do not close in at all.
 
 **Speed.** A geometry lies in the ball of radius s around its middle. With the middle moving at u and the link turning
@@ -29,8 +29,8 @@ T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never f
 joints that move it (separating_plane.py has why). Two points, one of each body's core, therefore get closer by at most
 |(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V. The radii cancel. []
 
-The velocity of a joint that carries both bodies is part of V, but such a joint is not in the sum. V could then be less
-than the speed at which the bodies close in. Pairs that share a joint are therefore left to the other proofs.
+The velocity of a joint that carries both bodies is part of V, but this joint is not in the sum. V could then be less
+than the speed at which the bodies close in. For that reason the other proofs handle pairs that share a joint.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ if TYPE_CHECKING:
 class BodyVelocities(NamedTuple):
     """Velocities in world axes, written by :func:`update_body_velocities`."""
 
-    linear: Array  # (n, 3) of joint frames' origins [m/s]
+    linear: Array  # (n, 3) Velocities of the origins of joint frames [m/s].
     angular: Array  # (n, 3) [rad/s]
-    middle: Array  # (g, 3) of geometries' middles [m/s]
-    swing: Array  # (g,) fastest of a geometry's points about its middle [m/s]
+    middle: Array  # (g, 3) Velocities of the middles of geometries [m/s].
+    swing: Array  # (g,) Greatest speed of a point of a geometry about its middle [m/s].
 
     @classmethod
     def empty(cls, model: CollisionModel) -> BodyVelocities:
@@ -64,7 +64,7 @@ class BodyVelocities(NamedTuple):
 
 @kernel
 def update_body_velocities(model: CollisionModel, data: CollisionData, v: Array, velocities: BodyVelocities) -> None:
-    """Velocities of all joint frames and geometries where they are placed, at joint velocities ``v`` (nv,)."""
+    """Write the velocities of all joint frames and geometries at their placements, for joint velocities ``v`` (nv,)."""
     chain, bodies, placements, posed = model.chain, model.bodies, data.placements, data.posed
     linear, angular = velocities.linear, velocities.angular
     for i in range(1, chain.parent.shape[0]):
@@ -88,7 +88,7 @@ def update_body_velocities(model: CollisionModel, data: CollisionData, v: Array,
 
 @kernel
 def _velocity_at(linear: Array, angular: Array, origin: Array, point: Array, out: Array) -> None:
-    """Velocity of ``point`` on a link whose frame at ``origin`` moves; ``out`` may be ``point`` itself."""
+    """Write the velocity of ``point`` on a link whose frame is at ``origin``; ``out`` may be ``point`` itself."""
     x, y, z = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
     out[0] = linear[0] + angular[1] * z - angular[2] * y
     out[1] = linear[1] + angular[2] * x - angular[0] * z
@@ -97,7 +97,7 @@ def _velocity_at(linear: Array, angular: Array, origin: Array, point: Array, out
 
 @kernel
 def fastest_body(velocities: BodyVelocities) -> float:
-    """Bound on the speed of any point of any geometry [m/s]."""
+    """Return a bound on the speed of any point of any geometry [m/s]."""
     fastest = 0.0
     for g in range(velocities.swing.shape[0]):
         fastest = max(fastest, speed_of(velocities, g))
@@ -106,22 +106,22 @@ def fastest_body(velocities: BodyVelocities) -> float:
 
 @inlined_kernel
 def speed_of(velocities: BodyVelocities, g: int) -> float:
-    """Bound on the speed of any point of a geometry [m/s]."""
+    """Return a bound on the speed of any point of geometry ``g`` [m/s]."""
     return size_of(velocities.middle[g]) + velocities.swing[g]
 
 
 @kernel
 def fastest_approach(velocities: BodyVelocities, first: int, second: int) -> float:
-    """Bound on how fast two geometries close in [m/s]."""
+    """Return a bound on the speed at which two geometries close in [m/s]."""
     between = way_between(velocities.middle[first], velocities.middle[second])
     return between + velocities.swing[first] + velocities.swing[second]
 
 
 @kernel
 def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: float) -> float:
-    """rho + kappa of every joint [rad or m], in a step of ``h`` to the candidate and a stop of ``duration`` [s].
+    """Write rho + kappa of every joint [rad or m], for a step of ``h`` [s] and a stop of ``duration`` [s].
 
-    Needs the ways of both. Returns h + T / 2 [s].
+    It needs the ways of the step and the stop. Returns h + T / 2 [s].
     """
     parent, v, v_next, rollout = model.collision.chain.parent, data.state.v, data.candidate.v, data.rollout
     step, stop = rollout.step.travel, rollout.stop.travel
@@ -139,10 +139,10 @@ def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: f
 
 @inlined_kernel
 def least_distance(model: SafetyModel, data: SafetyData, p: int, time: float) -> float:
-    """Least distance [m] of pair ``p``, which shares no joint, in the step and the stop; ``time`` is h + T / 2 [s].
+    """Return the least distance of pair ``p``, which shares no joint, in the step and the stop [m].
 
-    Needs :func:`write_deviations`, the velocities of the bodies as they are now and distances at the reference, or
-    lower bounds.
+    It needs :func:`write_deviations`, the velocities of the bodies, and distances at the reference or lower bounds of
+    them. ``time`` is h + T / 2 [s].
     """
     pairs = model.collision.pairs
     approach = fastest_approach(data.velocities, pairs.first[p], pairs.second[p])
@@ -151,7 +151,7 @@ def least_distance(model: SafetyModel, data: SafetyData, p: int, time: float) ->
 
 @inlined_kernel
 def way(model: SafetyModel, p: int, travel: Array) -> float:
-    """How far the bodies of pair ``p`` can have moved relative to each other when joints travel (nv,) [m]."""
+    """Return how far the bodies of pair ``p`` can move relative to each other while joints ``travel`` (nv,) [m]."""
     pairs = model.collision.pairs
     total = 0.0
     for k in range(pairs.joint.shape[1]):

@@ -1,6 +1,6 @@
-"""A stop's postures at instants, each worked out when it is first asked for, compiled.
+"""Compute the postures of a stop at instants. Each is computed when it is first asked for (compiled).
 
-The instants are spaced evenly in time, so that samples which one pair needs serve the others too.
+The instants are evenly spaced in time, so that all pairs share the samples.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SHAPES = 3
 
 @kernel
 def write_stop(model: SafetyModel, q: Array, v: Array, shape: int, deceleration: Array) -> None:
-    """Write the ``deceleration`` of a stop of the given shape from ``q`` [rad], ``v`` [rad/s], (nv,) each [rad/s^2]."""
+    """Write the ``deceleration`` (nv,) [rad/s^2] of a stop of a shape from ``q`` [rad] and ``v`` [rad/s] (nv,)."""
     a = model.limits.acceleration
     for j in range(v.shape[0]):
         deceleration[j] = a[j]
@@ -36,7 +36,7 @@ def write_stop(model: SafetyModel, q: Array, v: Array, shape: int, deceleration:
 
 @kernel
 def _least_deceleration(limits: JointLimits, j: int, q: float, v: float) -> float:
-    """Least constant deceleration of joint ``j`` that keeps P until it rests; its limit where none does."""
+    """Return the least constant deceleration of joint ``j`` that keeps P until it rests; its limit if none does."""
     room = (limits.upper[j] - q if v > 0.0 else q - limits.lower[j]) - limits.longest_step * abs(v)
     if room <= 0.0:
         return limits.acceleration[j]
@@ -45,7 +45,7 @@ def _least_deceleration(limits: JointLimits, j: int, q: float, v: float) -> floa
 
 @kernel
 def brake(q: Array, v: Array, deceleration: Array, t: float, q_out: Array, v_out: Array) -> None:
-    """State of the stop after ``t`` seconds, from (q, v) with decelerations > 0, (nv,) each."""
+    """Write the state of a stop after ``t`` [s], from (q, v) with decelerations above 0 (nv,)."""
     for j in range(q.shape[0]):
         speed = abs(v[j])
         sign = 1.0 if v[j] >= 0.0 else -1.0
@@ -57,14 +57,14 @@ def brake(q: Array, v: Array, deceleration: Array, t: float, q_out: Array, v_out
             v_out[j] = v[j] - sign * deceleration[j] * t
 
 
-# A joint that rests this much before the end of a piece of time counts as moving until then [s]. That is far more than
-# rounding, and the way that is counted wrong is d t^2 / 2, 1e-17 rad.
+# A joint that comes to rest by less than this before the end of a piece of time counts as moving until the end [s].
+# This is far more than rounding. The error of its way is d t^2 / 2, which is 1e-17 rad.
 _SAME_TIME = 1e-9
 
 
 @kernel
 def begin_rollout(data: SafetyData) -> float:
-    """Forget the samples of the last stop and write the candidate's as one piece; returns how long it takes [s]."""
+    """Forget the samples of the last stop, and write the candidate's stop as one piece; returns its duration [s]."""
     candidate, rollout = data.candidate, data.rollout
     rollout.known[:] = 0.0
     duration = 0.0
@@ -76,7 +76,7 @@ def begin_rollout(data: SafetyData) -> float:
 
 @kernel
 def stay_with_stop(data: SafetyData) -> None:
-    """Make the candidate the reference as it is, with the stop that is at hand."""
+    """Make the present reference the candidate, with the known stop."""
     for j in range(data.state.v.shape[0]):
         data.candidate.q[j] = data.state.q[j]
         data.candidate.v[j] = data.state.v[j]
@@ -85,7 +85,7 @@ def stay_with_stop(data: SafetyData) -> None:
 
 @kernel
 def sample_of(model: SafetyModel, data: SafetyData, i: int, duration: float) -> CollisionData:
-    """The bodies at sample ``i`` of the candidate's stop."""
+    """Return the placements of the bodies at sample ``i`` of the candidate's stop."""
     candidate, rollout = data.candidate, data.rollout
     sample = pointee_at(rollout.samples, i)
     if rollout.known[i] == 0.0:
@@ -98,15 +98,22 @@ def sample_of(model: SafetyModel, data: SafetyData, i: int, duration: float) -> 
 
 @kernel
 def write_piece(data: SafetyData, v: Array, start: float, length: float, piece: QuadraticPiece) -> None:
-    """The motion of the candidate's stop from ``start`` on, where its velocities are ``v``, for ``length`` [s].
+    """Write the motion in a part of the candidate's stop.
 
-    A joint that comes to rest on the way is no parabola: all that is known of it is from where to where it moves.
+    The motion of a joint that comes to rest in this part is not one parabola. Only its two ends are used.
+
+    Args:
+        data: The data.
+        v: Velocities at the start of the part (nv,) [rad/s].
+        start: Start of the part, from the beginning of the stop [s].
+        length: Duration of the part [s].
+        piece: Where the motion is written.
     """
     candidate = data.candidate
     for j in range(v.shape[0]):
         deceleration = candidate.deceleration[j]
         sign = 1.0 if v[j] >= 0.0 else -1.0
-        rest = abs(candidate.v[j]) / deceleration - start  # until the joint rests
+        rest = abs(candidate.v[j]) / deceleration - start  # The time until the joint rests.
         piece.rate[j], piece.change[j], piece.loose[j] = 0.0, 0.0, 0.0
         if v[j] == 0.0:
             piece.travel[j] = 0.0

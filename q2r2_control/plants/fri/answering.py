@@ -1,8 +1,8 @@
-"""The process that answers the cabinets: it does nothing else, so that no tick of the loop makes a cabinet wait.
+"""Answer the cabinets in a process of its own, so that no tick of the loop makes a cabinet wait.
 
-The loop sends commands, is told whether they came in time, and gets the state of a session after each message of its
-cabinet. Where the loop has ended, in whatever way, cabinets are answered until the arms have come to rest on their
-certified stop.
+The loop sends commands to this process, and gets back whether they came in time. After each message of a cabinet it
+gets the state of the session. If the loop ends in any way, the process goes on until the arms have come to rest on
+their certified stop.
 """
 
 from __future__ import annotations
@@ -25,37 +25,39 @@ from q2r2_control.plants.fri.wire import LONGEST, read_monitoring
 from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of, start_python
 from q2r2_control.process.scheduling import few_garbage_collections, how_it_ended, real_time, reserve, thread_priority
 
-_TAKEN, _TOO_LATE = b"1", b"0"  # a word about commands
-_RESERVED = 0.0015, 0.002  # of a processor for answers, which take 0.2 ms each, in every so many [s]
-_BEGUN = b"2"  # the first word: the cabinets are heard
-_LARGEST = 1 << 16  # of what is passed on [bytes]
-_POLL = 0.05  # of looking whether the arms of a loop that has ended stand still [s]
-_PATIENCE = 5.0  # with a process that is to end [s]
-_LONGEST_WORD = 1.0  # until it says whether commands came in time; arms brake meanwhile [s]
-# Linux stamps datagrams as they arrive (SO_TIMESTAMPNS) by its real-time clock; longer waits are jumps of that [s].
+_TAKEN, _TOO_LATE = b"1", b"0"  # The replies to commands.
+_RESERVED = 0.0015, 0.002  # Processor time that is reserved for answers in each interval [s]. An answer takes 0.2 ms.
+_BEGUN = b"2"  # The first reply: the process hears the cabinets.
+_LARGEST = 1 << 16  # Largest datagram between the processes [bytes].
+_POLL = 0.05  # After the loop has ended, time between two looks whether the arms stand still [s].
+_PATIENCE = 5.0  # Time to wait until the process ends [s].
+_LONGEST_WORD = 1.0  # Time to wait for the reply to commands. Arms brake meanwhile [s].
+# Linux stamps arriving datagrams by its real-time clock (SO_TIMESTAMPNS). A longer wait is a jump of that clock [s].
 _TIMESTAMP, _TIMESPEC, _EXTRA, _LONGEST_WAIT = 35, struct.Struct("@qq"), 64, 0.1
 
 
 @dataclass(slots=True)
 class Line:
-    """To one cabinet."""
+    """The connection to one cabinet."""
 
     session: ArmSession
-    address: str  # of the cabinet; nothing else is heard
-    file: int  # of the socket
-    newest: bytes | None = None  # message of the cabinet, as it came: that is passed on faster than read
+    address: str  # Address of the cabinet. Datagrams from other addresses are ignored.
+    file: int  # File descriptor of the socket.
+    newest: bytes | None = None  # The newest message of the cabinet, which the process passes on without decoding it.
 
 
 class AnsweringProcess:
-    """The loop's end."""
+    """The loop's end of the connection to the process."""
 
     def __init__(self, lines: Sequence[Line]) -> None:
-        """With a line to each cabinet, of which this process may close its sockets then.
+        """Start the process, with a line to each cabinet. The caller may close its own sockets then.
 
-        Returns when the process hears the cabinets: a busy computer takes seconds to start one. Raises
-        :class:`PlantError` where it cannot begin.
+        It returns when the process hears the cabinets, which takes seconds on a busy computer.
+
+        Raises:
+            PlantError: If the process cannot begin.
         """
-        # States that nobody reads may fill their link; a word about commands must not wait for that.
+        # States that nobody reads may fill their connection. Replies to commands must not wait for that.
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states.setblocking(False)
@@ -64,7 +66,7 @@ class AnsweringProcess:
             code, files = f"from {__name__} import main; main{links}", [*links, *(line.file for line in lines)]
             self._process = start_python(code, {}, files=files)
         self.pid = self._process.pid
-        # An answer goes before the loop, where that has a priority.
+        # If the loop has a real-time priority, answers come before it.
         priority = thread_priority()
         self._commands.send(pickle.dumps((priority and priority + 1, list(lines))))
         word = b""
@@ -75,9 +77,10 @@ class AnsweringProcess:
         self._commands.settimeout(_LONGEST_WORD)
 
     def send(self, commands: dict[str, ArmCommand]) -> bool:
-        """Whether commands, by arm, came before every answer that they were for; else none of them is followed.
+        """Send a command for each arm; returns whether all of them came in time. If not, none of them is followed.
 
-        Raises :class:`PlantError` where the process has ended, or says nothing.
+        Raises:
+            PlantError: If the process has ended, or does not reply.
         """
         try:
             self._commands.send(pickle.dumps(commands))
@@ -91,22 +94,23 @@ class AnsweringProcess:
         return word == _TAKEN
 
     def receive(self) -> tuple[list[SessionState], list[tuple[float, float]]]:
-        """Each arm's newest state since the last call; when messages came, and how long their answers took [s].
+        """Return each arm's newest state since the last call, and for each message its arrival and answer time [s].
 
-        Raises :class:`PlantError` where the process has ended.
+        Raises:
+            PlantError: If the process has ended.
         """
         newest, answers = {}, []
         with suppress(BlockingIOError):
             while said := self._states.recv(_LARGEST):
                 values, datagram = pickle.loads(said)
-                newest[values["arm"]] = values, datagram  # of many messages after a late tick, one is read
+                newest[values["arm"]] = values, datagram  # After a late tick only the newest message is decoded.
                 if values["took"] is not None:
                     answers.append((values["arrival"], values["took"]))
             raise self._end()
         return [SessionState(**its | {"newest": raw and read_monitoring(raw)}) for its, raw in newest.values()], answers
 
     def _end(self, last_word: bytes = b"") -> PlantError:
-        """The way in which the process has ended."""
+        """Return an error that says how the process has ended."""
         if not last_word:
             with suppress(OSError):
                 last_word = self._commands.recv(_LARGEST)
@@ -115,7 +119,7 @@ class AnsweringProcess:
         return PlantError(how_it_ended("the process that answers the cabinets", self._process.wait(_PATIENCE)))
 
     def close(self) -> None:
-        """Let it end as soon as the arms stand still."""
+        """Let the process end as soon as the arms stand still."""
         self._commands.close()
         try:
             self._process.wait(_PATIENCE)
@@ -126,7 +130,7 @@ class AnsweringProcess:
 
 
 def main(commands: int, states: int) -> None:
-    """In the process: answer until the loop has ended and the arms stand still."""
+    """Run in the process: answer until the loop has ended and the arms stand still."""
     leave_signals_to_the_run()
     with socket.socket(fileno=commands) as from_loop, socket.socket(fileno=states) as to_loop:
         try:
@@ -153,7 +157,7 @@ class _Answering:
         files = [*self._lines, self._commands.fileno()]
         for _, opened in self._lines.values():
             with suppress(OSError):
-                while True:  # what came while this process began is too old to be answered
+                while True:  # Messages that came while this process started are too old to be answered.
                     opened.recv(LONGEST + 1)
         self._commands.send(_BEGUN)
         ended = False
@@ -166,7 +170,7 @@ class _Answering:
                     self._answer(*self._lines[file])
 
     def _take_commands(self) -> bool:
-        """Take all that was sent before an answer; returns whether the loop is there."""
+        """Take all commands before an answer; returns whether the loop is still there."""
         try:
             while said := self._commands.recv(_LARGEST):
                 self._commands.send(_TAKEN if follow(self._sessions, pickle.loads(said)) else _TOO_LATE)
@@ -190,21 +194,21 @@ class _Answering:
             if reply is not None:
                 opened.sendto(reply, source)
                 state.took = time.monotonic() - came
-        except OSError:  # a cabinet that is gone refuses; its silence is noticed
+        except OSError:  # The cabinet has gone. Its silence will be noticed.
             return
-        with suppress(OSError):  # a loop that stands still gets a later state
+        with suppress(OSError):  # A loop that stands still gets a later state.
             self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))
 
 
 def address_for(cabinet: str) -> str:
-    """Address of this computer that a ``cabinet`` on this computer sends to; empty for one elsewhere: all networks."""
+    """Return the address to which a ``cabinet`` on this computer sends; "" for a cabinet elsewhere, on any network."""
     if not ip_address(cabinet).is_loopback:
         return ""
     return "::1" if ":" in cabinet else "127.0.0.1"
 
 
 def open_socket(address: str, port: int) -> socket.socket:
-    """A socket for one cabinet: loopback where it is on this computer, else all of its networks. Raises OSError."""
+    """Open a socket for one cabinet, on loopback if it is on this computer, else on all networks; may raise OSError."""
     opened = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM)
     try:
         opened.bind((address_for(address), port))
@@ -217,7 +221,7 @@ def open_socket(address: str, port: int) -> socket.socket:
 
 
 def _waited(extra: list[tuple[int, int, bytes]]) -> float:
-    """How long ago the kernel received a datagram [s]; 0 where it does not say."""
+    """Return the time since the kernel received a datagram [s]; 0 if the kernel does not say."""
     for _, kind, data in extra:
         if kind == _TIMESTAMP:
             seconds, nanoseconds = _TIMESPEC.unpack(data)

@@ -1,16 +1,16 @@
-"""Where the arms have to be when a cabinet asks: the reference between ticks, and the time that an answer is for.
+"""Compute where an arm has to be when its cabinet asks: the reference between ticks, and the time of an answer.
 
-**Two clocks.** A cabinet asks by its own clock, which drifts against ours, through a network that jitters and loses.
-It takes the difference of two answers over its period for a velocity. An answer for the very time at which a question
-arrived would pass the network's jitter on to the arm. An answer is therefore for an even time: that of the newest
-answer that the cabinet has heard, and one period more.
+**Two clocks.** A cabinet asks by its own clock, which drifts against ours, through a network that delays and loses
+messages. The difference of two answers over its period is a velocity to it. If an answer were for the time at which its
+question arrived, the jitter of the network would reach the arm. The times of answers are therefore even: each answer is
+for one period after the newest answer that the cabinet has heard.
 
-**Catching up.** Lost messages and drift let the even time fall behind. It catches up at up to ``CATCH_UP`` of its
-rate, and its rate changes by ``CATCH_UP_RAMP`` a second. With the reference at v and a the cabinet sees at most
-(1 + CATCH_UP) v and (1 + CATCH_UP)^2 a + CATCH_UP_RAMP v.
+**Catching up.** Lost messages and drift let the even time fall behind. It catches up at a rate of 1 + ``CATCH_UP`` at
+most, and the rate changes by ``CATCH_UP_RAMP`` per second. If the reference has the velocity v and the acceleration a,
+the cabinet sees at most (1 + CATCH_UP) v and (1 + CATCH_UP)^2 a + CATCH_UP_RAMP v.
 
-**Never beyond what is certified.** Where the newest reference ends before the answer's time, since our loop is late,
-its certified stop follows. The loop then lets its own reference follow the same stop for as long.
+**Never beyond the certificate.** If the newest reference ends before the time of an answer, because our loop is late,
+its certified stop follows. The loop then lets its own reference follow the same stop for the same time.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ import numpy as np
 
 from q2r2_control.types import Array
 
-CATCH_UP = 0.05  # of an even time's rate
-CATCH_UP_RAMP = 0.4  # of that rate [1/s]
-_SETTLED = 500  # messages in which a clock that is slower than it was taken for is followed
-_PIECES = 1024  # of the reference that are kept
-# Answers of which the time is known. At the shortest period of 1 ms they last four times as long as a cabinet that
-# hears none of them is followed.
+CATCH_UP = 0.05  # Greatest additional rate of the even time.
+CATCH_UP_RAMP = 0.4  # Greatest change of this rate per second [1/s].
+_SETTLED = 500  # Number of messages within which the estimate follows a clock that is slower than it was assumed.
+_PIECES = 1024  # Number of pieces of the reference that are kept.
+# Number of answers whose time is remembered. At the shortest period of 1 ms this is four times as long as a cabinet
+# that hears none of them is followed.
 _REMEMBERED = 1024
 
 
 class _Move(NamedTuple):
-    """From one tick's posture and velocity to the next one's."""
+    """The motion from the posture and velocity of one tick to those of the next one."""
 
     start: float  # [s]
     end: float
     q: tuple[Array, Array]  # [rad]
     v: tuple[Array, Array]  # [rad/s]
-    deceleration: Array  # of the certified stop from its end [rad/s^2]
+    deceleration: Array  # Of the certified stop from its end [rad/s^2].
 
     def at(self, t: float) -> tuple[Array, Array]:
-        """Posture and velocity by the cubic through both ends: with a constant acceleration it is that parabola."""
+        """Return posture and velocity by the cubic through both ends, a parabola if the acceleration is constant."""
         (q, end), (v, end_v), h = self.q, self.v, self.end - self.start
         x = min(max((t - self.start) / h, 0.0), 1.0)
         way = end - q
@@ -74,27 +74,27 @@ _start = attrgetter("start")
 
 
 class ReferencePath:
-    """The reference of the last ticks, and the certified stop from the newest."""
+    """The reference of the last ticks, and the certified stop from the newest one."""
 
     def __init__(self, t: float, q: Array) -> None:
-        """At rest at ``q`` (n,) [rad] from ``t`` [s] on."""
+        """Make the path of an arm that rests at ``q`` (n,) [rad] from ``t`` [s] on."""
         self._pieces: tuple[_Move | _Stop, ...] = ()
         self._stop = _Stop(t, q, np.zeros_like(q), np.ones_like(q))
 
     @property
     def end(self) -> float:
-        """Time from which on there is nothing but the stop [s]."""
+        """The time from which on there is only the stop [s]."""
         return self._stop.start
 
     @property
     def rest(self) -> Array:
-        """Posture (n,) [rad] in which the stop ends."""
+        """The posture in which the stop ends (n,) [rad]."""
         return self._stop.at(math.inf)[0]
 
     def extend(self, t: float, q: Array, v: Array, deceleration: Array, start: float = -math.inf) -> None:
-        """The reference is at ``q``, ``v`` at the time ``t`` [s]; its certified stop brakes at ``deceleration``.
+        """Add a piece that ends at ``q``, ``v`` at the time ``t`` [s], with a certified stop at ``deceleration``.
 
-        It left the stop of before at ``start`` [s], or at once.
+        The reference leaves the earlier stop at ``start`` [s], or at once.
         """
         stop, start = self._stop, max(start, self._stop.start)
         there, speed = stop.at(start)
@@ -103,9 +103,10 @@ class ReferencePath:
         self._stop = _Stop(t, q, v, deceleration)
 
     def brake(self, t: float) -> None:
-        """Let nothing but its certified stop follow the move at ``t`` [s].
+        """Let only the certified stop follow the piece at ``t`` [s].
 
-        The stop is that from the move's end. From its middle, a joint that nearly stands at the end would hardly brake.
+        The stop is the one from the end of the piece. From its middle, a joint that nearly stands at the end would
+        hardly brake.
         """
         piece = self._piece(t)
         if piece is not self._stop:
@@ -113,7 +114,7 @@ class ReferencePath:
             self._stop = piece if isinstance(piece, _Stop) else piece.stop
 
     def at(self, t: float) -> Array:
-        """Posture (n,) [rad] at ``t`` [s]."""
+        """Return the posture at ``t`` [s] (n,) [rad]."""
         return self._piece(t).at(t)[0]
 
     def _piece(self, t: float) -> _Move | _Stop:
@@ -123,22 +124,23 @@ class ReferencePath:
 
 
 class _Answer(NamedTuple):
-    time: float  # that it is for [s]
-    rate: float  # of that time since the answer before
+    time: float  # The time for which the answer is [s].
+    rate: float  # Rate of this time since the answer before.
 
 
 class MessageClock:
-    """When a cabinet's messages would come if nothing made them late, in [s] of our clock.
+    """Estimates when a cabinet's messages would come without any delay, in seconds of our clock.
 
-    A message may be late, and none is early: one that comes before it was expected shows the cabinet's clock.
+    A message may be late but never early. If a message comes before it was expected, the cabinet's clock is faster than
+    it was assumed.
     """
 
     def __init__(self, arrival: float) -> None:
-        """``arrival`` of the first message."""
-        self._taken, self.expected = 1, arrival  # messages so far, and the time of the newest
+        """``arrival`` is the time of the first message."""
+        self._taken, self.expected = 1, arrival  # Number of messages so far, and the expected time of the newest one.
 
     def update(self, arrival: float, passed: float) -> None:
-        """A newer message, ``passed`` [s] after the one before by the cabinet's clock."""
+        """Take a newer message, ``passed`` [s] after the one before by the cabinet's clock."""
         self._taken += 1
         expected = self.expected + passed
         late = arrival - expected
@@ -146,28 +148,38 @@ class MessageClock:
 
 
 class AnswerTimes:
-    """The even times of one cabinet's answers, all in [s] of our clock."""
+    """Computes the even times of the answers to one cabinet, in seconds of our clock."""
 
     def __init__(self, period: float, delay: float) -> None:
-        """``period`` between two answers; ``delay``: an answer is for that long before its question is expected."""
+        """Make the times of one cabinet.
+
+        Args:
+            period: Between two answers [s].
+            delay: By how much the time of an answer is before the expected time of its question [s].
+        """
         self._period, self._delay = period, delay
-        self._question = -1  # the newest one
-        self._answers: dict[int, _Answer] = {}  # the last ones by their counter
-        self._newest: _Answer | None = None  # that is for the latest time
-        self._begin: tuple[int, _Answer] | None = None  # the first counter, and what the cabinet goes on from till then
+        self._question = -1  # The newest question.
+        self._answers: dict[int, _Answer] = {}  # The last answers by their counter.
+        self._newest: _Answer | None = None  # The answer for the latest time.
+        # The first counter, and the answer from which the cabinet goes on until then.
+        self._begin: tuple[int, _Answer] | None = None
 
     def restart(self) -> None:
-        """The arm stands still, so that the next answer may be for any time."""
+        """Let the next answer be for any time, because the arm stands still."""
         self._answers, self._newest, self._begin = {}, None, None
 
     def _heard(self, counter: int) -> _Answer:
-        """The answer that the cabinet goes on from, or the oldest that is known, which is the nearest to that one."""
+        """Return the answer from which the cabinet goes on, or the oldest one that is known."""
         return self._answers.get(counter) or self._answers[min(self._answers)]
 
     def at(self, question: int, expected: float, counter: int, heard: int) -> float:
-        """The time that our answer ``counter`` to a ``question`` is for, that is ``expected`` at a time.
+        """Return the time of an answer.
 
-        ``heard``: counter of our newest answer that the cabinet knows of.
+        Args:
+            question: The counter of the question.
+            expected: The expected time of the question [s].
+            counter: The counter of our answer.
+            heard: The counter of our newest answer that the cabinet has heard.
         """
         newest, repeated, self._question = self._newest, question == self._question, question
         self._answers.pop(counter - _REMEMBERED, None)
@@ -178,11 +190,11 @@ class AnswerTimes:
         if self._begin is None:
             self._begin = counter, _Answer(wanted - self._period, 1.0)
         first, standing = self._begin
-        # From the answer that the cabinet goes on from: what it did not hear was never done.
+        # The time goes on from the answer that the cabinet has heard, because it has not followed any later one.
         before = standing if heard < first or newest is None else self._heard(heard)
-        lag = (wanted - before.time) / self._period - 1.0  # in answers
+        lag = (wanted - before.time) / self._period - 1.0  # The lag as a number of answers.
         ramp = CATCH_UP_RAMP * self._period
-        # The greatest excess of rate from which the ramp still comes back to 0 as the lag does.
+        # The greatest additional rate from which the ramp comes back to 0 together with the lag.
         excess = math.copysign(math.sqrt(2.0 * ramp * abs(lag) + 0.25 * ramp * ramp) - 0.5 * ramp, lag)
         excess = min(max(excess, -CATCH_UP), CATCH_UP)
         rate = min(max(1.0 + excess, before.rate - ramp), before.rate + ramp)

@@ -1,10 +1,10 @@
-"""The arms of a cell as their cabinets see them: from ticks of the loop to commands for all sessions.
+"""Turn the ticks of the loop into commands for the sessions of all cabinets.
 
-**The loop's time and the cabinets'.** Each tick of the loop moves the reference to one period after the tick. Where
-ticks took longer lately, or their commands came too late, it goes farther ahead by as much. The cabinets are answered
-from it a little later (``DELAY``). Where the loop is so late that an answer may pass its end, the certified stop is
-what the cabinets get. :meth:`FriCell.due` then lets the reference follow the same stop first. Where an answer has
-passed it in the middle of a tick, the sessions refuse the command of that tick, and it is withdrawn.
+**The loop's time and the cabinets' time.** Each tick of the loop moves the reference to one period after the tick. If
+ticks took longer lately, or commands came too late, the reference goes farther ahead by as much. The cabinets get their
+answers from it a little later (``DELAY``). If the loop is so late that an answer would pass the end of the reference,
+the cabinets get the certified stop, and :meth:`FriCell.due` lets the reference follow the same stop first. If an answer
+passes the end in the middle of a tick, the sessions refuse the command of this tick, and it is withdrawn.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from q2r2_control.plants.fri.wire import JOINTS, CommandKind, Monitoring, joints
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Command, CommandMode, RobotState
 
-# From the decision how far the reference goes until the sessions have it, and after commands that came too late [s].
-# The reference then goes farther ahead by the difference.
+# Time from the decision about the reference's end until the sessions have it: usually, and after commands that came too
+# late [s]. The reference then goes farther ahead by the difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
-# Of a period, the shortest step of the reference.
+# Shortest step of the reference, as a share of a period.
 _SHORTEST = 0.5
-_FORGETTING = 0.01  # share of the longest tick and margin lately that each tick forgets
-_PASSING = 0.0015  # from a measurement until it has passed cabinet, network and processes, about [s]
-_NO_COMMANDS = 0.1  # so long without one that came in time is told [s]
-# In which an arm loses most of its speed where no overlay comes: several periods of a cabinet [s].
+_FORGETTING = 0.01  # Share of the longest recent tick and margin that each tick forgets.
+_PASSING = 0.0015  # Approximate time that a measurement takes through cabinet, network and processes [s].
+_NO_COMMANDS = 0.1  # Time without a command in time, after which this is reported [s].
+# Time constant with which an arm loses its speed if no overlay comes: several periods of a cabinet [s].
 _BRAKING_TIME = 0.03
-_MISSING = 10  # messages of a cabinet in a run; fewer are chance, and more are said
+_MISSING = 10  # Number of lost messages of a cabinet in a run from which they are reported.
 _logger = logging.getLogger(__name__)
 
 
 class FriCell:
-    """The loop's side: what the sessions are like, and what they are sent."""
+    """The loop's side of all sessions: their states, and the commands for them."""
 
     def __init__(
         self,
@@ -49,23 +49,31 @@ class FriCell:
         longest: float,
         grippers: Mapping[str, GripperIoConfig] | None = None,
     ) -> None:
-        """``period`` of the loop, and the ``longest`` step of its reference [s], which has one acceleration.
+        """Make the loop's side.
 
-        The state of each arm's session, and the grippers that some arms have.
+        Args:
+            robot: The robot.
+            period: Of the loop [s].
+            longest: The longest step of the reference with one acceleration [s].
+            states: The state of each arm's session.
+            grippers: The grippers, of the arms that have one.
         """
         self.states = {state.arm: state for state in states}
         self._robot, self._period, self._longest, self._grippers = robot, period, longest, dict(grippers or {})
         self._joints = {arm: robot.arms[arm].joints for arm in self.states}
         self._data = robot.model.createData()
-        self._now = self._start = self._end = -math.inf  # of the newest tick, and of its piece of the path [s]
-        self._withdraws, self._in_time = False, -math.inf  # the newest command, and when one was not [s]
-        self._margin = _MARGIN  # for the next command [s]
-        self._longest_tick = period  # lately [s]
+        # The time of the newest tick, and both ends of its piece of the path [s].
+        self._now = self._start = self._end = -math.inf
+        # Whether the newest command is withdrawn, and the time of the last command that was not [s].
+        self._withdraws, self._in_time = False, -math.inf
+        self._margin = _MARGIN  # For the next command [s].
+        self._longest_tick = period  # The longest recent tick [s].
         self._told = self._ends()
-        self._heard_since: dict[str, float] = {}  # arms' first messages [s]; not of those whose losses were said
+        # Time of the first message of each arm whose losses were not reported yet [s].
+        self._heard_since: dict[str, float] = {}
 
     def update(self, state: SessionState) -> None:
-        """A newer state of an arm's session. One warning a run says that messages of its cabinet are missing."""
+        """Take a newer state of an arm's session. Lost messages of its cabinet are reported once in a run."""
         if state.newest is not None and self.states[state.arm].newest is None:
             self._heard_since[state.arm] = state.arrival
             self._say_missing_output(state.arm, state.source, state.newest)
@@ -84,35 +92,36 @@ class FriCell:
         _logger.warning("%s: %s %s; outputs that its application registers: %s", arm, source, lacks, names)
 
     def due(self, now: float) -> tuple[float, float]:
-        """In a tick at ``now`` [s]: how long the reference has to brake first, and to go on then [s]."""
+        """Return the durations for which the reference brakes first, and moves then, in the tick at ``now`` [s]."""
         following = [state for state in self.states.values() if state.following]
         sent = now + self._margin
         latest = max([sent - DELAY, *(state.latest(sent) for state in following)])
         late, self._now, before = now - self._now if following else 0.0, now, self._end
         longest = max(late, (1.0 - _FORGETTING) * self._longest_tick)
         self._longest_tick = max(self._period, min(longest, self._longest))
-        # A session that has just begun may not be known yet: the path gets a step for each period then.
+        # A session may have begun that is not known yet. The path therefore gets a step for each period.
         ahead = self._ahead if following else self._period
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
         else:
             braked, self._start = latest - before, latest
-        # A step of one acceleration is a parabola, for the path too; of a late tick what is left comes in the next.
+        # A step with one acceleration is a parabola, as the path expects. The rest of a late tick comes in the next.
         step = min(max(now + ahead - self._start, _SHORTEST * self._period), self._longest)
         self._end = self._start + step
         return braked, step
 
     def apply(self, command: Command) -> dict[str, ArmCommand]:
-        """For each arm what its session is to be sent: the reference at the end of the tick of :meth:`due`."""
+        """Return the command for the session of each arm: the reference at the end of the tick of :meth:`due`."""
         sent = {}
         is_torque = command.mode is CommandMode.TORQUE
         if is_torque:
             model, data, measured = self._robot.model, self._data, self.state().q
-            overlay = command.tau - pin.computeGeneralizedGravity(model, data, measured)  # which the cabinet bears
+            # The cabinet itself bears gravity.
+            overlay = command.tau - pin.computeGeneralizedGravity(model, data, measured)
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # A reference at rest comes without a stop.
+            # A reference at rest has no deceleration.
             stop = (1.0,) * JOINTS if deceleration is None else joints_of(deceleration[joints])
             q, v = joints_of(command.q[joints]), joints_of(command.v[joints])
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)
@@ -125,7 +134,7 @@ class FriCell:
         return sent
 
     def fault(self) -> Reason | None:
-        """Why the arms cannot be commanded at the newest tick, or ceased to be since the last call; None: they can."""
+        """Return why the arms cannot be commanded at the newest tick, or could not since the last call; else None."""
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
             dropped = self._told[arm] > told[arm]
@@ -139,7 +148,7 @@ class FriCell:
         return {arm: state.ended for arm, state in self.states.items()}
 
     def sent(self, taken: bool) -> None:
-        """The commands of a tick were ``taken`` by the sessions, or came too late for one of them."""
+        """Record whether the sessions have ``taken`` the commands of a tick, or one of them came too late."""
         self._withdraws = not taken
         if taken:
             self._in_time, self._margin = self._now, max(_MARGIN, (1.0 - _FORGETTING) * self._margin)
@@ -148,21 +157,21 @@ class FriCell:
 
     @property
     def _ahead(self) -> float:
-        """From a tick to the end of its piece of the path [s].
+        """Return the time from a tick to the end of its piece of the path [s].
 
-        No answer passes it before the next command has come, if neither is later than one was lately.
+        If no tick and no command is later than the latest ones lately, no answer passes this end.
         """
         return self._longest_tick + self._margin - _MARGIN
 
     def withdraws(self) -> bool:
-        """Whether the newest command came after an answer that it was for: the arms go on along the stop before it."""
+        """Return whether the newest command came too late for an answer, so that the arms follow the stop before it."""
         return self._withdraws
 
     def delay(self) -> float:
-        """From the end of a command until a tick finds the arm there [s].
+        """Return the time from the end of a command until a tick finds the arm there [s].
 
-        A cabinet begins to go there with its next message and takes a period for it. The newest message is half of one
-        old in the mean. Torques count at once.
+        A cabinet begins to go there with its next message, and takes a period for it. The newest message is half a
+        period old on average. Torques act at once.
         """
         states = self.states.values()
         is_torque = any(state.wanted is CommandKind.TORQUE for state in states)
@@ -170,7 +179,7 @@ class FriCell:
         return 0.0 if is_torque else farther + DELAY + _PASSING + 2.5 * max(state.period for state in states)
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Of all arms that were heard, at the newest tick. Torques are for no time: there only silence tells."""
+        """Return the timing of all arms that were heard. Torques have no time, so that only silence counts for them."""
         return {arm: state.timing(self._now) for arm, state in self.states.items() if state.newest is not None}
 
     def lead(self) -> float:
@@ -178,7 +187,7 @@ class FriCell:
         return DELAY + self._ahead + self._period
 
     def openings(self) -> dict[str, float]:
-        """Measured opening of each gripper that has an input, 0 closed .. 1 open."""
+        """Return the measured opening of each gripper that has an input, from 0 for closed to 1 for open."""
         found = {}
         for arm, gripper in self._grippers.items():
             newest = self.states[arm].newest
@@ -188,11 +197,11 @@ class FriCell:
 
     @property
     def is_heard(self) -> bool:
-        """Whether every cabinet has said something."""
+        """Whether every cabinet has sent a message."""
         return all(state.newest is not None for state in self.states.values())
 
     def state(self) -> RobotState:
-        """Measurements of the cabinets, as old as the older message."""
+        """Return the measurements of the cabinets, with the stamp of the oldest message."""
         q, v, tau, external, held = np.zeros((5, self._robot.model.nv))
         knows_external = True
         for arm, state in self.states.items():

@@ -1,4 +1,4 @@
-"""Two arms, or one, behind KUKA's cabinets: a process answers them, the loop says where the arms are to go."""
+"""Two arms, or one, behind KUKA's cabinets. A process answers the cabinets, and gets the arms' motion from the loop."""
 
 from __future__ import annotations
 
@@ -23,22 +23,25 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
-_KEPT = 100_000  # answers; the garbage collector goes through all of them in mid-run
+_KEPT = 100_000  # Number of answers that are kept. The garbage collector looks at all of them during a run.
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
 class FriPlant:
-    """The arms start where they stand, and again after each session that a cabinet ended."""
+    """A plant whose arms start where they stand, also after each session that a cabinet has ended."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
     realtime_only = True
-    # In a reset, for each cabinet's first message, and for all to command. A run begins without the latter, too [s].
+    # Times that a reset waits for the first message of each cabinet, and for all sessions [s]. Without all sessions a
+    # run begins nevertheless.
     longest_wait = longest_session_wait = 5.0
 
     def __init__(self, robot: Robot, config: Config) -> None:
-        """Raises :class:`ConfigError` unless every arm has a cabinet and seven joints, and a gripper its package.
+        """Make the plant.
 
-        And where late ticks would have several accelerations: between two ticks the cabinets get a parabola.
+        Raises:
+            ConfigError: If an arm lacks a cabinet or does not have seven joints, if the package of a gripper is
+                missing, or if a late tick would be split into steps. Between two ticks the cabinets get one parabola.
         """
         for arm, its in robot.arms.items():
             if arm not in set(config.fri):
@@ -54,7 +57,7 @@ class FriPlant:
         self.begin(CommandMode.POSITION)
         self.grippers = self._modbus_grippers()
         self._answering: AnsweringProcess | None = None
-        # The newest: when each message arrived, by the monotonic clock, and how long until its answer was sent [s].
+        # For the newest messages, the arrival by the monotonic clock, and the time until the answer was sent [s].
         self.answers: deque[tuple[float, float]] = deque(maxlen=_KEPT)
 
     @classmethod
@@ -63,7 +66,7 @@ class FriPlant:
 
     @property
     def addresses(self) -> list[str]:
-        """Of the cabinets."""
+        """The addresses of the cabinets."""
         return [cabinet.address for cabinet in self._cabinets.values()]
 
     def begin(self, mode: CommandMode, stopped: Callable[[], bool] = lambda: False) -> None:
@@ -71,7 +74,11 @@ class FriPlant:
         self._mode, self._stopped = mode, stopped
 
     def reset(self, q: Array | None = None) -> None:
-        """Hear the cabinets. Raises :class:`PlantError` where one says nothing, and for ``q``: arms are not placed."""
+        """Begin to hear the cabinets.
+
+        Raises:
+            PlantError: If a cabinet says nothing, or if ``q`` is given, because real arms cannot be placed.
+        """
         if q is not None:
             raise PlantError("reset q: a real arm starts where it stands")
         self.close()
@@ -82,7 +89,7 @@ class FriPlant:
             self._answering = AnsweringProcess(lines)
         finally:
             for line in lines:
-                socket.close(line.file)  # the process has it
+                socket.close(line.file)  # The process has a copy of it.
         self.grippers = self._modbus_grippers()
         for gripper in self.grippers.values():
             gripper.start()
@@ -93,7 +100,7 @@ class FriPlant:
             raise
 
     def _wait(self) -> None:
-        """Wait for the cabinets. Raises :class:`PlantError` where one says nothing."""
+        """Wait for the cabinets; raises :class:`PlantError` if one says nothing."""
         waiting = CabinetWait(self._stopped)
 
         def looked(ready: Callable[[], bool]) -> bool:
@@ -111,7 +118,7 @@ class FriPlant:
         waiting.until(lambda: looked(lambda: self.cell.fault() is None), states, self.longest_session_wait)
 
     def is_released(self) -> bool:
-        """Whether no process answers the cabinets, on this computer, so that nothing moves the arms any more."""
+        """Return whether no process on this computer answers the cabinets any more, so that nothing moves the arms."""
         try:
             for line in self._lines():
                 socket.close(line.file)
@@ -135,7 +142,7 @@ class FriPlant:
         return lines
 
     def states(self) -> dict[str, SessionState]:
-        """Of each arm's session, as the newest message of its cabinet has left it."""
+        """Return the state of each arm's session after the newest message of its cabinet."""
         if self._answering is not None:
             states, answers = self._answering.receive()
             self.answers.extend(answers)
@@ -144,7 +151,7 @@ class FriPlant:
         return self.cell.states
 
     def due(self, now: float) -> tuple[float, float]:
-        """See :meth:`FriCell.due`. Raises :class:`PlantError` where nothing answers the cabinets any more."""
+        """See :meth:`FriCell.due`; raises :class:`PlantError` if nothing answers the cabinets any more."""
         self.states()
         return self.cell.due(now)
 
@@ -180,13 +187,13 @@ class FriPlant:
                 gripper.command(float(command.grippers[arm]))
 
     def advance(self, dt: float) -> None:
-        """Time passes by itself."""
+        """Do nothing, because the time of real arms passes by itself."""
 
     def state(self) -> RobotState:
         return self.cell.state()
 
     def gripper_openings(self) -> dict[str, float]:
-        """See :meth:`Plant.gripper_openings`. Before a run those that are going to be measured are open."""
+        """See :meth:`Plant.gripper_openings`. Before a run, grippers that will be measured count as open."""
         if self._answering is None:
             its = {arm: cabinet.gripper for arm, cabinet in self._cabinets.items()}
             return {arm: 1.0 for arm, one in its.items() if one is not None and getattr(one, "input", True) is not None}
@@ -202,6 +209,6 @@ class FriPlant:
                 gripper.close()
 
     def _modbus_grippers(self) -> dict[str, ModbusGripper]:
-        """New ones, which know nothing of an earlier run."""
+        """Make new grippers, which know nothing of an earlier run."""
         configs = {arm: cabinet.gripper for arm, cabinet in self._cabinets.items()}
         return {arm: ModbusGripper(arm, its) for arm, its in configs.items() if isinstance(its, ModbusGripperConfig)}

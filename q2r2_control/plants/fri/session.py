@@ -1,4 +1,4 @@
-"""The session with one cabinet, in a time that is passed in: a datagram in, the answer to it out."""
+"""Keep the session with one cabinet: a datagram goes in, and its answer comes out. The caller gives the time."""
 
 from __future__ import annotations
 
@@ -23,23 +23,24 @@ from q2r2_control.plants.fri.wire import (
 )
 from q2r2_control.types import Array
 
-# An answer is for so long before its question arrived, by which time the loop has ticked, on a busy machine too [s].
+# An answer is for a time that is this much before the arrival of its question [s]. Also on a busy computer the loop has
+# ticked by then.
 DELAY = 0.004
 _AT_REST = 1e-9  # [rad]
-_RESTARTED = 1000  # a counter that is back by more is that of a session that began anew
+_RESTARTED = 1000  # A counter that goes back by more shows that the session has begun anew.
 _COUNTERS = 1 << 32
-_MOST_AHEAD = 20  # messages that may come at once after a moment without any
-# A torque that nobody renews is a push without end: one that brakes follows it, and after a while no answer, so that
-# the cabinet ends the session [s].
+_MOST_AHEAD = 20  # Number of messages that may come at once after a gap.
+# Times after which a torque that is not updated is replaced [s]. A torque that nobody updates would push for ever. It
+# is replaced by a torque that brakes, and later by no answer, so that the cabinet ends the session.
 _TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
-_BRAKING_RATE = 5000.0  # of torques at least: a slower damping would come too late [Nm/s]
-# Of a reference that begins where its arm is held, or, with torques, where it is measured [rad].
+_BRAKING_RATE = 5000.0  # Least permitted rate of torques, because slower damping would come too late [Nm/s].
+# Greatest distance of a reference at its beginning from where the arm is held, or with torques is measured [rad].
 _SAME, _NEAR = 1e-6, 0.02
-_FROM_REST = 20.0  # more than a joint's acceleration in the first tick [rad/s^2]
+_FROM_REST = 20.0  # A bound above the acceleration of a joint in the first tick [rad/s^2].
 
 
 class ArmSession:
-    """One arm. While it follows, its answers are on the reference's ``path``; else it is held where it is."""
+    """The session of one arm. While it follows, its answers are on the reference's ``path``; else the arm is held."""
 
     def __init__(
         self,
@@ -51,18 +52,25 @@ class ArmSession:
         velocity_limit: Array | None = None,
         torque_rate_limit: float = math.inf,
     ) -> None:
-        """``source``: the cabinet in words; ``version`` of FRI, None: either.
+        """Make the session of one arm.
 
-        ``torque_limit`` (n,): of overlays; ``velocity_limit`` (n,): none is measured beyond. A position that jumps once
-        lets the damping then push a joint back by the way of one period at that speed, and no further.
-        ``torque_rate_limit``: between two answers [Nm/s]. The damping keeps it too, or 5000 where that is lower.
+        Args:
+            arm: The arm.
+            source: The cabinet in words.
+            wanted: The kind of commands, positions or torques.
+            version: The version of FRI; None for either.
+            torque_limit: Greatest torque of an overlay (n,) [Nm].
+            velocity_limit: Greatest plausible measured velocity (n,) [rad/s]. A measured position that jumps once then
+                lets the damping push the joint back by the way of one period at this velocity at most.
+            torque_rate_limit: Greatest change of a torque between two answers [Nm/s]. The damping keeps it as well, or
+                5000 Nm/s if the limit is lower.
         """
         self.state, self._version = SessionState(arm, source, wanted), version
         self.path = ReferencePath(0.0, np.zeros(JOINTS))
-        # Overlay [Nm], or None: the damping; and when that was decided on [s].
+        # The torque overlay [Nm], or None for the damping; and the time at which it was decided on [s].
         self._tau: Array | None = None
         self._tau_came = -math.inf
-        self._damping = np.zeros(JOINTS)  # that brakes where no overlay comes [Nm s/rad]
+        self._damping = np.zeros(JOINTS)  # Brakes the arm if no overlay comes [Nm s/rad].
         none = np.full(JOINTS, math.inf)
         self._torque_limit = none if torque_limit is None else torque_limit
         self._torque_rate_limit = max(torque_rate_limit, _BRAKING_RATE)
@@ -72,11 +80,11 @@ class ArmSession:
         self._answers = 0
         self._times: AnswerTimes | None = None
         self._clock = MessageClock(-math.inf)
-        self.waits = 0.0  # how far its answers wait for the other arms [s]
-        self._begun = False  # the cabinet's own position is known, where the path begins
+        self.waits = 0.0  # Time by which the answers wait for the other arms [s].
+        self._begun = False  # Whether the cabinet's own position is known, at which the path begins.
 
     def is_still(self, now: float) -> bool:
-        """Whether nothing moves the arm at ``now`` [s] if no more commands come."""
+        """Return whether nothing moves the arm at ``now`` [s] if no more commands come."""
         if not self._begun or self.state.is_silent(now):
             return True
         if self.state.wanted is CommandKind.TORQUE:
@@ -84,22 +92,22 @@ class ArmSession:
         return self._rests(self.state.answered)
 
     def _rests(self, t: float) -> bool:
-        """Whether the path has come to its end at ``t`` [s]."""
+        """Return whether the path has come to its end at ``t`` [s]."""
         return bool(np.abs(self.path.at(t) - self.path.rest).max() <= _AT_REST)
 
     def has_passed(self, command: ArmCommand) -> bool:
-        """Whether an answer was for a time of the command's already, and followed the stop before it."""
+        """Return whether an answer has already followed the earlier stop at a time for which ``command`` is."""
         return self.state.following and self.state.answered > command.start
 
     def follow(self, command: ArmCommand) -> None:
-        """Take a tick's command, which no answer has passed."""
+        """Take the command of a tick, which no answer has passed."""
         state = self.state
         if state.is_silent(command.now):
             self._brake()
         if not state.following and self._begins(command):
             state.following = state.fault(command.now) is None
             self.path = ReferencePath(command.start, self.path.rest)
-        if state.following and command.end > self.path.end:  # a second command in a tick is no motion
+        if state.following and command.end > self.path.end:  # A second command of one tick adds no motion.
             there, speed, deceleration = map(np.array, (command.q, command.v, command.deceleration))
             self.path.extend(command.end, there, speed, deceleration, command.start)
             state.rest = joints_of(self.path.rest)
@@ -109,7 +117,7 @@ class ArmSession:
             self._damping, self._tau_came = np.array(command.damping), command.now
 
     def _begins(self, command: ArmCommand) -> bool:
-        """Whether the reference was at rest a tick ago, where the arm is."""
+        """Return whether the reference was at rest a tick ago, at the place of the arm."""
         state, step = self.state, command.end - command.start
         torques = state.wanted is CommandKind.TORQUE and state.newest
         if not torques and not self._rests(state.answered):
@@ -119,7 +127,7 @@ class ArmSession:
         return bool((speed <= _FROM_REST * step).all() and (way <= speed * step + allowed).all())
 
     def answer(self, datagram: bytes, now: float) -> bytes | None:
-        """Take a message that came at ``now`` [s]; returns the datagram that answers it, if one is due."""
+        """Take a message that came at ``now`` [s]; returns the datagram of the answer, or None if none is due."""
         try:
             message = read_monitoring(datagram)
             self._check(message, now)
@@ -135,7 +143,7 @@ class ArmSession:
         return write_command(command, message.version)
 
     def _check(self, message: Monitoring, now: float) -> None:
-        """Raises :class:`ProtocolError` for a message that cannot be this cabinet's."""
+        """Raise :class:`ProtocolError` if a message cannot come from this cabinet."""
         if self._version not in (None, message.version):
             raise ProtocolError(f"FRI {message.version}: allowed by the YAML: {self._version}")
         before, passed = self.state.newest, now - self.state.arrival
@@ -148,13 +156,13 @@ class ArmSession:
             raise ProtocolError(f"FRI message counter {ahead} ahead, {passed:.3f} s after the last one")
 
     def _take(self, message: Monitoring, now: float) -> bool:
-        """Note a message; False for one that is older than the newest."""
+        """Take the contents of a message; returns False for one that is older than the newest."""
         state, before = self.state, self.state.newest
         state.problem = None
         if before is None or state.is_silent(now):
             passed = 0
             if before is not None and self._lasts(message, before):
-                self._brake()  # to begin anew would stop the arm at once
+                self._brake()  # To begin anew here would stop the arm at once.
             else:
                 self._begin_anew()
         else:
@@ -184,13 +192,13 @@ class ArmSession:
         return True
 
     def _lasts(self, message: Monitoring, before: Monitoring) -> bool:
-        """Whether the session before a silence goes on after it."""
+        """Return whether a session goes on after a silence."""
         active = Session.COMMANDING_ACTIVE
         same = message.version == before.version and message.session is before.session is active
         return self._begun and same and _ahead(message, before) > 0
 
     def _brake(self) -> None:
-        """The cabinet is silent: the arm follows no more, and brakes from where the newest answer led it."""
+        """Let the arm brake from the newest answer, because its cabinet is silent."""
         if self.state.following:
             self._cease()
             if self.state.wanted is CommandKind.POSITION:
@@ -198,7 +206,7 @@ class ArmSession:
                 self.state.rest = joints_of(self.path.rest)
 
     def _begin_anew(self) -> None:
-        """The arm is where its cabinet says next."""
+        """Let the path begin anew, at the position that the next message of the cabinet has."""
         self._cease()
         self._begun = False
         self._times = None
@@ -214,13 +222,13 @@ class ArmSession:
             self._begin_anew()
             if message.session is Session.IDLE:
                 return None
-            mirrored = message.commanded_q or message.q  # which FRI 1 expects, and FRI 2 does without
+            mirrored = message.commanded_q or message.q  # FRI 1 expects this, and FRI 2 does not need it.
             return FriCommand(counter, reflected, mirrored if message.version == 1 else None, io=self._io(message))
         if self._times is None:
             self._times = AnswerTimes(message.period * message.multiplier, DELAY)
         if message.session is Session.COMMANDING_WAIT or not self._begun:
-            # The first command has to equal the cabinet's own position, and the reference begins there. In a session
-            # that another client has begun, the arm is no longer where the cabinet's own motion holds it.
+            # The first command has to equal the cabinet's own position, where the reference begins. In a session that
+            # another client has begun, the arm is not there any more.
             own = message.ipo_q if message.session is Session.COMMANDING_WAIT else message.commanded_q
             self._cease()
             self._begun = True
@@ -233,19 +241,19 @@ class ArmSession:
         time, state = self._times.at(*question), self.state
         wanted = self._clock.expected - self.waits - DELAY
         if abs(wanted - time) > message.period and self._rests(min(time, wanted)):
-            self._times.restart()  # where nothing moves, and nothing is known that will, an answer may be for any time
+            self._times.restart()  # While nothing moves, an answer may be for any time.
             time = self._times.at(*question)
         state.answered, state.lag = max(state.answered, time), now - DELAY - time
         state.expected, state.behind = self._clock.expected, self._clock.expected - DELAY - time
         return FriCommand(counter, reflected, joints_of(self.path.at(time)), io=self._io(message))
 
     def _io(self, message: Monitoring) -> dict[str, IoValue]:
-        """Values for the outputs that the cabinet has; others are not written."""
+        """Return the values for the outputs that the cabinet has. Other outputs are not written."""
         fitting = {name: message.output(name, value) for name, value in self._outputs.items()}
         return {name: value for name, value in fitting.items() if value is not None}
 
     def _torque(self, message: Monitoring, now: float) -> FriCommand | None:
-        """The newest overlay, or one that brakes, with the cabinet's own position as KUKA's example clients have it."""
+        """Return the newest torque overlay, or one that brakes, with the cabinet's own position, as KUKA's examples."""
         age = now - self._tau_came
         if self.state.is_too_slow or (message.session is Session.COMMANDING_ACTIVE and age > _TORQUE_GONE):
             return None
@@ -260,7 +268,7 @@ class ArmSession:
 
 
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:
-    """Let every arm take its command, or none where one of them came too late: both brake together."""
+    """Let every arm take its command; returns False, and none takes it, if one came too late. Both arms then brake."""
     if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
         return False
     for arm, command in commands.items():
@@ -269,9 +277,9 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
 
 
 def answer(sessions: Mapping[str, ArmSession], arm: str, datagram: bytes, now: float) -> bytes | None:
-    """As :meth:`ArmSession.answer` of one ``arm``, which waits for those that are behind.
+    """Answer a message of one arm as :meth:`ArmSession.answer` does, and let the arm wait for arms that are behind.
 
-    It waits by half of what they are behind. They catch up meanwhile, and so all arrive where none is behind.
+    It waits for half of the time that they are behind. They catch up meanwhile, until no arm is behind.
     """
     lags = [other.state.timing(now).lag for name, other in sessions.items() if name != arm and other.state.following]
     sessions[arm].waits = 0.5 * max(0.0, *lags, 0.0)
@@ -279,5 +287,5 @@ def answer(sessions: Mapping[str, ArmSession], arm: str, datagram: bytes, now: f
 
 
 def _ahead(message: Monitoring, before: Monitoring) -> int:
-    """By how many messages it is newer; negative: older."""
+    """Return by how many messages ``message`` is newer than ``before``; negative if it is older."""
     return (message.counter - before.counter + _COUNTERS // 2) % _COUNTERS - _COUNTERS // 2

@@ -1,4 +1,4 @@
-"""Wait for cabinets that a person has to start; log what there is to do, and how long the wait has lasted."""
+"""Wait for cabinets that a person has to start, and log what this person has to do and how long it has taken."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterable
 from q2r2_control.plants.fri.session_state import SessionState
 from q2r2_control.plants.fri.wire import Session
 
-_LOOKS = 0.01  # between two looks at the cabinets [s]
-_FIRST_LINE, _BETWEEN_LINES = 3.0, 10.0  # cabinets that are ready within the first need no line [s]
+_LOOKS = 0.01  # Time between two looks at the cabinets [s].
+_FIRST_LINE, _BETWEEN_LINES = 3.0, 10.0  # Delay of the first line, and time between two lines [s].
 _START = (
     "start its FRI application at the smartPAD: choose it, in T1 or T2 hold the enabling switch, press the play key"
 )
@@ -28,18 +28,18 @@ _logger = logging.getLogger(__name__)
 
 
 class CabinetWait:
-    """Waits from the moment that it is made. Lines are logged: one at first, and then every ten seconds."""
+    """Waits, and logs a line after some seconds and then every ten seconds. The time begins when it is made."""
 
     def __init__(
         self, stopped: Callable[[], bool] = lambda: False, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """``stopped`` returns True as soon as nobody wants to wait any longer; ``clock`` [s] is that of the states."""
+        """``stopped`` returns True if the wait is to end; ``clock`` is the clock of the states [s]."""
         self._stopped, self._clock, self._began = stopped, clock, clock()
         self._next_line = self._began + _FIRST_LINE
 
     @property
     def passed(self) -> float:
-        """Time since the begin of the wait [s]."""
+        """Time since the beginning of the wait [s]."""
         return self._clock() - self._began
 
     @property
@@ -50,12 +50,12 @@ class CabinetWait:
         """Wait until ``done``, at most until ``longest`` [s] after the begin of all waiting.
 
         Args:
-            done: Looks at the cabinets anew, and returns True if there is nothing to wait for.
-            states: Sessions of all arms, of which the lines tell.
-            longest: A bound [s]; infinite: none.
+            done: Looks at the cabinets, and returns True if there is nothing to wait for.
+            states: Returns the sessions of all arms, for the lines.
+            longest: The longest wait; infinite if there is no bound [s].
 
         Returns:
-            True if ``done`` returned True; False if time was over, or somebody stopped the wait.
+            True if ``done`` returned True; False if the time was over, or somebody ended the wait.
         """
         while not done():
             now = self._clock()
@@ -71,7 +71,7 @@ class CabinetWait:
 
 
 def what_is_missing(state: SessionState, now: float) -> str:
-    """A line for an operator: where a cabinet is in its session, and what to do there."""
+    """Return a line for the operator: the state of a cabinet's session, and what to do there."""
     newest = state.newest
     if newest is None or state.is_silent(now):
         if state.problem is not None:

@@ -1,0 +1,176 @@
+"""Measured joint states that are late, old, no numbers, or jump; and the rules for arms of another controller."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control import load_config
+from q2r2_control.config.control import SupervisionSettings
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.supervision.joint_watch import JointWatch, settings_for_external_arms, watch_settings
+from q2r2_control.types import RobotState
+from tests.supervision.conftest import CONFIG
+
+NAMES, LIMIT = ("shoulder", "elbow"), np.array([1.0, 2.0])  # velocity limits [rad/s]
+SETTINGS = SupervisionSettings()
+PERIOD = 0.01  # of the states [s]
+
+
+def state(q: float, stamp: float, v: float = 0.0, external: float | None = None) -> RobotState:
+    torque = None if external is None else np.array([0.0, external])
+    return RobotState(q=np.array([0.0, q]), v=np.array([0.0, v]), tau=np.zeros(2), stamp=stamp, tau_external=torque)
+
+
+class Joints:
+    """A watch that has accepted states at rest until ``now`` [s]."""
+
+    def __init__(self, settings: SupervisionSettings = SETTINGS) -> None:
+        self.watch = JointWatch(NAMES, LIMIT, watch_settings(settings, yields=False), lambda: " from /arm")
+        self.now = 0.0
+        self.rest(settings.settle_time + 2.0 * PERIOD)
+        assert self.watch.settled(self.now)
+        self.watch.accept()
+
+    def rest(self, duration: float, q: float = 0.0) -> None:
+        end = self.now + duration
+        while self.now < end:
+            self.now += PERIOD
+            self.watch.observe(state(q, self.now), self.now)
+
+    def fault(self) -> ReasonKind | None:
+        found = self.watch.check(self.now)
+        return None if found is None else found.kind
+
+
+@pytest.fixture
+def joints() -> Joints:
+    return Joints()
+
+
+def test_no_fault_is_found_while_states_come_and_the_arms_rest(joints: Joints) -> None:
+    joints.rest(1.0)
+    assert joints.fault() is None
+    assert joints.watch.believed
+
+
+def test_states_that_cease_are_a_fault_after_the_timeout(joints: Joints) -> None:
+    joints.now += SETTINGS.state_timeout - 1e-6
+    assert joints.fault() is None
+    joints.now += 2e-6
+    assert joints.fault() is ReasonKind.STATES_SILENT
+    assert not joints.watch.believed
+    assert " from /arm" in str(joints.watch.check(joints.now))
+
+
+def test_a_clock_that_was_set_back_by_more_than_the_timeout_is_a_fault(joints: Joints) -> None:
+    joints.now -= SETTINGS.state_timeout - 1e-6
+    assert joints.fault() is None
+    joints.now -= 2e-6
+    assert joints.fault() is ReasonKind.STATES_SILENT
+
+
+def test_the_first_fault_stays_until_states_are_accepted_again(joints: Joints) -> None:
+    joints.watch.observe(Reason.of(ReasonKind.BAD_JOINT_STATES, text="elbow is missing"), joints.now)
+    joints.watch.observe(Reason.of(ReasonKind.LOOP_STALLED, duration=1.0), joints.now)
+    assert joints.fault() is ReasonKind.BAD_JOINT_STATES
+    joints.rest(SETTINGS.settle_time + 2.0 * PERIOD)
+    assert joints.watch.settled(joints.now)
+    joints.watch.accept()
+    assert joints.fault() is None
+
+
+@pytest.mark.parametrize("what", ["position", "velocity", "external torque"])
+def test_a_number_that_is_not_finite_is_bridged_for_a_while_and_named_then(joints: Joints, what: str) -> None:
+    bad = {
+        "position": lambda stamp: state(np.nan, stamp),
+        "velocity": lambda stamp: state(0.0, stamp, v=np.inf),
+        "external torque": lambda stamp: state(0.0, stamp, external=np.nan),
+    }[what]
+    good = joints.now
+    while joints.now < good + SETTINGS.unusable_time - PERIOD:
+        joints.now += PERIOD
+        joints.watch.observe(bad(joints.now), joints.now)
+        assert joints.fault() is None
+    assert joints.watch.state is not None
+    assert joints.watch.state.stamp == good
+    joints.now = good + SETTINGS.unusable_time + 1e-6
+    joints.watch.observe(bad(joints.now), joints.now)
+    fault = joints.watch.fault
+    assert fault is not None
+    assert (fault.kind, fault.detail["quantity"], fault.detail["joint"]) == (ReasonKind.STATE_NOT_FINITE, what, "elbow")
+
+
+@pytest.mark.parametrize("gap", [PERIOD, 0.05])
+def test_a_joint_that_moves_farther_than_its_speed_allows_is_a_fault(gap: float) -> None:
+    """The elbow may move at 2 rad/s for the gap and 20 ms more, and 50 mrad."""
+    allowed = 2.0 * (gap + 0.02) + 0.05
+    for distance, expected in ((allowed - 1e-6, None), (allowed + 1e-6, ReasonKind.STATE_JUMPED)):
+        joints = Joints()
+        joints.now += gap
+        joints.watch.observe(state(distance, joints.now), joints.now)
+        assert joints.fault() is expected
+
+
+def test_simulated_time_that_passed_counts_where_it_is_longer_than_the_loop_s(joints: Joints) -> None:
+    joints.now += PERIOD
+    joints.watch.observe(state(0.4, joints.now), joints.now, passed=0.2)
+    assert joints.fault() is None
+
+
+def test_arms_that_creep_are_not_settled_and_arms_at_rest_are_after_the_settle_time() -> None:
+    watch, now = JointWatch(NAMES, LIMIT, watch_settings(SETTINGS, yields=False)), 0.0
+    while now < 3.0 * SETTINGS.settle_time:
+        now += PERIOD
+        watch.observe(state(0.15 * now, now), now)
+        assert not watch.settled(now), "it moves by 10 mrad within the settle time"
+    still = now
+    while now < still + SETTINGS.settle_time + PERIOD:
+        now += PERIOD
+        watch.observe(state(0.15 * still, now), now)
+    assert watch.settled(now)
+    assert not watch.settled(now + SETTINGS.state_timeout + 1e-6), "the newest state is too old"
+
+
+def test_arms_whose_session_is_lost_may_brake_by_states_that_still_come(joints: Joints) -> None:
+    joints.watch.lose(Reason.of(ReasonKind.LOOP_STALLED, duration=1.0))
+    assert joints.fault() is ReasonKind.LOOP_STALLED
+    assert joints.watch.believed
+    joints.now += PERIOD
+    joints.watch.observe(state(np.pi, joints.now), joints.now)
+    joints.now += PERIOD
+    joints.watch.observe(state(-np.pi, joints.now), joints.now)
+    assert not joints.watch.believed
+
+
+def test_arms_that_lose_their_session_during_another_fault_may_not_brake_by_their_states(joints: Joints) -> None:
+    joints.watch.observe(Reason.of(ReasonKind.BAD_JOINT_STATES, text="elbow is missing"), joints.now)
+    joints.watch.lose(Reason.of(ReasonKind.LOOP_STALLED, duration=1.0))
+    assert not joints.watch.believed
+
+
+def test_a_joint_away_from_its_reference_is_named_after_the_deviation_time(joints: Joints) -> None:
+    near = np.array([0.0, SETTINGS.max_deviation])
+    far = near + np.array([0.0, 1e-6])
+    assert joints.watch.deviates(near, joints.now) is None
+    began = joints.now
+    assert joints.watch.deviates(far, began + SETTINGS.deviation_time) is None
+    reason = joints.watch.deviates(far, began + SETTINGS.deviation_time + 1e-6)
+    assert reason is not None
+    assert (reason.kind, reason.detail["joint"]) == (ReasonKind.OFF_REFERENCE, "elbow")
+    assert joints.watch.deviates(near, began + 1.0) is None, "it is near again"
+    assert joints.watch.deviates(far, began + 1.0 + SETTINGS.deviation_time) is None
+
+
+def test_compliant_arms_may_be_pushed_farther_away() -> None:
+    assert watch_settings(SETTINGS, yields=True).deviation == SETTINGS.max_deviation_torque
+    assert watch_settings(SETTINGS, yields=False).deviation == SETTINGS.max_deviation
+
+
+def test_only_the_other_controller_is_compliant_and_its_arms_may_lag_farther() -> None:
+    config = load_config(CONFIG)
+    config = config.model_copy(update={"admittance": config.admittance.model_copy(update={"enabled": True})})
+    external = settings_for_external_arms(config)
+    assert not external.admittance.enabled
+    assert external.supervision.max_deviation == config.supervision.max_deviation_external
+    assert external.control.posture_gain > config.control.posture_gain
