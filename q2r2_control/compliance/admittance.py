@@ -1,7 +1,7 @@
 """Compliance in position mode: the measured wrench displaces the target that the QP follows.
 
-The QP keeps every limit and distance whatever is asked of it, so the displacement needs no bounds but those for the
-operator's sake. Only the QP sees the displaced target: recordings and the teleop layer go on with the operator's own.
+The QP keeps every limit and distance for any target. The bounds of the displacement are therefore only for the
+operator. Only the QP sees the displaced target: recordings and the teleop layer use the operator's own target.
 
 The tool shows the admittance in series with the servos below it. Against a stiff body the loop closes through QP and
 servos with their delay. With the defaults a simulated arm leans quietly on 10 kN/m. On 30 kN/m it does so with twice
@@ -23,13 +23,14 @@ from q2r2_control.robot.robot import Arm, Robot
 from q2r2_control.types import Array, RobotState
 
 _METRES = np.array([1.0, 1.0, 1.0, *[ROTATION_LENGTH] * 3])
-# Of J, in metres throughout: below it a direction counts as singular. A torque error of 0.1 Nm is worth 2 N there [m].
+# Singular value of J, all in metres, below which a direction counts as singular [m]. A torque error of 0.1 Nm is an
+# error of 2 N there.
 _SINGULAR = 0.05
-_NOTHING = 1e-9  # below it a displacement counts as over [m, rad, per second]
+_NOTHING = 1e-9  # A smaller displacement or speed counts as zero [m], [rad], [1/s].
 
 
 def estimate_wrench(J: Array, tau: Array) -> Array:
-    """Least-squares wrench (6,) for the torques ``tau`` (n,) [Nm] of an arm's joints with the Jacobian J (6, n).
+    """Return the least-squares wrench (6,) for the torques ``tau`` (n,) [Nm] of an arm with the Jacobian J (6, n).
 
     By J J' = V s^2 V', F = V f(s) V' J tau.
     """
@@ -43,7 +44,7 @@ def estimate_wrench(J: Array, tau: Array) -> Array:
 
 
 def rest_displacement(force: Array, dead_band: float, stiffness: float, limit: float) -> Array:
-    """Displacement (3,) at which the spring bears a force or torque (3,), after the dead band, within ``limit``."""
+    """Return the displacement (3,) at which the spring balances a force or torque (3,) beyond the dead band."""
     size = math.hypot(*force)
     if size <= dead_band:
         return np.zeros(3)
@@ -51,7 +52,7 @@ def rest_displacement(force: Array, dead_band: float, stiffness: float, limit: f
 
 
 def stop_at_limit(x: Array, v: Array, limit: float) -> tuple[Array, Array]:
-    """A displacement and its speed, (3,) each, no farther than ``limit``, and there without speed outwards."""
+    """Return a displacement (3,) of at most ``limit`` and its speed (3,), which does not point outwards there."""
     length = math.hypot(*x)
     if length <= limit:
         return x, v
@@ -60,10 +61,10 @@ def stop_at_limit(x: Array, v: Array, limit: float) -> tuple[Array, Array]:
 
 
 def oscillate(x: Array, v: Array, frequency: float, damping_ratio: float, dt: float) -> tuple[Array, Array]:
-    """Exact x and v after ``dt`` [s] of  x'' + 2 xi w x' + w^2 x = 0,  w the undamped ``frequency`` [rad/s]."""
+    """Return the exact x and v after ``dt`` [s] of x'' + 2 xi w x' + w^2 x = 0, with the ``frequency`` w [rad/s]."""
     fall = damping_ratio * frequency
     spread = frequency * math.sqrt(abs(damping_ratio**2 - 1.0))
-    # e^-fall t times cos or cosh, and sin or sinh over spread, without overflow.
+    # The products of e^(-fall t) with cos or cosh, and with sin or sinh over spread, in a form without overflow.
     if spread * dt < 1e-6:
         cosine = math.exp(-fall * dt)
         sine = cosine * dt
@@ -79,22 +80,22 @@ def oscillate(x: Array, v: Array, frequency: float, damping_ratio: float, dt: fl
 
 @dataclass(frozen=True, slots=True)
 class ArmCompliance:
-    """How one arm yields. World axes, at the tool frame's origin."""
+    """The wrench and the displacement of one arm, in world axes at the origin of the tool frame."""
 
-    wrench: Array  # (6,) on the tool, after the low-pass, before the dead band: force [N], torque [Nm]
-    displacement: Array  # (6,) translation [m], rotation vector [rad]
+    wrench: Array  # (6,) On the tool, after the low-pass and before the dead band: force [N], torque [Nm].
+    displacement: Array  # (6,) Translation [m], rotation vector [rad].
 
 
 @dataclass(frozen=True, slots=True)
 class AdmittanceReport:
-    """The admittance's result of one tick."""
+    """The result of the admittance in one tick."""
 
     arms: dict[str, ArmCompliance]
-    rejected: bool  # the measurement or dt was not finite: the last good wrench is held
+    rejected: bool  # Whether the measurement or dt was not finite, so that the last good wrench is used.
 
 
 class Admittance:
-    """Displaces the targets of all arms so that each tool yields like M x'' + D x' + K x = F."""
+    """Displaces the targets of all arms, so that each tool yields as M x'' + D x' + K x = F does."""
 
     def __init__(self, robot: Robot, settings: AdmittanceSettings | None = None) -> None:
         self.settings = settings or AdmittanceSettings()
@@ -104,20 +105,23 @@ class Admittance:
 
     def reset(self) -> None:
         """Forget wrenches and displacements."""
-        self._wrench = {arm: np.zeros(6) for arm in self._arms}  # after the low-pass [N, Nm]
-        self._x = {arm: np.zeros(6) for arm in self._arms}  # displacement [m, rad]
-        self._v = {arm: np.zeros(6) for arm in self._arms}  # [m/s, rad/s]
+        self._wrench = {arm: np.zeros(6) for arm in self._arms}  # After the low-pass [N], [Nm].
+        self._x = {arm: np.zeros(6) for arm in self._arms}  # Displacement [m], [rad].
+        self._v = {arm: np.zeros(6) for arm in self._arms}  # [m/s], [rad/s]
         self._rejected = False
 
     def update(self, targets: Mapping[str, pin.SE3 | None], state: RobotState, dt: float) -> dict[str, pin.SE3 | None]:
-        """The ``targets`` (world frame), displaced after ``dt`` [s].
+        """Return the displaced targets.
 
-        ``state.tau_external`` (nv,) is J' F of the wrench F that the environment exerts on the tool; None counts as
-        no touch. With no touch and the last displacement gone the targets come back as they are.
+        If an arm has no target, its displacement ends at once, because a new target starts at the tool. If a torque or
+        the posture is not finite, the last wrench is used. If dt is not positive and finite, nothing moves. The report
+        says so in both cases. A target that is not finite is passed on, and the controller refuses it.
 
-        The displacement of an arm whose target is missing or None ends at once: a new target starts where the tool is.
-        Torques or a posture that are not finite hold the last wrench; a dt that is not positive and finite moves
-        nothing; the report says so. A target that is not finite stays so, for the controller to refuse.
+        Args:
+            targets: Targets of the tools, in the world frame.
+            state: The measured state. ``tau_external`` (nv,) is J' F for the wrench F of the environment on the tool;
+                None counts as no contact.
+            dt: Time since the last call [s].
         """
         self._rejected = not (math.isfinite(dt) and dt > 0.0)
         if not self._rejected:
@@ -132,12 +136,12 @@ class Admittance:
         return displaced
 
     def report(self) -> AdmittanceReport:
-        """Of the last update."""
+        """The report of the last update."""
         arms = {arm: ArmCompliance(self._wrench[arm].copy(), x.copy()) for arm, x in self._x.items()}
         return AdmittanceReport(arms, self._rejected)
 
     def _filter_wrenches(self, state: RobotState, dt: float) -> None:
-        """Let every arm's wrench approach the measured one, or none where nothing is measured."""
+        """Let the wrench of every arm approach the measured one, or zero if nothing is measured."""
         tau, q = state.tau_external, state.q
         if tau is not None:
             self._rejected = not (math.isfinite(tau.sum()) and math.isfinite(q.sum()))
@@ -154,7 +158,7 @@ class Admittance:
             self._wrench[name] += share * (estimate - self._wrench[name])
 
     def _displace(self, arm: str, follows: bool, dt: float) -> None:
-        """Move one arm's displacement by ``dt``; it ends at once where the arm follows no target."""
+        """Advance the displacement of one arm by ``dt`` [s]. It ends at once if the arm follows no target."""
         law, wrench, x, v, pushed = self.settings, self._wrench[arm], self._x[arm], self._v[arm], False
         linear = (slice(0, 3), law.stiffness, law.mass, law.force_dead_band, law.max_displacement)
         angular = (slice(3, 6), law.rotation_stiffness, law.inertia, law.torque_dead_band, law.max_rotation)

@@ -1,22 +1,22 @@
-"""Cartesian impedance control: the QP's reference in, joint torques out that make each tool a damped spring about it.
+"""Cartesian impedance control: turn the QP's reference into joint torques that make each tool a damped spring.
 
     tau = J' (K e + D e') + N (K_n (q_r - q) + D_n (v_r - v)) + M(q) a_r + C(q, v) v + g(q) + joint-limit repulsion
 
 e is the way from the measured tool to that of the reference, e' the difference of their twists, D and D_n the damping
 of :func:`inertia_and_damping`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
 
-**Feed-forward M a_r.** Seen from the tool an arm weighs what its rotors weigh geared up, 20 to 140 kg for a robot of 22
-kg. Without feed-forward the spring would have to yield for every acceleration, 30 mm at 1 m/s^2. With it the spring
-bears only the errors of the model, and may be soft. A push at rest feels none of it.
+**Feed-forward M a_r.** The inertia of an arm at its tool is mainly that of the rotors times the squared gear ratio: 20
+to 140 kg for a robot of 22 kg. Without feed-forward the spring would have to yield for every acceleration, by 30 mm at
+1 m/s^2. With it the spring bears only the errors of the model, and may be soft. A push at rest is not affected.
 
-**Torque rate.** A full stop at 10 rad/s^2 takes 70 Nm more in a joint that moves the whole arm. As long as the torque
-rises to that the tool leaves the reference, and with it the distances that the reference keeps.
+**Torque rate.** A full stop at 10 rad/s^2 needs 70 Nm more in a joint that moves the whole arm. While the torque rises
+to that, the tool leaves the reference, and with it the distances that the reference keeps.
 
-**Payload.** A held object is part of M, C and g. Its mass comes and goes on a straight line over 0.3 s, so that no
-torque jumps.
+**Payload.** A held object is part of M, C and g. Its mass is added and removed on a straight line over 0.3 s, so that
+no torque jumps.
 
-**Time.** A reference is due at the end of its tick, the state is measured at its start. The spring is therefore about
-the reference of the tick before, which is due now. The acceleration is the one that leads to the newest.
+**Time.** A reference is due at the end of its tick, and the state is measured at the start. The spring therefore acts
+about the reference of the tick before, which is due now. The acceleration is the one that leads to the newest one.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Reference, RobotState
 
-_PAYLOAD_TIME = 0.3  # over which a payload's mass comes or goes [s]
+_PAYLOAD_TIME = 0.3  # Time over which the mass of a payload is added or removed [s].
 
 
 @dataclass(slots=True)
 class ImpedanceReport:
-    """Outcome of one tick. Joints and arms by name."""
+    """The result of one tick. Joints and arms are given by name."""
 
-    errors: dict[str, Array]  # arm -> (6,) way to the reference after clipping [m, rad], world axes
-    clipped: tuple[str, ...]  # arms that are further from their reference than the clip allows
-    saturated: tuple[str, ...]  # joints that would need more than their torque limit
-    rate_limited: tuple[str, ...]  # joints whose torque could not change as fast as it should
-    repelled: tuple[str, ...]  # joints that are pushed away from a position limit
-    held: bool  # the measured state was of no use: the last gravity torque is held
+    errors: dict[str, Array]  # By arm (6,): clipped way to the reference, in world axes [m], [rad].
+    clipped: tuple[str, ...]  # Arms that are farther from their reference than the clip allows.
+    saturated: tuple[str, ...]  # Joints that would need more than their torque limit.
+    rate_limited: tuple[str, ...]  # Joints whose torque could not change as fast as it should.
+    repelled: tuple[str, ...]  # Joints that are pushed away from a position limit.
+    held: bool  # Whether the measured state was not usable, so that the last gravity torque is held.
 
 
 @dataclass(slots=True)
@@ -70,11 +70,11 @@ class TorqueCommand:
 
 
 class ImpedanceController:
-    """Turns each tick's reference and measured state into joint torques, for all arms of a cell.
+    """Turns the reference and the measured state of each tick into joint torques, for all arms of a cell.
 
-    At every tick, whatever comes in: finite torques, within ``torque_scale`` of the robot's limits, and no further from
-    the tick before than ``torque_rate_limit`` allows. Each arm is treated by itself, with its own blocks of the inertia
-    matrix and its inverse; joints that several arms hang on get the sum.
+    For any input the torques are finite, within ``torque_scale`` times the robot's limits, and change between two ticks
+    by no more than ``torque_rate_limit`` allows. Each arm is computed alone, with its own blocks of the inertia matrix
+    and its inverse. Joints that carry several arms get the sum.
     """
 
     def __init__(self, robot: Robot, settings: ImpedanceSettings | None = None) -> None:
@@ -82,30 +82,32 @@ class ImpedanceController:
         self.settings = settings = settings or ImpedanceSettings()
         self._limit = settings.torque_scale * robot.torque_limit
         self._payloads = {arm: held for arm, held in robot.objects.by_arm.items() if held.config.mass > 0.0}
-        self._borne = dict.fromkeys(self._payloads, 0.0)  # share of each payload's mass
+        self._borne = dict.fromkeys(self._payloads, 0.0)  # Share of each payload's mass that is borne now.
         self._wanted_borne = dict(self._borne)
         spring = settings.limit_stiffness, settings.limit_damping, settings.limit_distance
         limits = PositionLimits(robot.position_lower, robot.position_upper, *spring)
         largest_error = np.array([settings.max_position_error, settings.max_rotation_error])
         model = ImpedanceModel(chain_of(robot.model), tools_of(robot), limits, self._limit, largest_error)
         values = [float(getattr(settings, name)) for name in LIVE_IMPEDANCE]
-        self._springs = np.tile(values, (len(self._arms), 1))  # in force
+        self._springs = np.tile(values, (len(self._arms), 1))  # The present values.
         self._kernel_data = ImpedanceData.empty(model, self._springs)
-        self._inputs = self._kernel_data.inputs.reshape(-1)  # a view
+        self._inputs = self._kernel_data.inputs.reshape(-1)  # A view, which shares its memory.
         self._pointers = pointer_to(model), pointer_to(self._kernel_data)
         self._impedance_torque = bound(impedance_torque, *self._pointers, 0.0)
-        self._model = robot.model.copy()  # to which payloads are added
+        self._model = robot.model.copy()  # Payloads are added to this copy.
         self._pinocchio_data = self._model.createData()
-        self._wanted_springs = self._springs.copy()  # at the end of a ramp
+        self._wanted_springs = self._springs.copy()  # The values at the end of a ramp.
         self._ramp_rate = np.zeros_like(self._springs)
         self._ramping = False
         self._begin(robot.home)
 
     def reset(self, state: RobotState) -> None:
-        """Start anew at rest at the measured posture: the first torque is that of gravity there, without a bump.
+        """Start anew at rest at the measured posture. The first torque is that of gravity there, without a jump.
 
-        Stiffness, damping or a payload that is being changed is reached at once. Raises :class:`RobotError` for a
-        posture that is not nv finite numbers.
+        Changes of stiffness, damping or payload that are under way are completed at once.
+
+        Raises:
+            RobotError: If the posture is not nv finite numbers.
         """
         q = np.array(state.q, dtype=np.float64)
         if q.shape != self._limit.shape or not np.isfinite(q).all():
@@ -119,20 +121,20 @@ class ImpedanceController:
     def _begin(self, q: Array) -> None:
         data = self._kernel_data
         data.due[:] = q, np.zeros_like(q)
-        self._usable_q = q  # the newest measured posture that was of use
+        self._usable_q = q  # The newest measured posture that was usable.
         data.commanded[:] = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
 
     def gravity(self, q: Array) -> Array:
-        """Torque (nv,) that bears the arms, with what they hold, at a posture ``q`` (nv,) [rad], [Nm]."""
+        """Return the torque (nv,) [Nm] that bears the arms and what they hold at a posture ``q`` (nv,) [rad]."""
         return np.array(pin.computeGeneralizedGravity(self._model, self._pinocchio_data, q))
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:
-        """Of each arm whose gripper has an object, whether it is held and its mass to be borne."""
+        """Take whether each gripper that has an object holds it, so that the arm has to bear its mass."""
         for arm in self._payloads:
             self._wanted_borne[arm] = float(holding.get(arm, False))
 
     def _bear(self, change: float) -> None:
-        """Let the borne share of each payload come nearer to the wanted one by ``change``."""
+        """Move the borne share of each payload towards the wanted one by ``change``."""
         inertias = {held.joint: self.robot.model.inertias[held.joint] for held in self._payloads.values()}
         for arm, held in self._payloads.items():
             way = self._wanted_borne[arm] - self._borne[arm]
@@ -143,10 +145,13 @@ class ImpedanceController:
             self._model.inertias[joint] = inertia
 
     def change(self, values: Mapping[str, float], arm: str | None = None) -> None:
-        """Go by other stiffness and damping of one arm or of all, by name as in ``LIVE_IMPEDANCE``.
+        """Change stiffness and damping of one arm or of all arms, by the names in ``LIVE_IMPEDANCE``.
 
-        On a straight line over ``ramp_time``, since stiffness is energy in a spring that is stretched. Raises
-        :class:`ConfigError`, and changes nothing, for another name, a value out of range or an arm that does not exist.
+        The values change on a straight line over ``ramp_time``, because a stiffer spring that is stretched stores more
+        energy.
+
+        Raises:
+            ConfigError: If there is no such name or arm, or a value is out of range. Nothing is changed then.
         """
         if arm is not None and arm not in self._arms:
             raise ConfigError(f"impedance: no arm {arm!r:.40}; arms: {', '.join(self._arms)}")
@@ -160,15 +165,19 @@ class ImpedanceController:
         self._ramping = True
 
     def in_force(self, arm: str) -> dict[str, float]:
-        """The part of ``LIVE_IMPEDANCE`` an arm goes by now."""
+        """Return the present values of ``LIVE_IMPEDANCE`` of an arm."""
         return dict(zip(LIVE_IMPEDANCE, self._springs[self._arms.index(arm)].tolist(), strict=True))
 
     def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:
-        """Torques for a tick of ``dt`` [s] that begins at ``state`` and ends when ``reference`` is due.
+        """Return the torques for one tick.
 
-        ``extra`` (nv,) [Nm] is added before saturation. A reference that is not finite is not used: the last one is
-        held. The last gravity torque is held where the state, or a result of it, is not finite. A spring about an
-        unknown posture could push anywhere. A dt that is not in (0, 0.1] s counts as 0 or as 0.1 s.
+        Args:
+            reference: The reference, which is due at the end of the tick. One that is not finite is not used, and the
+                last one is held.
+            state: The state that was measured at the start of the tick. If it, or a result of it, is not finite, the
+                last gravity torque is held, because a spring about an unknown posture could push anywhere.
+            dt: Duration of the tick [s]. One that is not in (0, 0.1] counts as 0 or as 0.1.
+            extra: Torque that is added before saturation (nv,) [Nm].
         """
         time = min(float(dt), LONGEST_DT) if dt > 0.0 else 0.0
         if self._ramping:
@@ -202,7 +211,7 @@ class ImpedanceController:
 
 
 def check_springs(values: Mapping[str, float]) -> None:
-    """Raises :class:`ConfigError` for what is none of ``LIVE_IMPEDANCE``, and for a value out of range."""
+    """Raise :class:`ConfigError` for a name that is not in ``LIVE_IMPEDANCE``, and for a value out of range."""
     for name in values.keys() - set(LIVE_IMPEDANCE):
         allowed = ", ".join(LIVE_IMPEDANCE)
         raise ConfigError(f"impedance: {name} = {values[name]!r:.40}: while a controller runs: {allowed}")

@@ -20,31 +20,30 @@ from q2r2_control.types import Array
 
 BoolArray = npt.NDArray[np.bool_]
 
-ABSURD = 1e9  # no number that a robot or a controller sends is as large; squares of those below it are finite
-# No direction of a tool counts for more than this [kg]. An arm whose rotors weigh most of it stays below a fifth of it
-# in every posture that it works in.
+ABSURD = 1e9  # A robot or a controller sends no number as large as this. The squares of smaller ones are finite.
+# The greatest inertia that a direction of a tool may have [kg]. An arm in a working posture stays below a fifth of it.
 _HEAVIEST = 1000.0
 
 
 class PositionLimits(NamedTuple):
-    """Position limits with the spring that begins before each."""
+    """Position limits, and the spring that begins before each limit."""
 
     lower: Array  # (nv,) [rad]
     upper: Array  # (nv,)
     stiffness: float  # [Nm/rad]
     damping: float  # [Nms/rad]
-    distance: float  # where the spring begins [rad]
+    distance: float  # Distance from the limit at which the spring begins [rad].
 
 
 @numpy_kernel
 def plausible(numbers: Array) -> bool:
-    """Whether all numbers are finite and none is absurd."""
+    """Return whether all numbers are finite and below ``ABSURD``."""
     return bool((np.abs(numbers) < ABSURD).all())
 
 
 @numpy_kernel
 def clip_errors(errors: Array, position: float, rotation: float) -> BoolArray:
-    """Make each part of ``errors`` (k, 6) no longer than ``position`` [m], ``rotation`` [rad]; returns which were."""
+    """Shorten each part of ``errors`` (k, 6) to ``position`` [m] and ``rotation`` [rad]; returns which were longer."""
     clipped = np.zeros(len(errors), dtype=np.bool_)
     for i in range(len(errors)):
         nearer = position / max(size_of(errors[i, :3]), position)
@@ -58,7 +57,7 @@ def clip_errors(errors: Array, position: float, rotation: float) -> BoolArray:
 
 @numpy_kernel
 def inertia_and_damping(mobility: Array, stiffness: Array) -> tuple[Array, Array]:
-    """Inertia Lambda (6, 6) that a hand at the tool feels, and the damping (6, 6) of ratio 1 to its ``stiffness`` (6,).
+    """Return the inertia Lambda (6, 6) at the tool, and the damping (6, 6) of ratio 1 for a ``stiffness`` (6,).
 
     ``mobility`` is J M^-1 J' (6, 6), whose inverse is Lambda (Khatib 1987, eq. 18). The damping gives every mode of
     Lambda x'' + D x' + K x = 0 the same ratio, by double diagonalisation (Albu-Schaeffer, Ott, Frese, Hirzinger:
@@ -66,9 +65,9 @@ def inertia_and_damping(mobility: Array, stiffness: Array) -> tuple[Array, Array
     K v = lambda Lambda v, V' Lambda V = I, Q = V^-1, D = 2 Q' diag(xi sqrt(lambda)) Q. K being diagonal,
     K^1/2 J M^-1 J' K^1/2 = U diag(lambda) U' gives Q' = K^1/2 U diag(lambda)^-1/2, and with it Lambda = Q' Q.
 
-    Near a singular posture some lambda vanishes, and Lambda and the damping force would grow without bound. There
-    lambda, the square of a mode's frequency, is raised to that of 1000 kg. All others stay exact; a damping term on the
-    diagonal would make the projector that is built with Lambda leak everywhere.
+    Near a singular posture a lambda vanishes, and Lambda and the damping force would grow without bound. For that
+    reason lambda, the square of a mode's frequency, is not below the one of 1000 kg. All other modes stay exact. A
+    damping term on the diagonal would instead make the projector with Lambda inexact everywhere.
     """
     root = np.sqrt(stiffness)
     scaled = np.zeros((6, 6))
@@ -89,7 +88,7 @@ def inertia_and_damping(mobility: Array, stiffness: Array) -> tuple[Array, Array
 
 @numpy_kernel
 def consistent_force(inertia: Array, J: Array, M_inverse: Array, torque: Array) -> Array:
-    """Force F (6,) that keeps ``torque`` (n,) from accelerating the tool: torque - J' F is N torque.
+    """Return the force F (6,) for which ``torque`` - J' F does not accelerate the tool, which is N torque.
 
     N = I - J' Lambda J M^-1 (Khatib 1987, eq. 51).
     """
@@ -107,20 +106,20 @@ class ImpedanceModel(NamedTuple):
 
 
 class ImpedanceData(NamedTuple):
-    """One tick's measurement, and arrays written anew."""
+    """The measurement of one tick, and the arrays that are written in it."""
 
-    inputs: Array  # (6, nv): q and v measured; q, v and a of the newest reference; torque that is added [Nm]
-    due: Array  # (2, nv) q and v of the reference that is due now
-    springs: Array  # (k, 5) values of ``LIVE_IMPEDANCE``
-    M: Array  # (nv, nv) inertia
-    torque: Array  # (nv,) of gravity and speed comes in, that of the law goes out [Nm]
-    commanded: Array  # (nv,) the last one, within all bounds [Nm]
-    saturated: BoolArray  # (nv,) joints that would need more than their torque limit
-    late: BoolArray  # (nv,) joints whose torque could not change as fast as it should
-    J: Array  # (k, 6, nv) measured
-    error: Array  # (k, 6) clipped way to the wanted pose [m, rad]
-    clipped: BoolArray  # (k,) arms whose way was longer
-    repulsion: Array  # (nv,) from position limits [Nm]
+    inputs: Array  # (6, nv) Measured q and v; q, v and a of the newest reference; torque that is added [Nm].
+    due: Array  # (2, nv) q and v of the reference that is due now.
+    springs: Array  # (k, 5) Values of ``LIVE_IMPEDANCE``.
+    M: Array  # (nv, nv) Inertia.
+    torque: Array  # (nv,) Input: torque of gravity and velocity. Output: torque of the law [Nm].
+    commanded: Array  # (nv,) The last torque, within all bounds [Nm].
+    saturated: BoolArray  # (nv,) Joints that would need more than their torque limit.
+    late: BoolArray  # (nv,) Joints whose torque could not change as fast as it should.
+    J: Array  # (k, 6, nv) Jacobians at the measured posture.
+    error: Array  # (k, 6) Clipped way to the wanted pose [m], [rad].
+    clipped: BoolArray  # (k,) Arms whose way was longer.
+    repulsion: Array  # (nv,) Torque from position limits [Nm].
     wanted_twist: Array  # (k, 6)
     wanted_rotation: Array  # (k, 3, 3) of the tools
     wanted_translation: Array  # (k, 3) [m]
@@ -160,11 +159,14 @@ class ImpedanceData(NamedTuple):
 def impedance_torque(
     model_pointer: KernelPointer, data_pointer: KernelPointer, change: float
 ) -> tuple[bool, bool, bool, bool]:
-    """One tick: the law's torque within its bounds, ``change`` [Nm] at most from the last one, to ``data.commanded``.
+    """Write the torque of one tick into ``data.commanded``, at most ``change`` [Nm] from the last one.
 
-    Returns whether there is one, and whether an error was clipped, a limit repels and a bound held it back. There is
-    none, and nothing is commanded, where the measured state, or what comes of it, is no number to go by. A reference
-    that is not is not used: the last one is held. All in one call, since every call from Python takes time.
+    A reference that is not finite is not used, and the last one is held. All is one kernel, because every call from
+    Python takes time.
+
+    Returns:
+        Whether there is a torque, whether an error was clipped, whether a limit repels, and whether a bound held the
+        torque back. There is no torque if the measured state, or a result of it, is not finite.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     measured, reference, added = data.inputs[:2], data.inputs[2:5], data.inputs[5]
@@ -192,7 +194,7 @@ def impedance_torque(
 
 @numpy_kernel
 def _add_springs(model: ImpedanceModel, data: ImpedanceData, q: Array, v: Array) -> None:
-    """Add J' (K e + D e') + N posture of all arms to ``data.torque``; ``data.repulsion`` is that of the limits."""
+    """Add J' (K e + D e') + N posture of all arms to ``data.torque``, and write ``data.repulsion`` of the limits."""
     _update_tools(model, data, q)
     copy(clip_errors(data.error, model.largest_error[0], model.largest_error[1]), data.clipped)
     M_inverse, stiffness, posture = np.linalg.inv(data.M), np.zeros(6), np.zeros(len(q))
@@ -203,7 +205,7 @@ def _add_springs(model: ImpedanceModel, data: ImpedanceData, q: Array, v: Array)
         inertia, damping = inertia_and_damping(J @ M_inverse @ J.T, stiffness)
         force = stiffness * data.error[i] + values[2] * (damping @ (data.wanted_twist[i] - J @ v))
         for j in range(len(q)):
-            # Each joint's damping has the ratio for the inertia that it moves by itself.
+            # The damping of each joint has its ratio for the inertia that this joint moves alone.
             joint_damping = 2.0 * values[4] * np.sqrt(values[3] * data.M[j, j])
             posture[j] = (values[3] * (data.due[0, j] - q[j]) + joint_damping * (data.due[1, j] - v[j])) * member[j]
         force -= consistent_force(inertia, J, M_inverse, posture)
@@ -213,7 +215,7 @@ def _add_springs(model: ImpedanceModel, data: ImpedanceData, q: Array, v: Array)
 
 @kernel
 def _update_tools(model: ImpedanceModel, data: ImpedanceData, q: Array) -> None:
-    """Jacobians at ``q``, wanted twists, and the ways from measured to wanted poses."""
+    """Write the Jacobians at ``q``, the wanted twists, and the ways from measured to wanted poses."""
     place(model.chain, data.due[0], data.placements)
     for i in range(len(data.J)):
         tool_pose(data.placements, model.tools, i, data.wanted_rotation[i], data.wanted_translation[i])
@@ -232,18 +234,18 @@ def _update_tools(model: ImpedanceModel, data: ImpedanceData, q: Array) -> None:
 
 @kernel
 def copy(values: Array, out: Array) -> None:
-    """Write ``values`` (n,) into ``out`` (n,); Numba takes seconds to compile ``out[:] = values``."""
+    """Write ``values`` (n,) into ``out`` (n,). Numba takes seconds to compile ``out[:] = values``."""
     for i in range(values.shape[0]):
         out[i] = values[i]
 
 
 @numpy_kernel
 def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array) -> Array:
-    """Torque (nv,) [Nm] away from position limits, of a spring that begins some way before each.
+    """Return the torque (nv,) [Nm] away from position limits, of a spring that begins at a distance before each.
 
-    Where ``wanted`` (nv,), the reference, lies nearer to the limit, the spring begins there. The reference keeps the
-    limits by itself, and a spring that holds a joint off its reference would hold the tool off its target. The damping
-    grows from 0 over that way, so that the torque does not jump, and it only brakes, it never pulls.
+    If the reference ``wanted`` (nv,) is nearer to the limit, the spring begins at the reference. The reference keeps
+    the limits by itself, and a spring that keeps a joint from its reference would keep the tool from its target. The
+    damping grows from 0 along this way, so that the torque does not jump. It brakes, and never pulls.
     """
     reach, share = limits.distance, limits.damping / limits.distance
     below = np.maximum(np.minimum(limits.lower + reach, wanted) - q, 0.0)
@@ -255,10 +257,11 @@ def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array) -
 
 @numpy_kernel
 def bound_torque(tau: Array, last: Array, limit: Array, change: float) -> tuple[Array, BoolArray, BoolArray]:
-    """``tau`` (nv,) within +-``limit`` (nv,) and no further than ``change`` from ``last`` (nv,), all [Nm].
+    """Return ``tau`` (nv,) within +-``limit`` (nv,) and at most ``change`` from ``last`` (nv,), all in Nm.
 
-    Both bounds hold whenever ``last`` is within the limit: the result lies between ``last`` and the saturated torque,
-    hence within the limit too. The other two (nv,) say which joints were saturated, which could not change fast enough.
+    If ``last`` is within the limit, both bounds hold: the result lies between ``last`` and the saturated torque, and is
+    therefore within the limit as well. The other two results (nv,) tell which joints were saturated, and which could
+    not change fast enough.
     """
     within = np.minimum(np.maximum(tau, -limit), limit)
     bounded = np.minimum(np.maximum(within, last - change), last + change)

@@ -1,1 +1,1 @@
-"""The process that runs a loop."""
+"""Start, schedule and end processes: the one that runs a loop, and those beside it."""

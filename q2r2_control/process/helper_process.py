@@ -1,8 +1,9 @@
-"""A process beside the loop, which gets requests on its standard input and answers on its standard output.
+"""Run a process beside the loop, which gets requests on its standard input and answers on its standard output.
 
-A thread would take Python's interpreter from the loop for milliseconds. ``multiprocessing`` was measured too: killed
-while it sent 1 MB, a run left 8 of 8 processes with a ``Queue`` waiting for the rest, so they closed no file. Its
-``Pipe`` makes the loop wait while it is full, so it needs the same threads. A script without a main guard runs again.
+A thread would take Python's interpreter from the loop for milliseconds. ``multiprocessing`` was measured as well. If a
+run was killed while it sent 1 MB, 8 of 8 processes with a ``Queue`` waited for the rest for ever, and closed no file. A
+``Pipe`` makes the loop wait while it is full, and so needs the same threads. It also runs scripts without a main guard
+again.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from typing import Any
 
 from q2r2_control.process.scheduling import how_it_ended
 
-_LOOKS = 0.1  # between two looks at whether it gets on, at its end [s]
-_AFTER_KILL = 1.0  # for what handles the last answer [s]
-_NO_ROOM = 1e-3  # between two attempts to send [s]
+_LOOKS = 0.1  # Time between two looks at the progress of a process that is to end [s].
+_AFTER_KILL = 1.0  # Time for the code that handles the last answer [s].
+_NO_ROOM = 1e-3  # Time between two attempts to send [s].
 
 
 class HelperProcess:
-    """Starts at once. To be ended by :meth:`finish` or :meth:`kill`; it ends with this process, however that does.
+    """A process that starts at once. :meth:`finish` or :meth:`kill` ends it, and so does the end of this process.
 
-    Two threads pass requests and answers on, so neither :meth:`send` nor the process waits for the other.
+    Two threads pass requests and answers on, so that neither :meth:`send` nor the process waits for the other.
     """
 
     def __init__(
@@ -44,22 +45,29 @@ class HelperProcess:
         idle: float | None = None,
         **environment: str,
     ) -> None:
-        """Call ``module.main(requests, answer)`` in a new process. Raises :class:`OSError`.
+        """Call ``module.main(requests, answer)`` in a new process.
 
-        ``what`` it does, for faults. ``on_answer`` gets each answer, in a thread of its own. ``room`` [bytes] is for
-        requests that wait; one that is None comes when no other has for ``idle`` [s]. ``environment``: variables, where
-        this process does not have them.
+        Args:
+            module: Name of the module.
+            what: What the process does, for messages about faults.
+            on_answer: Gets each answer, in a thread of its own.
+            room: For requests that wait [bytes].
+            idle: If no request comes for this time, the process gets None as a request [s].
+            environment: Variables that are added where this process does not have them.
+
+        Raises:
+            OSError: If the process cannot be started.
         """
         self._what, self._on_answer, self._room, self._idle = what, on_answer, room, idle
         code = f"from {__name__} import run_helper; run_helper({module!r})"
         self._process = start_python(code, environment, stdout=subprocess.PIPE)
         self.pid = self._process.pid
-        self.fault: str | None = None  # why it has ended before it was to, or without doing all
+        self.fault: str | None = None  # Why the process has ended too early, or without doing everything.
         self._ending = self._killed = False
         self._queue: SimpleQueue[tuple[Any, int] | None] = SimpleQueue()
         self._lock = Lock()
-        self._put = self._sent = 0  # bytes of requests, since the beginning
-        self._moved = time.monotonic()  # when it last took or answered something
+        self._put = self._sent = 0  # Bytes of all requests so far.
+        self._moved = time.monotonic()  # Time at which the process last took or answered something.
         self._listener = Thread(target=self._listen, daemon=True)
         Thread(target=self._feed, daemon=True).start()
         self._listener.start()
@@ -69,7 +77,7 @@ class HelperProcess:
         return self._listener.is_alive()
 
     def send(self, request: Any, size: int = 0, *, wait: bool = False) -> bool:
-        """Queue a request; ``wait`` for room, or return False where there is none for its ``size`` [bytes]."""
+        """Queue a request. Without room for its ``size`` [bytes], it waits with ``wait``, and returns False without."""
         while self.alive:
             with self._lock:
                 if self._put + size - self._sent <= self._room:
@@ -82,10 +90,10 @@ class HelperProcess:
         return False
 
     def finish(self, patience: float, longest: float = math.inf) -> None:
-        """Wait until it has done what was sent, and has ended.
+        """Wait until the process has done all requests and has ended.
 
-        One that neither takes nor answers anything for ``patience`` [s], although processors are free, is killed. The
-        same holds for one that is busy for ``longest`` [s]. Nobody waits for a process that was killed.
+        If it neither takes nor answers anything for ``patience`` [s] although processors are free, it is killed. It is
+        also killed if it is busy for ``longest`` [s]. Nobody waits for a process that was killed.
         """
         self._ending = True
         self._queue.put(None)
@@ -103,9 +111,9 @@ class HelperProcess:
                 return
 
     def kill(self) -> None:
-        """End it and the processes that it has started, whatever they do; without a fault.
+        """End the process and all processes that it has started, at once. This is not a fault.
 
-        A process that it had started would keep its files and ports, and the pipe whose end says that it has ended.
+        A process that it has started would otherwise keep files and ports, and the pipe that shows its end.
         """
         self._killed = True
         if self._process.returncode is None:  # otherwise another process may have its number by now

@@ -1,4 +1,4 @@
-"""Reasons why this computer may answer a robot late, each with the command that helps; and whether it has a display."""
+"""Find reasons why this computer may answer a robot late, each with the command that helps."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from pathlib import Path
 
 from q2r2_control.process.scheduling import real_time
 
-_LEAST_MTU = 1500  # that takes every message of a cabinet in one piece [bytes]
+_LEAST_MTU = 1500  # Least MTU for which every message of a cabinet is one packet [bytes].
 _FAIR_SERVER = "/sys/kernel/debug/sched/fair_server"
 _GATHERS = re.compile(r"^(Adaptive RX: on|rx-usecs: *[1-9]\d*)", re.MULTILINE)
 _RING = re.compile(r"^RX:\s*(\d+)", re.MULTILINE)
 
 
 def has_display(environment: Mapping[str, str] = os.environ) -> bool:
-    """Whether a window can be looked at."""
+    """Return whether this computer has a display for a window."""
     return sys.platform != "linux" or bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
 
 
 def machine_notes() -> list[str]:
-    """Of the kernel, its scheduler and the processors."""
+    """Return notes about the kernel, its scheduler and the processors."""
     notes = []
     with real_time() as refused:
         if refused:
@@ -44,9 +44,13 @@ def machine_notes() -> list[str]:
 
 
 def fair_server_notes(release: str, folder: Path) -> list[str]:
-    """Of the share of a processor that Linux, from 6.12 on, keeps for other programs by halting real-time threads.
+    """Return notes about the processor time that Linux 6.12 and later keep for other programs.
 
-    ``release`` of the kernel; ``folder`` with the share of each processor, which only root may read.
+    The kernel halts real-time threads for it.
+
+    Args:
+        release: Of the kernel.
+        folder: Has the share of each processor. Only root may read it.
     """
     major, minor, *_ = *map(int, re.findall(r"\d+", release)[:2]), 0, 0
     shares = [_text(file) for file in folder.glob("cpu*/runtime")]
@@ -59,7 +63,7 @@ def fair_server_notes(release: str, folder: Path) -> list[str]:
 
 
 def network_notes(addresses: Iterable[str]) -> list[str]:
-    """Of the network cards by which ``addresses`` are reached. This computer's own addresses have none."""
+    """Return notes about the network cards by which ``addresses`` are reached. Own addresses have no card."""
     if sys.platform != "linux":
         return []
     routes = (_output("ip", "-j", "route", "get", address) for address in sorted(set(addresses)))
@@ -71,21 +75,21 @@ def network_notes(addresses: Iterable[str]) -> list[str]:
 
 
 def card_notes(card: str) -> list[str]:
-    """Of one network card, as far as ``ethtool`` tells."""
+    """Return notes about one network card, from ``ethtool``."""
     notes = []
     mtu = _text(f"/sys/class/net/{card}/mtu")
     if mtu and int(mtu) < _LEAST_MTU:
         notes.append(f"{card}: MTU {mtu}, so messages may come in pieces; ip link set {card} mtu {_LEAST_MTU}")
     if found := _GATHERS.search(_output("ethtool", "-c", card)):
         notes.append(f"{card} gathers messages ({found[0].lower()}); ethtool -C {card} adaptive-rx off rx-usecs 0")
-    ring = [int(size) for size in _RING.findall(_output("ethtool", "-g", card))]  # the greatest, and today's
+    ring = [int(size) for size in _RING.findall(_output("ethtool", "-g", card))]  # The greatest and the present size.
     if len(ring) == 2 and ring[1] < ring[0]:
         notes.append(f"{card}: a ring buffer of {ring[1]} messages; ethtool -G {card} rx {ring[0]}")
     return notes
 
 
 def _text(file: str | Path) -> str:
-    """Of a file; empty where it is not there or may not be read."""
+    """Return the text of a file; "" if it does not exist or may not be read."""
     try:
         return Path(file).read_text().strip()
     except OSError:
@@ -93,7 +97,7 @@ def _text(file: str | Path) -> str:
 
 
 def _output(*words: str) -> str:
-    """Of a command; empty where it is not there or fails."""
+    """Return the output of a command; "" if it does not exist or fails."""
     try:
         return subprocess.run(words, capture_output=True, text=True, check=True, timeout=5).stdout
     except (OSError, subprocess.SubprocessError):

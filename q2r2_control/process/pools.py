@@ -1,4 +1,4 @@
-"""Processes that share work, and end with the process that gave it to them."""
+"""Share work among processes, which end with the process that gave it to them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from threading import Thread
 
 
 def pool_of(workers: int) -> ProcessPoolExecutor:
-    """Workers are spawned, not forked: this process may have threads. At Ctrl-C, which reaches all, it ends them."""
+    """Return a pool of ``workers``. They are spawned, not forked, since this process may have threads.
+
+    Ctrl-C reaches all processes, and this process ends the workers.
+    """
     return ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin)
 
 
@@ -20,7 +23,7 @@ def _begin() -> None:
 
 
 def _end_with_parent() -> None:
-    """A worker whose parent was killed would wait for work for ever."""
+    """Let a worker end with its parent. Otherwise it would wait for work for ever."""
     if (parent := parent_process()) is not None:
         parent.join()
         os._exit(1)

@@ -1,6 +1,6 @@
-"""The process that runs a loop: real-time scheduling, signals, and folders for its files.
+"""Prepare the process that runs a loop: real-time scheduling, signals, and folders for its files.
 
-Real time needs permissions. Without them a run goes on as it would have: a refusal is a line and no error.
+Real-time scheduling needs permissions. Without them a run goes on without it, and one line says so.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from tempfile import TemporaryFile
 
 from q2r2_control.errors import ConfigError
 
-# Below 50, at which Linux with PREEMPT_RT runs the interrupts that the loop itself waits for.
+# Below 50, the priority of the interrupts that the loop itself waits for under Linux with PREEMPT_RT.
 _PRIORITY = 40
-LONGEST_END = 5  # of a process after all that it did is closed; SIGALRM ends it then [s]
-_LEAST_ROOM = 1 << 16  # that a folder for recordings has to have [bytes]
-_CURRENT, _FUTURE = 1, 2  # of mlockall on Linux
-# Of sched_setattr on Linux: its number by machine; size, policy, flags, nice, priority, runtime, deadline, period [ns].
+LONGEST_END = 5  # Time that a process may take to end after it has closed everything. SIGALRM ends it then [s].
+_LEAST_ROOM = 1 << 16  # Free space that a folder for recordings must have [bytes].
+_CURRENT, _FUTURE = 1, 2  # Flags of mlockall on Linux.
+# For sched_setattr on Linux: its number by machine, and the layout of its structure: size, policy, flags, nice,
+# priority, runtime, deadline, period [ns].
 _SET_ATTRIBUTES, _ATTRIBUTES = {"x86_64": 314, "aarch64": 274}, struct.Struct("=IIQiIQQQ")
-_DEADLINE, _RESET_ON_FORK = 6, 1  # a policy and a flag
+_DEADLINE, _RESET_ON_FORK = 6, 1  # A policy and a flag.
 _ADVICE = (
     "to permit it, give the user 'rtprio 40' and 'memlock unlimited' in /etc/security/limits.conf and log in anew, or "
     "a container --cap-add SYS_NICE --cap-add IPC_LOCK --ulimit memlock=-1"
@@ -36,10 +37,10 @@ _ADVICE = (
 
 @contextmanager
 def real_time(priority: int = _PRIORITY) -> Iterator[str | None]:
-    """Lock the process's memory and let the calling thread run under SCHED_FIFO, as far as that is permitted.
+    """Lock the memory of the process, and let the calling thread run under SCHED_FIFO, if this is permitted.
 
-    Yields None, or one line that says what was refused and how to permit it. Threads and processes that are started
-    meanwhile do not inherit the scheduler: one that draws or listens must not keep the loop waiting.
+    It yields None, or one line that says what was refused and how to permit it. Threads and processes that are started
+    meanwhile do not inherit the scheduler, because a thread that draws or listens must not keep the loop waiting.
     """
     refused = [line for line in (_lock_memory(), _schedule_first([0], priority)) if line]
     try:
@@ -53,11 +54,11 @@ def real_time(priority: int = _PRIORITY) -> Iterator[str | None]:
 def reserve(runtime: float, period: float) -> bool:
     """Reserve ``runtime`` [s] of a processor in every ``period`` [s] for the calling thread, before all others.
 
-    Where threads under SCHED_FIFO leave other programs nothing of a processor, Linux halts them for up to 50 ms. A
-    reservation (SCHED_DEADLINE) comes before that, too. A thread that needs more waits for its next period.
+    If threads under SCHED_FIFO leave no time for other programs, Linux halts them for up to 50 ms. A reservation
+    (SCHED_DEADLINE) also goes before this halt. A thread that needs more time waits for its next period.
 
     Returns:
-        False if the system has no such reservations, or does not permit one; nothing has changed then.
+        False if the system has no such reservations, or does not permit one. Nothing has changed then.
     """
     number = _SET_ATTRIBUTES.get(platform.machine()) if sys.platform == "linux" else None
     if number is None:
@@ -68,28 +69,29 @@ def reserve(runtime: float, period: float) -> bool:
 
 
 def schedule_thread_first(priority: int) -> str | None:
-    """Let the calling thread run under SCHED_FIFO at ``priority``, 1..99.
+    """Let the calling thread run under SCHED_FIFO at ``priority``, from 1 to 99.
 
-    Other threads of the process do not: what answers in time goes first, and not what may fall behind. Returns None, or
-    one line that says why that is not permitted, and how to permit it. Threads and processes that are started later do
-    not inherit it.
+    Other threads of the process do not change, and threads and processes that are started later do not inherit it.
+
+    Returns:
+        None, or one line that says why it is not permitted and how to permit it.
     """
     refused = _schedule_first([0], priority)
     return refused if refused is None or sys.platform != "linux" else f"{refused}; {_ADVICE}"
 
 
 def thread_priority() -> int:
-    """Of the calling thread under SCHED_FIFO; 0: it is scheduled as others."""
+    """Return the priority of the calling thread under SCHED_FIFO; 0 if it has an ordinary scheduler."""
     return os.sched_getparam(0).sched_priority if sys.platform == "linux" else 0
 
 
 def schedule_thread_as_others() -> None:
-    """Take back what :func:`schedule_thread_first` did."""
+    """Undo :func:`schedule_thread_first`."""
     _schedule_as_others([0])
 
 
 def _lock_memory() -> str | None:
-    """Why memory cannot be locked, or None."""
+    """Lock the memory; returns why this is not possible, or None."""
     if sys.platform != "linux":
         return "memory is not locked: only done on Linux"
     import resource  # not on every system
@@ -102,7 +104,7 @@ def _lock_memory() -> str | None:
 
 
 def _schedule_first(threads: Iterable[int], priority: int) -> str | None:
-    """Why threads do not get SCHED_FIFO, or None; 0 is the calling thread."""
+    """Let threads run under SCHED_FIFO; returns why this is not possible, or None. 0 is the calling thread."""
     if sys.platform != "linux":
         return "no SCHED_FIFO: only asked for on Linux"
     try:
@@ -123,9 +125,10 @@ def _schedule_as_others(threads: Iterable[int]) -> None:
 
 
 def new_folder(parent: Path, name: str, what: str) -> Path:
-    """A folder that did not exist before: ``name``, or numbered where several runs begin within one second.
+    """Make a folder that did not exist before. Its ``name`` gets a number if several runs begin within one second.
 
-    Raises :class:`ConfigError` that begins with ``what``.
+    Raises:
+        ConfigError: With a text that begins with ``what``.
     """
     for suffix in ("", *(f"-{number}" for number in range(2, 100))):
         folder = parent / (name + suffix)
@@ -139,9 +142,10 @@ def new_folder(parent: Path, name: str, what: str) -> Path:
 
 
 def check_folder(folder: Path, what: str) -> None:
-    """Make ``folder`` where it is missing.
+    """Make ``folder`` if it does not exist.
 
-    Raises :class:`ConfigError` that begins with ``what`` if nothing can be written in it.
+    Raises:
+        ConfigError: With a text that begins with ``what``, if nothing can be written in the folder.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -156,7 +160,8 @@ def check_folder(folder: Path, what: str) -> None:
 class StopRequest:
     """A flag that a signal handler sets and a loop reads.
 
-    A plain attribute: with the lock of a ``threading.Event``, a signal in another one's handler would wait for ever.
+    It is a plain attribute. With the lock of a ``threading.Event``, a signal within another one's handler would wait
+    for ever.
     """
 
     asked = False
@@ -168,7 +173,7 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C and SIGTERM call ``stop`` instead of interrupting the loop; only where this is the main thread."""
+    """Let Ctrl-C and SIGTERM call ``stop`` instead of interrupting the loop, if this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -182,7 +187,7 @@ def stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 
 def how_it_ended(what: str, code: int) -> str:
-    """In words, of a process ``what`` that ended with this exit ``code``, negative: by that signal."""
+    """Return in words how a process ``what`` has ended. A negative exit ``code`` is the number of a signal."""
     return f"{what} was ended by {signal.Signals(-code).name}" if code < 0 else f"{what} ended with exit code {code}"
 
 
