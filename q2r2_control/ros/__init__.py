@@ -1,8 +1,9 @@
 """ROS 2: the nodes, and the code that connects them to the rest of the package, which needs no rclpy.
 
 From the bottom up: ``launch`` starts nodes as processes, and ``executor`` spins nodes that tick. ``base_node`` is the
-base of every node, and ``monitoring`` watches other nodes. ``bridge`` turns messages into data and back. ``nodes`` has
-the executables, and ``watching`` looks at a running set from outside. ``interfaces`` holds message packages to build.
+base class of every node, and ``monitoring`` watches other nodes. ``bridge`` converts messages into data and back.
+``nodes`` has the executables, and ``watching`` observes a running set of nodes from outside. ``interfaces`` has message
+packages to build.
 """
 
 from __future__ import annotations

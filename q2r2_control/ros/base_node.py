@@ -40,25 +40,25 @@ from q2r2_control.ros.executor import TickExecutor, TickGroup
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.wording import sentence
 
-# A process that goes first and never sleeps would leave nothing of its processor to others; Linux counts [s].
+# Processor time after which Linux ends a real-time process that never sleeps [s]. It would leave nothing to others.
 _NEVER_IDLE = 0.5
-_LEAST_END = 2.0  # that a process has in any case once its nodes are closed: arms brake for 3 s at most [s]
-_deadline = math.inf  # when this process has to be gone that was asked to end, of the steady clock [s]
-# All keep the last messages, and are reliable and volatile where they do not say otherwise.
-# Commands, at the receiver: only the newest counts, and it has to arrive.
+_LEAST_END = 2.0  # Least time that a process has to end after its nodes are closed [s]. Arms brake for 3 s at most.
+_deadline = math.inf  # Time of the steady clock at which this process must have ended [s].
+# All QoS profiles keep the last messages. They are reliable and volatile unless they say otherwise.
+# For the receiver of commands. Only the newest one counts, and it must arrive.
 COMMAND_QOS = QoSProfile(depth=1)
-# Commands, at the sender: a reliable sender repeats messages that have not arrived, also after a link was down for a
-# while. An old target would be a jump. The lifespan is judged by the sender's clock; the receiver's may differ.
+# For the sender of commands. A reliable sender repeats messages that have not arrived, also after the network was down
+# for a while. An old target would be a jump. The lifespan counts by the sender's clock; the receiver's may differ.
 SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
-# Streams of a headset or of joint states: a late message is worth less than the next one.
+# For streams of a headset or of joint states, where a late message is worth less than the next one.
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-# Messages for recordings only: all of it counts, and nobody waits for it.
+# For messages that are only recorded. All of them count, and nobody waits for them.
 RECORDED_QOS = QoSProfile(depth=200)
-# Messages that subscribers that start later have to get too, such as robot_description.
+# For messages that later subscribers need as well, such as robot_description.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _DIAGNOSTICS_PERIOD = 0.5  # [s]
-STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # of timers that go on while /clock stands still
-_CLOCK_TIMEOUT = 1.0  # simulated time that stands still for longer is reported [s]
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # For timers that go on while /clock stands still.
+_CLOCK_TIMEOUT = 1.0  # Simulated time that stands still for longer than this is reported [s].
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -66,9 +66,9 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 class BaseNode(Node):
     """A node with described parameters, ``/diagnostics`` and ``~/state`` (one JSON object in a String)."""
 
-    exit_code: int | None = None  # once it is set the executable ends with it
-    ticks = False  # whether its messages wait for its ticks, see TickExecutor
-    priority = 0  # of real time, where it is permitted; 0: as other programs
+    exit_code: int | None = None  # As soon as it is set, the executable ends with this exit code.
+    ticks = False  # Whether messages are taken at the node's ticks only, see TickExecutor.
+    priority = 0  # Real-time priority, if it is permitted; 0 for an ordinary one.
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         self.tick_group = TickGroup()
@@ -79,13 +79,14 @@ class BaseNode(Node):
         self.priority = self.parameter("realtime_priority", self.priority, what, within=(0, 98))
         self._diagnostics = self.create_publisher(DiagnosticArray, "diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
-        self._ros_time = 0.0, time.monotonic()  # the newest, and the steady time when it was first seen [s]
-        self._dropped: set[str] = set()  # topics of which some messages could not be read
-        self.ticked, self._counted_at = 0, time.monotonic()  # since the rate was last asked for, and when [s]
+        self._ros_time = 0.0, time.monotonic()  # The newest ROS time, and the steady time when it was first seen [s].
+        self._dropped: set[str] = set()  # Topics with messages that could not be read.
+        # Number of ticks since the rate was last asked for, and the time of that [s].
+        self.ticked, self._counted_at = 0, time.monotonic()
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=STEADY)
 
-    # rclpy looks at every endpoint's events each time that it waits, which costs processor time. They warn of settings
-    # or types that do not match: a publisher's subscribers warn too, and best effort matches every publisher.
+    # rclpy checks the events of every endpoint each time that it waits, which costs processor time. These events warn
+    # of settings or types that do not match. The subscribers of a publisher warn as well, and best effort matches all.
     def create_publisher(self, *args: Any, **kwargs: Any) -> Any:
         kwargs.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))
         return super().create_publisher(*args, **kwargs)
@@ -98,7 +99,7 @@ class BaseNode(Node):
         return super().create_subscription(msg_type, topic, callback, qos_profile, **kwargs)
 
     def create_tick(self, period: float, callback: Callable[[], None], clock: Clock | None = None) -> Any:
-        """A timer of ``period`` [s] that runs after the callbacks of all messages that have arrived."""
+        """Create a timer of ``period`` [s] that runs after the callbacks of all messages that have arrived."""
         return self.create_timer(period, callback, callback_group=self.tick_group, clock=clock)
 
     def parameter(
@@ -111,9 +112,10 @@ class BaseNode(Node):
         one_of: Sequence[str] = (),
         read_only: bool = True,
     ) -> Any:
-        """Declare a parameter and return its value; rclpy enforces ``within``, and ``one_of`` counts at the start only.
+        """Declare a parameter and return its value. rclpy enforces ``within``; ``one_of`` is checked at the start only.
 
-        Raises :class:`ConfigError` for a value of another type, outside the range or not in ``one_of``.
+        Raises:
+            ConfigError: If the value has another type, is outside the range, or is not in ``one_of``.
         """
         descriptor = ParameterDescriptor(description=description, read_only=read_only)
         if one_of:
@@ -133,40 +135,40 @@ class BaseNode(Node):
         return value
 
     def full_name(self, name: str) -> str:
-        """A topic's, service's or node's name in this node's namespace; one that begins with / stays, if it was given.
+        """Return the name of a topic, a service or a node in this node's namespace. A name with a leading / stays.
 
-        It is not remapped: whoever subscribes, publishes or calls by it does that.
+        The name is not remapped here, because rclpy does so when it is used.
         """
         return str(self.resolve_topic_name(name, only_expand=True)) if name else name
 
     def name_in_set(self, name: str) -> str:
-        """The full name of what is called ``name``, such as ``/recorder``, in a set without a namespace."""
+        """Return the full name here of ``name``, such as ``/recorder``, in a set of nodes without a namespace."""
         return self.full_name(name.removeprefix("/"))
 
     @property
     def now(self) -> float:
-        """The node's clock [s]: ROS time, so that use_sim_time has its effect."""
+        """Return the time of the node's clock [s]. It is ROS time, so that use_sim_time has an effect."""
         return float(self.get_clock().handle.get_now().nanoseconds) * 1e-9
 
     def tick_rate(self) -> float:
-        """Of what a subclass has counted in ``ticked`` since this was last asked for [Hz]."""
+        """Return the rate of the ticks that a subclass has counted in ``ticked`` since the last call [Hz]."""
         now = time.monotonic()
         rate = self.ticked / max(now - self._counted_at, 1e-9)
         self.ticked, self._counted_at = 0, now
         return round(rate, 1)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """Level (OK, WARN, ERROR), one line, and figures."""
+        """Return the level (OK, WARN, ERROR), one line, and figures, for the diagnostics."""
         return OK, "running", {}
 
     def drop(self, topic: str, text: str) -> None:
-        """Warn, once for each topic, that what others send there cannot be read, such as ``text``."""
+        """Warn once for each topic that messages of others cannot be read, with ``text`` as an example."""
         if topic not in self._dropped:
             self._dropped.add(topic)
             self.get_logger().warning(sentence(Reason.of(ReasonKind.MESSAGE_UNREADABLE, topic=topic, text=text)))
 
     def report_health(self) -> None:
-        """Publish :meth:`health` now. A timer does it twice a second; call it for a change that should not wait."""
+        """Publish :meth:`health` now. A timer does so twice a second. Call it after an urgent change."""
         level, line, values = self.health()
         if (problem := self.clock_problem()) is not None:
             level, line = max(level, WARN), f"{sentence(problem)}; {line}"
@@ -180,16 +182,16 @@ class BaseNode(Node):
         self._state.publish(String(data=json.dumps(state, default=str)))
 
     def close(self) -> None:
-        """Called at the end, while the node can still publish."""
+        """Close the node. It is called at the end, while the node can still publish."""
 
     def destroy_node(self) -> None:
-        """Destroy actions too. rclpy leaves them behind, where others find them and they keep the middleware alive."""
+        """Destroy the node with its actions. rclpy would leave these, and they would keep the middleware alive."""
         for action in [one for one in self.waitables if isinstance(one, (ActionClient, ActionServer))]:
             action.destroy()
         super().destroy_node()
 
     def clock_problem(self, timeout: float = _CLOCK_TIMEOUT) -> Reason | None:
-        """A reason if ROS time is simulated and has stood still for ``timeout`` [s], as far as calls of this tell."""
+        """Return a reason if ROS time is simulated and has stood still for ``timeout`` [s] between calls, else None."""
         clock: Any = self.get_clock()
         now, wall = self.now, time.monotonic()
         if now != self._ros_time[0]:
@@ -202,17 +204,18 @@ class BaseNode(Node):
 
 
 class ManagedNode(LifecycleNodeMixin, BaseNode):
-    """A node with a lifecycle, active when it starts: ``ros2 lifecycle set /cartesian_controller deactivate``.
+    """A node with a lifecycle, which starts active: ``ros2 lifecycle set /cartesian_controller deactivate``.
 
-    Subclasses override :meth:`begin` and :meth:`end`, which make it active or inactive, or return why not.
-    A transition is answered when it is done. Parameters are read at the start only, so ``cleanup`` fails.
+    Subclasses override :meth:`begin` and :meth:`end`, which make the node active or inactive, or return why this is not
+    possible. A transition is answered when it is complete. Parameters are read at the start only, so that ``cleanup``
+    fails.
     """
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         BaseNode.__init__(self, name, **kwargs)
         LifecycleNodeMixin.__init__(self)
         self._starting = False
-        # unconfigured, inactive, active, finalized, or the transition between inactive and active
+        # The state: unconfigured, inactive, active, finalized, or the transition between inactive and active.
         self.lifecycle_state = "unconfigured"
 
     def begin(self) -> str | None:
@@ -222,7 +225,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         return None
 
     def start_active(self) -> None:
-        """At the end of a subclass's own start: configured and active, without :meth:`begin`."""
+        """Make the node active, without :meth:`begin`. A subclass calls it at the end of its own start."""
         self._starting = True
         self.trigger_configure()
         self.trigger_activate()
@@ -249,11 +252,11 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _tried(self, what: str, act: Callable[[], str | None], meanwhile: str, done: str) -> TransitionCallbackReturn:
-        """Move on to the state ``done`` by ``act``; where that returns a problem, the state is the one of before."""
+        """Go to the state ``done`` by ``act``. If that returns a problem, the node goes back to the state before."""
         before, self.lifecycle_state = self.lifecycle_state, meanwhile
         try:
             problem = act()
-        except Exception as error:  # rclpy would swallow it
+        except Exception as error:  # rclpy would hide it.
             problem = f"{type(error).__name__}: {error}"
         self.lifecycle_state = done if problem is None else before
         if problem is None:
@@ -264,16 +267,19 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
 
 
 def run_node(*makes: Callable[[], BaseNode]) -> int:
-    """Main function of an executable: make the node, spin until Ctrl-C or SIGTERM, close it; the exit code.
+    """Run the main function of an executable: make the nodes, spin until Ctrl-C or SIGTERM, and close them.
 
-    Several nodes share the process and its thread, and what ends one of them ends all. A wrong configuration is one
+    Several nodes share the process and its thread, and the end of one of them ends all. A wrong configuration gives one
     line on stderr and exit code 2.
+
+    Returns:
+        The exit code.
     """
     name = sys.argv[0].rsplit("/", 1)[-1]
     set_up_middleware(os.environ)
     try:
         rclpy.init(args=list(sys.argv), signal_handler_options=rclpy.SignalHandlerOptions.NO)
-    except rclpy_implementation.RCLError as error:  # such as arguments that cannot be parsed
+    except rclpy_implementation.RCLError as error:  # For example, arguments could not be parsed.
         print(f"{name}: {error}", file=sys.stderr)
         return 2
     stop = StopRequest()
@@ -287,8 +293,8 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         for node in nodes:
             executor.add_node(node)
         for timer in [timer for node in nodes for timer in node.timers if not timer.is_canceled()]:
-            timer.reset()  # from now on: nodes of one rate tick at one moment, for which the process wakes once
-        # Objects that exist now stay: a collection of all of it would take longer than a tick.
+            timer.reset()  # Nodes of one rate then tick at one moment, and the process wakes up only once.
+        # Objects that exist now stay. A garbage collection of all of them would take longer than a tick.
         gc.collect()
         gc.freeze()
         _take_priority(nodes)
@@ -303,7 +309,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         asked = time.monotonic()
         for node in reversed(nodes):
             node.close()
-        # No arm waits for this process any more. The middleware may take long to end, but neither first nor for ever.
+        # No arm waits for this process any more. The middleware may end slowly, without priority and within a limit.
         schedule_thread_as_others()
         global _deadline
         _deadline = max(asked + LONGEST_END, time.monotonic() + _LEAST_END)
@@ -316,12 +322,12 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
 
 
 def end_in_time() -> None:
-    """Let SIGALRM end this process ``LONGEST_END`` after it was asked to end, in which its nodes were closed too."""
+    """Let SIGALRM end this process ``LONGEST_END`` after it was asked to end, including the time to close its nodes."""
     signal.setitimer(signal.ITIMER_REAL, max(min(_deadline - time.monotonic(), LONGEST_END), 1e-3))
 
 
 def _take_priority(nodes: Sequence[BaseNode]) -> None:
-    """From here on nodes tick; what takes long, such as compiling, is done, and did not keep other programs waiting."""
+    """Take a real-time priority before the nodes tick. Slow work, such as compiling, is done before, without it."""
     priority = max(node.priority for node in nodes)
     if not priority:
         return
@@ -329,7 +335,7 @@ def _take_priority(nodes: Sequence[BaseNode]) -> None:
     if problem := schedule_thread_first(priority):
         log.info(f"real time: {problem}")
         return
-    import resource  # on Linux, where alone a process goes first
+    import resource  # It exists on Linux, where alone a process can have a real-time priority.
 
     def give_up(*_: object) -> None:
         schedule_thread_as_others()

@@ -1,7 +1,7 @@
-"""Who else publishes where one node may: hands, targets and commands have one publisher each, for every loop.
+"""Find other publishers of topics that may have one publisher only: hands, targets and commands.
 
-A publisher that appears is found in the graph, 0.04 s after the middleware has discovered it. One that was there before
-and said nothing is listened to, and found by its first message.
+A publisher that appears is found in the graph, 0.04 s after the middleware has discovered it. A publisher that was
+there before and was silent is found by its first message.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 
-_DISCOVERY = 1.0  # what a new node discovers by then was there before it [s]
-_GRAPH_PERIOD = 0.04  # of asking the graph [s]
-_UNKNOWN = "a node not known yet"  # the graph knows an endpoint before it knows its node
-HEARD = 0.3  # a commander that was heard within this time commands [s]
+_DISCOVERY = 1.0  # A publisher that a new node discovers within this time was there before it [s].
+_GRAPH_PERIOD = 0.04  # Time between two queries of the graph [s].
+_UNKNOWN = "a node not known yet"  # The graph knows an endpoint before it knows its node.
+HEARD = 0.3  # A node that sent a command within this time is a commander [s].
 
 
 def publishers_of(node: BaseNode, topic: str, *, own: bool = True) -> str:
-    """Names of the nodes that publish on ``topic``, for a sentence; ``own``: this node's too."""
+    """Return the names of the nodes that publish on ``topic``, for a sentence. With ``own``, this node is included."""
     leave_out = None if own else node.get_fully_qualified_name()
     names = {node_of(info) or _UNKNOWN for info in node.get_publishers_info_by_topic(topic)}
     return " and ".join(sorted(names - {leave_out})) or "another node"
 
 
 def takers_of(node: BaseNode, topic: str) -> str:
-    """Names of the nodes that take what this one sends on ``topic``, for a sentence."""
+    """Return the names of the nodes that receive what this node sends on ``topic``, for a sentence."""
     found = {node_of(info) or _UNKNOWN for info in node.get_subscriptions_info_by_topic(topic)}
     return " and ".join(sorted(found - {node.get_fully_qualified_name()}))
 
 
 class OnePublisher:
-    """Whether topics, by their full names, have more than one publisher; may be asked at every tick."""
+    """Checks whether topics, by their full names, have more than one publisher. It may be asked at every tick."""
 
     def __init__(self, node: BaseNode, topics: Iterable[str]) -> None:
         self._node, self._topics = node, tuple(topics)
@@ -44,7 +44,7 @@ class OnePublisher:
         self._found: Reason | None = None
 
     def conflict(self) -> Reason | None:
-        """A reason for the first topic that has several."""
+        """Return a reason for the first topic that has several publishers, or None."""
         if (now := time.monotonic()) - self._asked_at >= _GRAPH_PERIOD:
             self._asked_at, self._found = now, next(filter(None, map(self._look, self._topics)), None)
         return self._found
@@ -57,25 +57,26 @@ class OnePublisher:
 
 
 class CommandWatch:
-    """Other publishers of the topics on which a node commands arms.
+    """Watches for other publishers of the topics on which a node commands arms.
 
-    While the node commands, :meth:`intruder` finds one that appears, and one that was there before and begins to send.
-    While it does not, it may listen: :meth:`commander`. It listens by best effort, so nobody awaits its answers. This
-    node's own commands come back too, and are known by their bytes: rclpy does not say who sent a message.
+    While the node commands, :meth:`intruder` finds a publisher that appears, and one that was there before and begins
+    to send. While it does not command, it may listen: :meth:`commander`. It listens by best effort, so that nobody
+    waits for its acknowledgements. The node's own commands come back as well. They are recognised by their bytes,
+    because rclpy does not say who sent a message.
     """
 
     def __init__(self, node: BaseNode, kind: type, publishers: Iterable[WatchedPublisher]) -> None:
         self._node, self._kind = node, kind
         self._publishers = {publisher.topic_name: publisher for publisher in publishers}
-        self._heard = dict.fromkeys(self._publishers, -math.inf)  # the last command of another node [s]
+        self._heard = dict.fromkeys(self._publishers, -math.inf)  # Time of the last command of another node [s].
         self._subscriptions: list[Any] = []
         self._born = time.monotonic()
-        self._asked_at = -math.inf  # the graph [s]
-        self._known: int | None = None  # other publishers since the node commands; None: it does not
-        self._found: Reason | None = None  # another commander, found since this node began to command
+        self._asked_at = -math.inf  # Time of the last query of the graph [s].
+        self._known: int | None = None  # Number of other publishers when the node began to command, if it does.
+        self._found: Reason | None = None  # Another commander that was found since this node began to command.
 
     def begin(self) -> None:
-        """Listen."""
+        """Begin to listen."""
         if self._subscriptions:
             return
         for topic, publisher in self._publishers.items():
@@ -85,7 +86,7 @@ class CommandWatch:
             publisher.own_listeners = 1
 
     def end(self) -> None:
-        """Listen no more."""
+        """Cease to listen."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         for publisher in self._publishers.values():
@@ -93,13 +94,13 @@ class CommandWatch:
         self._subscriptions = []
 
     def commander(self, within: float = HEARD) -> Reason | None:
-        """A reason if commands of another node came within the last seconds, else None."""
+        """Return a reason if another node sent a command ``within`` the last seconds, else None."""
         now = time.monotonic()
         topics = (topic for topic, heard in self._heard.items() if now - heard <= within)
         return next(map(self._reason, topics), None)
 
     def intruder(self) -> Reason | None:
-        """Why this node may not go on commanding, or None; to be asked before each command."""
+        """Return why this node may not go on commanding, or None. It is called before each command."""
         if self._known is not None and time.monotonic() - self._asked_at < _GRAPH_PERIOD:
             self._found = self._found or self.commander()
             return self._found
@@ -119,13 +120,13 @@ class CommandWatch:
         return self._found
 
     def named(self, reason: Reason) -> Reason:
-        """The same reason with the names of nodes that are known by now."""
+        """Return the same reason with the names of nodes that are known by now."""
         if reason.kind is not ReasonKind.OTHER_COMMANDER or _UNKNOWN not in reason.detail["nodes"]:
             return reason
         return self._reason(reason.detail["topic"])
 
     def rest(self) -> None:
-        """This node commands no more: when it does again, whoever is there then was there before."""
+        """Record that this node commands no more. Publishers that are there when it begins again were there before."""
         self._known = None
 
     def _reason(self, topic: str) -> Reason:

@@ -1,10 +1,11 @@
 """An executor for nodes that tick: it sleeps until a tick, takes the messages that have arrived, and runs the tick.
 
-Messages and ticks go past rclpy's wait set; all else, such as services, is rclpy's to run. Measured on two busy cores
-with both arms moving: 1.1 cores and 167 joint commands a second. With ``SingleThreadedExecutor`` it was 1.7 cores and
-53. The ``EventsExecutor`` of rclpy 7.1 fails with a ``SystemError`` where a callback gets a message's times. rclpy
-makes a wait set each time that it looks, which takes a millisecond where other programs have the caches. One that stays
-says in 0.05 ms whether there is anything to run.
+Messages and ticks bypass rclpy's wait set. rclpy runs everything else, such as services. On two busy cores with both
+arms moving, this needs 1.1 cores for 167 joint commands per second. With ``SingleThreadedExecutor`` it was 1.7 cores
+for 53. The ``EventsExecutor`` of rclpy 7.1 fails with a ``SystemError`` if a callback gets the times of a message.
+
+rclpy makes a wait set for each look, which takes a millisecond while other programs occupy the caches. A permanent wait
+set tells within 0.05 ms whether there is anything to run.
 """
 
 from __future__ import annotations
@@ -22,32 +23,32 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
-_SERVED = 0.05  # period of services, slow timers, silent topics and all else that is no tick and no stream [s]
-_MOST_CALLS = 20  # of these at once: a coroutine that waits for something is ready all the time
-_MOST_MESSAGES = 100  # of one subscription between two ticks
-_SIMULATED = 0.001  # period of looking at a simulated clock [s]
+_SERVED = 0.05  # Period for services, slow timers and silent topics, which are neither ticks nor streams [s].
+_MOST_CALLS = 20  # Greatest number of these calls at once. A coroutine that waits is always ready.
+_MOST_MESSAGES = 100  # Greatest number of messages of one subscription between two ticks.
+_SIMULATED = 0.001  # Period for looking at a simulated clock [s].
 
 
 class TickGroup(MutuallyExclusiveCallbackGroup):
-    """A node's ticks and the messages that they use. Executors other than :class:`TickExecutor` run it as any group."""
+    """The ticks of a node and the messages that they use. Other executors run it as any callback group."""
 
-    is_taken = False  # by a TickExecutor
+    is_taken = False  # Whether a TickExecutor runs it.
 
     def can_execute(self, entity: Any) -> bool:
         return not self.is_taken and bool(super().can_execute(entity))
 
 
 class TickExecutor(SingleThreadedExecutor):
-    """Runs each node's ``tick_group`` itself; rclpy runs all other callbacks, for which it looks each 50 ms."""
+    """Runs the ``tick_group`` of each node itself. rclpy runs all other callbacks every 50 ms."""
 
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
-        self._changed = True  # entities were made or destroyed
-        self._subscriptions: list[Any] = []  # and how many arguments the callback of each gets
-        self._streams: list[Any] = []  # those with a publisher; to look for a message takes long where none can come
-        self._ticks: list[Any] = []  # timers
+        self._changed = True  # Whether entities were made or destroyed.
+        self._subscriptions: list[Any] = []  # With the number of arguments of each callback.
+        self._streams: list[Any] = []  # Subscriptions with a publisher. To look at others would be a waste of time.
+        self._ticks: list[Any] = []  # The timers of ticks.
         self._served_at = -math.inf  # [s]
-        self._simulated = False  # see _is_simulated
+        self._simulated = False  # See _is_simulated.
         self._rest = _RestOfNodes([])
 
     def add_node(self, node: Any) -> bool:
@@ -59,7 +60,7 @@ class TickExecutor(SingleThreadedExecutor):
         super().wake()
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Sleep until a tick is due, for 50 ms or ``timeout_sec`` at most; run what is due then."""
+        """Sleep until a tick is due, for 50 ms or ``timeout_sec`` at most, and run what is due then."""
         if not self.context.ok():
             raise ExternalShutdownException
         if self._changed:
@@ -76,20 +77,20 @@ class TickExecutor(SingleThreadedExecutor):
                 timer.callback()
         if (now := time.monotonic()) - self._served_at >= _SERVED:
             self._served_at, self._streams, self._simulated = now, self._subscriptions, self._is_simulated()
-            self.take_messages()  # a publisher may have come, and even gone
+            self.take_messages()  # A publisher may have come and gone meanwhile.
             if not self._changed:
                 self._streams = [one for one in self._streams if one[0].handle.get_publisher_count()]
             if self._changed or self._tasks or self._rest.is_ready():
                 self._serve()
 
     def take_messages(self) -> None:
-        """Run the callbacks of all messages that have arrived; also for a service that ticks by itself for a while."""
+        """Run the callbacks of all messages that have arrived. A service that ticks by itself also calls it."""
         if self._changed:
             self._collect()
         for one, arguments in self._streams:
             for _ in range(_MOST_MESSAGES):
                 if self._changed:
-                    return  # this subscription may be destroyed
+                    return  # This subscription may have been destroyed.
                 if (taken := one.handle.take_message(one.msg_type, one.raw)) is None:
                     break
                 one.callback(*taken[:arguments])
@@ -97,11 +98,11 @@ class TickExecutor(SingleThreadedExecutor):
     def _time_left(self, longest: float) -> float:
         if self._simulated:
             return min(longest, _SIMULATED)
-        left = [timer.time_until_next_call() for timer in self._ticks]  # [ns]; None: cancelled
+        left = [timer.time_until_next_call() for timer in self._ticks]  # [ns]; None for a timer that was cancelled.
         return min([longest, *(1e-9 * one for one in left if one is not None)])
 
     def _is_simulated(self) -> bool:
-        """Whether some tick goes by a clock that others set; it may become so while a node runs."""
+        """Return whether a tick uses simulated time. This may change while a node runs."""
         return any(isinstance(timer.clock, ROSClock) and timer.clock.ros_time_is_active for timer in self._ticks)
 
     def _serve(self) -> None:
@@ -110,7 +111,7 @@ class TickExecutor(SingleThreadedExecutor):
                 task, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
                 task()
                 if task.done():
-                    task.result()  # raises what the callback has raised
+                    task.result()  # This raises the exception of the callback.
 
     def _collect(self) -> None:
         self._changed = False
@@ -123,7 +124,7 @@ class TickExecutor(SingleThreadedExecutor):
 
 
 class _RestOfNodes:
-    """The callbacks of some nodes that belong to no :class:`TickGroup`; rclpy executes them."""
+    """The callbacks of nodes that belong to no :class:`TickGroup`. rclpy executes them."""
 
     def __init__(self, nodes: list[Any]) -> None:
         groups = [node.tick_group for node in nodes]
@@ -134,7 +135,7 @@ class _RestOfNodes:
 
         self._subscriptions, self._timers = others("subscriptions"), others("timers")
         self._clients, self._services, self._waitables = others("clients"), others("services"), others("waitables")
-        # To wait for a guard condition takes its trigger away, which then is not there for rclpy.
+        # A wait for a guard condition would clear its trigger, and rclpy would not see it.
         self._has_guards = any(list(node.guards) for node in nodes)
         self._wait_set: Any = None
         if nodes:
@@ -147,7 +148,7 @@ class _RestOfNodes:
             self._wait_set = rclpy_implementation.WaitSet(*counts, nodes[0].context.handle)
 
     def is_ready(self) -> bool:
-        """Whether some of it can run now."""
+        """Return whether one of these callbacks can run now."""
         wait_set = self._wait_set
         if self._has_guards or wait_set is None:
             return True

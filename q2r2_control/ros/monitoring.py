@@ -1,4 +1,4 @@
-"""A node's view of others: who publishes and subscribes, who still acknowledges, what they say on ``~/state``."""
+"""Observe other nodes: who publishes and subscribes, who still acknowledges, and what they report on ``~/state``."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from std_msgs.msg import String
 from q2r2_control.events import HOLD_REQUESTS, Reason, ReasonKind
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS
 
-_MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
-_PERIOD = 2.0  # of asking the graph where no other code asks [s]
+_MAX_AGE = 0.1  # Age of the graph's answer at which it is asked again [s].
+_PERIOD = 2.0  # Time between two queries of the graph, if no other code asks [s].
 _NO_WAIT = Duration(nanoseconds=0)
-# A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. Messages are therefore left out
-# every _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
+# A subscriber may take 5 ms to acknowledge, which is longer than the period of a fast stream. Every _CHECK seconds
+# messages are therefore left out until the last one has been acknowledged, for at most _GAP seconds.
 _CHECK, _GAP = 0.05, 0.015
-_ASKED = 0.02  # after all was acknowledged, it is asked again [s]
+_ASKED = 0.02  # Time after which it is asked again whether all was acknowledged [s].
 _LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # [s]
-_LATELY = 32  # messages; a subscription of the same node keeps fewer
+_LATELY = 32  # Number of recent messages. A subscription of the same node keeps fewer.
 _STATE = "/state"
-_LOOK_PERIOD = 0.3  # of asking the graph for nodes that report [s]
-_DISCOVERY = 2.0  # an arm that is there has said so by then: nodes report twice a second [s]
-_SILENT, _GONE = 2.0, 5.0  # without a report [s]
-_ARM = {"engaged", "ready", "hand"}  # what an arm's node says
+_LOOK_PERIOD = 0.3  # Time between two queries of the graph for nodes that report [s].
+_DISCOVERY = 2.0  # Time within which every arm that is there has reported. Nodes report twice a second [s].
+_SILENT, _GONE = 2.0, 5.0  # Times without a report, after which a node is silent, and has gone [s].
+_ARM = {"engaged", "ready", "hand"}  # The keys by which the report of an arm's node is recognised.
 # By the number of an endpoint, which is unique. A node that the graph has lost, such as one that was frozen or
 # unreachable for longer than its lease, comes back with the same endpoints. Fast DDS never learns their node again.
 _known: dict[bytes, str] = {}
 
 
 def node_of(endpoint: Any) -> str | None:
-    """Full name of the node that an endpoint of the graph belongs to; None while it was never known."""
+    """Return the full name of the node to which an endpoint belongs; None if it was never known."""
     number = bytes(endpoint.endpoint_gid)
-    if not endpoint.node_name.startswith("_NODE_NAME_"):  # as rcl puts it
+    if not endpoint.node_name.startswith("_NODE_NAME_"):  # rcl gives such a name if it does not know the node.
         _known[number] = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
     return _known.get(number)
 
 
 class Publishers:
-    """Which nodes publish on some topics, asked now and then; names are kept after a node has left the graph."""
+    """The nodes that publish on some topics. Their names are kept after a node has left the graph."""
 
     def __init__(self, node: Node, topics: Iterable[str]) -> None:
         self._node = node
@@ -55,13 +55,13 @@ class Publishers:
         node.create_timer(_PERIOD, partial(self._ask, *self._names), clock=STEADY)
 
     def of(self, topic: str) -> str:
-        """Full names of the nodes that publish on ``topic``, or of the last ones that did; "" if there were none."""
+        """Return the full names of the nodes that publish on ``topic`` or did last; "" if there were none."""
         if time.monotonic() - self._asked_at[topic] > _MAX_AGE:
             self._ask(topic)
         return self._names[topic]
 
     def source(self, topic: str) -> str:
-        """The same for the middle of a sentence: " from /node", or "" if there were none."""
+        """Return the same for the middle of a sentence: " from /node", or "" if there were none."""
         return f" from {names}" if (names := self.of(topic)) else ""
 
     def _ask(self, *topics: str) -> None:
@@ -73,10 +73,16 @@ class Publishers:
 
 
 def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
-    """Publish what was decided on at ``decided`` [s] of the steady clock, unless its lifespan is over; whether it was.
+    """Publish a message, unless its lifespan is over; returns whether it was published.
 
-    The middleware counts the lifespan from the publishing: a process that is frozen before would send a command of the
-    past, a jump. Serializing takes most of the time until the message is sent; :class:`DelayWatch` covers the rest.
+    The middleware counts the lifespan from the publishing. A process that was frozen before would send an old command,
+    which is a jump. Serialisation takes most of the time until the message is sent. :class:`DelayWatch` covers the
+    rest.
+
+    Args:
+        publisher: The publisher.
+        message: The message.
+        decided: When the contents were decided on, by the steady clock [s].
     """
     data = message if isinstance(message, bytes) else serialize_message(message)
     in_time = time.monotonic() - decided <= _LIFESPAN
@@ -86,13 +92,13 @@ def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
 
 
 class WatchedPublisher:
-    """A publisher of targets or commands that notices when a subscriber was killed or hangs: it acknowledges no more.
+    """A publisher of targets or commands that notices a killed or hanging subscriber, which acknowledges no more.
 
-    The graph lists such a subscriber for seconds. Meanwhile the targets move on, and a subscriber that is started in
-    its place would begin with a jump. A stream of which nothing was ever acknowledged is not judged, because the
-    remains of a subscriber that ended earlier do not acknowledge either. Best-effort subscribers never acknowledge and
-    do not count. Middlewares without acknowledgements, on Zenoh, affirm all, and ``q2r2 ros doctor`` says so. All times
-    are real time, also where a simulation has its own.
+    The graph lists such a subscriber for seconds. Meanwhile the targets move on, and a new subscriber in its place
+    would begin with a jump. If nothing of a stream was ever acknowledged, the stream is not judged, because the remains
+    of an earlier subscriber do not acknowledge either. Best-effort subscribers never acknowledge, and do not count.
+    Middlewares without acknowledgements, on Zenoh, always affirm, and ``q2r2 ros doctor`` says so. All times are real
+    time, also with a simulated clock.
     """
 
     def __init__(self, node: Node, kind: type, topic: str, timeout: float) -> None:
@@ -101,27 +107,28 @@ class WatchedPublisher:
         self._timeout = timeout
         self.sent = 0
         self._lately: deque[bytes] = deque(maxlen=_LATELY)
-        self.own_listeners = 0  # subscriptions of the same node, which acknowledge nothing
+        self.own_listeners = 0  # Number of subscriptions of the same node, which acknowledge nothing.
         self._streaming = False
-        self._acknowledged: float | None = None  # when all messages last were; None: not yet in this stream [s]
+        # Time when all messages were last acknowledged; None if they were not yet in this stream [s].
+        self._acknowledged: float | None = None
         self._gap_began = -math.inf  # [s]
 
     @property
     def listeners(self) -> int:
-        """How many subscribers of others the graph lists; some may have ended."""
+        """Return the number of subscribers of other nodes in the graph. Some of them may have ended."""
         return int(self._publisher.get_subscription_count()) - self.own_listeners
 
     def is_own(self, data: bytes) -> bool:
-        """Whether a serialized message is one of the last that were published here."""
+        """Return whether a serialized message is one of the last messages that were published here."""
         return data in self._lately
 
     def begin(self, acknowledged: bool = False) -> None:
-        """The next message begins a stream; with ``acknowledged`` all that was sent before counts as acknowledged."""
+        """Let the next message begin a stream. With ``acknowledged``, all earlier messages count as acknowledged."""
         self._streaming, self._gap_began = False, -math.inf
         self._acknowledged = time.monotonic() if acknowledged else None
 
     def publish(self, message: Any, decided: float) -> bool:
-        """Publish a message of the stream; ``decided`` and what it returns: see :func:`publish_in_time`."""
+        """Publish a message of the stream. See :func:`publish_in_time` for ``decided`` and the result."""
         data = message if isinstance(message, bytes) else serialize_message(message)
         self._lately.append(data)
         published = publish_in_time(self._publisher, data, decided)
@@ -130,7 +137,7 @@ class WatchedPublisher:
         return published
 
     def waits(self) -> bool:
-        """Whether the next message should be left out, so that the last one can be acknowledged."""
+        """Return whether the next message should be left out, so that the last one can be acknowledged."""
         now = time.monotonic()
         if not self._streaming or (self._acknowledged is not None and now - self._acknowledged < _CHECK):
             return False
@@ -142,7 +149,7 @@ class WatchedPublisher:
         return now - self._gap_began < _GAP
 
     def silence(self) -> Reason | None:
-        """A reason if nothing was acknowledged for longer than the timeout; call it before each message."""
+        """Return a reason if nothing was acknowledged for longer than the timeout. It is called before each message."""
         if not self._streaming:
             return None
         now = time.monotonic()
@@ -156,7 +163,7 @@ class WatchedPublisher:
 
 
 class NodeStates:
-    """The newest state of every node that reports one, by its full name; the node has to be spun."""
+    """The newest state of every node that reports one, by its full name. The node has to be spun."""
 
     def __init__(
         self,
@@ -164,10 +171,10 @@ class NodeStates:
         on_state: Callable[[str, dict[str, Any]], None] = lambda name, state: None,
         namespace: str = "/",
     ) -> None:
-        """``namespace``: where nodes are that count."""
+        """Only nodes in ``namespace`` count."""
         self._node, self._on_state, self._prefix = node, on_state, f"{namespace.rstrip('/')}/"
-        self._heard: set[str] = set()  # topics
-        self.newest: dict[str, tuple[dict[str, Any], float]] = {}  # and when it came [s]
+        self._heard: set[str] = set()  # The topics that are heard.
+        self.newest: dict[str, tuple[dict[str, Any], float]] = {}  # By node, the state and the time of receipt [s].
 
     def look(self) -> None:
         for topic, types in self._node.get_topic_names_and_types():
@@ -181,14 +188,14 @@ class NodeStates:
         try:
             state = json.loads(message.data)
         except ValueError:
-            return  # some other node's
+            return  # The topic belongs to some other node.
         if isinstance(state, dict) and {"level", "message"} <= state.keys():
             self.newest[name] = state, time.monotonic()
             self._on_state(name, state)
 
 
 class HandListeners:
-    """The nodes that say on ``~/state`` that they follow one of some hands."""
+    """The nodes that report on ``~/state`` that they follow one of some hands."""
 
     def __init__(self, node: Node, hands: Sequence[str]) -> None:
         self._states, self._hands = NodeStates(node, namespace=node.get_namespace()), hands
@@ -201,7 +208,7 @@ class HandListeners:
             self._states.look()
 
     def unready(self) -> str | None:
-        """One line if some arm cannot be engaged yet, or may be one that has not said so; else None."""
+        """Return one line if an arm cannot be engaged yet, or may not have reported yet; else None."""
         if time.monotonic() - self._began < _DISCOVERY and any(self.engaged(hand) is None for hand in self._hands):
             return "an arm may be there that has not said yet what it does"
         for name, state, age in self._arms():
@@ -212,16 +219,16 @@ class HandListeners:
         return None
 
     def engaged(self, hand: str) -> bool | None:
-        """Whether all arms that follow a hand are engaged; None if no arm follows it."""
+        """Return whether all arms that follow a hand are engaged; None if no arm follows it."""
         engaged = [state["engaged"] for _, state, _ in self._arms() if state["hand"] == hand]
         return all(engaged) if engaged else None
 
     def asked_to_hold(self) -> bool:
-        """Whether the last event of some arm is a request for a pause, a reset or the way home, or how that ended."""
+        """Return whether the last event of an arm is a request for a pause, a reset or the way home, or its result."""
         return any(state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms())
 
     def _arms(self) -> list[tuple[str, dict[str, Any], float]]:
-        """Name, state and age [s] of the arms' nodes that follow these hands."""
+        """Return name, state and age of the state [s] of the arms' nodes that follow these hands."""
         now = time.monotonic()
         said = ((name, state, now - at) for name, (state, at) in self._states.newest.items())
         return [one for one in said if one[2] <= _GONE and one[1].keys() >= _ARM and one[1]["hand"] in self._hands]

@@ -1,7 +1,7 @@
-"""``--plant ros``: a robot behind ROS 2, whose joint states come in and whose setpoints go out, for a loop elsewhere.
+"""``--plant ros``: a robot behind ROS 2, which sends joint states and gets setpoints of a loop in this process.
 
-The loop takes the place of ``cartesian_controller``, with the usual topics: ``joint_states``, ``joint_trajectory`` and
-the actions of the grippers. It begins only where nobody else commands the arms.
+The loop replaces ``cartesian_controller``, with the usual topics: ``joint_states``, ``joint_trajectory`` and the
+actions of the grippers. It begins only if nobody else commands the arms.
 """
 
 from __future__ import annotations
@@ -37,40 +37,44 @@ from q2r2_control.supervision.standstill import JOINTS
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
-_WAIT = 5.0  # for joint states and for whatever takes the commands [s]
-_QUIET = 1.0  # nobody else commands the arms for so long before, in which all others are discovered [s]
+_WAIT = 5.0  # Time to wait for joint states and for a receiver of the commands [s].
+_QUIET = 1.0  # Other commanders must be silent for this long first, while they are discovered [s].
 _CURE = "; start the robot, and see q2r2 ros doctor"
-_AWAY = 0.02  # from the measured joints: to a receiver that is new such a command is a jump [rad]
+_AWAY = 0.02  # A command farther from the measured joints would be a jump to a new receiver [rad].
 
 
 class _PlantNode(BaseNode):
-    ticks = True  # its messages are taken when the loop ticks
+    ticks = True  # Its messages are taken when the loop ticks.
 
 
 class RosPlant:
-    """The arms start where they stand. Joint states that cease or are bad, and a new receiver, let them rest."""
+    """A plant whose arms start where they stand. Missing or bad joint states, or a new receiver, bring them to rest."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
     realtime_only = True
-    standstill = JOINTS  # the arms' controller is another process, which may stand still
+    standstill = JOINTS  # The arms' controller is another process, which may stand still.
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._robot, self._period = robot, 1.0 / config.nominal_rate_hz
         self._fingers, self._kind = Fingers(robot, config), TrajectoryOutput(self._period, robot)
-        self._openings = dict.fromkeys(self._fingers.arms, 1.0)  # none is measured before a run
+        self._openings = dict.fromkeys(self._fingers.arms, 1.0)  # No opening is measured before a run.
         self._context: Context | None = None
-        self._stopped: Callable[[], bool] = lambda: False  # whether nobody wants to wait for the robot any more
+        self._stopped: Callable[[], bool] = lambda: False  # Whether the wait for the robot is to end.
 
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> RosPlant:
         return cls(robot, config)
 
     def begin(self, mode: CommandMode, stopped: Callable[[], bool]) -> None:
-        """See :meth:`SessionPlant.begin`; there is one mode."""
+        """See :meth:`SessionPlant.begin`. There is only one mode."""
         self._stopped = stopped
 
     def reset(self, q: Array | None = None) -> None:
-        """Hear the robot. Raises :class:`PlantError` where it is not there, others command it, or for ``q``."""
+        """Begin to hear the robot.
+
+        Raises:
+            PlantError: If the robot is not there, if another node commands it, or if ``q`` is given.
+        """
         if q is not None:
             raise PlantError("reset q: a real arm starts where it stands")
         self.close()
@@ -87,12 +91,12 @@ class RosPlant:
         }
         self._openings = {}
         self._joints = JointIntake(node, self._robot)
-        self._bad: Reason | None = None  # what is wrong with the newest joint states
-        self._fault: Reason | None = None  # why nothing is commanded
+        self._bad: Reason | None = None  # What is wrong with the newest joint states.
+        self._fault: Reason | None = None  # Why nothing is commanded.
         self._joints.subscribe(self._take_state, self._take_fingers)
-        self._last = -math.inf  # tick [s]
-        self._command: Command | None = None  # the newest one
-        self._begins = True  # the next command has to be where the arms are
+        self._last = -math.inf  # Time of the last tick [s].
+        self._command: Command | None = None  # The newest command.
+        self._begins = True  # Whether the next command has to be at the arms' posture.
         self._others = others = CommandWatch(node, JointTrajectory, [self._publisher])
         others.begin()
         began = time.monotonic()
@@ -120,7 +124,7 @@ class RosPlant:
         self._openings |= self._fingers.openings(message)
 
     def due(self, now: float) -> tuple[float, float]:
-        """See :meth:`SessionPlant.due`. After a late tick the reference goes on by two periods at most."""
+        """See :meth:`SessionPlant.due`. After a late tick the reference advances by two periods at most."""
         self._executor.spin_once(timeout_sec=0.0)
         gap, self._last = now - self._last, now
         before, self._listeners = self._listeners, self._publisher.listeners
@@ -145,7 +149,7 @@ class RosPlant:
         return self._period + COMMAND_TIME
 
     def delay(self) -> float:
-        """Drivers do not tell it."""
+        """Return 0, because drivers do not report their delay."""
         return 0.0
 
     def fault(self) -> Reason | None:
@@ -168,11 +172,11 @@ class RosPlant:
                 gripper.check(decided)
 
     def advance(self, dt: float) -> None:
-        """Time passes by itself."""
+        """Do nothing, because the time of real arms passes by itself."""
 
     def state(self) -> RobotState:
         state = self._joints.state
-        assert state is not None  # since reset
+        assert state is not None  # It exists since the reset.
         return state
 
     def gripper_openings(self) -> dict[str, float]:
