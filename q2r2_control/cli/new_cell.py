@@ -32,6 +32,7 @@ from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_na
 from q2r2_control.robot.reachability import nearest_approaches, srdf_text
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
+from q2r2_control.robot.unchecked import shapeless_links
 from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
@@ -107,6 +108,7 @@ def new_cell(
     models = without_mjcf(given, name, velocity, yes)
     robot = models.get("robot")
     _survey(draft, dict.fromkeys(tips, robot) if robot else models, tips, shared=robot)
+    _enclose_drawings(draft, yes)
     _mount(draft, distance, height, yes)
     _place(draft, yes)
     with counting() as progress:
@@ -199,6 +201,23 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
                 capsules[name] = max(fit.capsules, capsules.get(name, 0))
     if capsules:
         draft.data["capsules"] = capsules
+
+
+def _enclose_drawings(draft: _Draft, yes: bool) -> None:
+    """Capsules around the drawings of links that weigh something and have no collision shape."""
+    links = [link for link in shapeless_links(Robot.from_config(draft.config())) if link.is_body and link.drawn]
+    names = ", ".join(link.name for link in links)
+    if not links or not (yes or typer.confirm(f"watch {names} by capsules around their drawings", default=True)):
+        return
+    before = draft.data.get("capsules", {})
+    draft.data["capsules"] = before | {link.name: 1 for link in links}
+    try:
+        Robot.from_config(draft.config())
+    except Q2R2Error as error:
+        draft.notes.append(f"no capsules around drawings: {error}")
+        draft.data["capsules"] = before
+        return
+    draft.notes.append(f"{names}: drawn, without a collision shape, hence watched by capsules around the drawings")
 
 
 def _mount(draft: _Draft, distance: float | None, height: float | None, yes: bool) -> None:

@@ -29,6 +29,7 @@ from q2r2_control.robot.urdf_parts import (
     obstacle_link,
     renamed_exclusions,
     set_acceleration_limit,
+    shape_from_drawings,
 )
 from q2r2_control.types import SIDES
 
@@ -86,6 +87,7 @@ def compose(config: Config) -> ComposedCell:
     for arm in arms.values():
         for name, limit in arm.acceleration_limits().items():
             set_acceleration_limit(next(joint for joint in urdf.findall("joint") if joint.get("name") == name), limit)
+    shape_from_drawings(urdf.findall("link"), config.capsules)
     name_shapes(urdf.findall("link"))
     for name, obstacle in config.obstacles.items():
         _check_obstacle_name(name, urdf)

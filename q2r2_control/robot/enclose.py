@@ -39,15 +39,15 @@ _SLABS = 12  # of equal height, which the capsules of a mesh share
 def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | None = None) -> None:
     """Replace in place every shape that is not a capsule, a sphere or a box fixed in the world; names and pairs stay.
 
-    ``capsules`` has links of whose meshes each becomes that many capsules at most. The first one has the mesh's name,
-    the others follow all shapes, as further ones of their link. Raises :class:`RobotError` for a shape without extent
+    ``capsules`` has links of whose meshes each becomes that many capsules at most; 1 is for other shapes too. The
+    first one has the mesh's name, the others follow all shapes, as further ones of their link. Raises :class:`RobotError` for a shape without extent
     or without bounds, and :class:`ConfigError` for a link in ``capsules`` that has no mesh.
     """
     capsules = capsules or {}
     numbers = Counter(link_of(item.name) for item in geometry.geometryObjects)
     meshes = {link_of(one.name) for one in geometry.geometryObjects if isinstance(one.geometry, coal.BVHModelBase)}
-    for link in capsules:
-        if link not in meshes:
+    for link, count in capsules.items():
+        if link not in (meshes if count > 1 else numbers):
             allowed = ", ".join(sorted(meshes)) or "none in this cell"
             raise ConfigError(f"capsules.{link!s:.60}: no link with a mesh; allowed: {allowed}")
     more = []

@@ -17,6 +17,7 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import joints_that_cannot_hold
+from q2r2_control.robot.unchecked import unchecked_faults
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.types import Array, Reference
 
@@ -244,19 +245,14 @@ def preflight_faults(
 ) -> tuple[str, ...]:
     """One line for each reason why ``robot`` should not start at home; empty for a cell that may run.
 
-    Position limits are checked with their margin, gravity against torque limits, and every monitored pair against the
-    distance that it keeps. The ``controller`` has to know a certified stop at home, where it is left reset. None where
-    no controller is about to move the arms: a stop of arms at rest keeps all apart where the distances are kept.
+    Every link that weighs something needs a shape, unless the cell names it. Position limits are checked with their
+    margin, gravity against torque limits, and every monitored pair against the distance that it keeps. The
+    ``controller`` has to know a certified stop at home, where it is left reset. None where no controller is about to
+    move the arms: a stop of arms at rest keeps all apart where the distances are kept.
     """
     lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
     change = "to change: control.position_margin, or a fixed joint in the model"
-    # A joint's index in Pinocchio's model is one more than in the vectors, since the world comes first.
-    shaped = {item.parentJoint - 1 for item in robot.collision_model.geometryObjects}
-    faults = [
-        f"{name} arm: no link between its base and its tool has a collision shape; allowed: a model with <collision>"
-        for name, arm in robot.arms.items()
-        if not shaped & set(arm.joints[:-1].tolist())  # the last one moves the tool
-    ]
+    faults = unchecked_faults(robot)
     faults += [
         f"{name}: position_margin leaves {max(left, 0.0):g} rad of its range; {change}"
         for name, left in zip(robot.joint_names, upper - lower, strict=True)

@@ -218,9 +218,10 @@ def test_a_cell_watches_each_capsule_of_a_link() -> None:
         ({"forearm_link": 2}, "capsules.forearm_link: no link with a mesh; allowed: left_base_link, left_forearm_link"),
         ({"left_ee_link": 2}, "capsules.left_ee_link: no link with a mesh"),
         ({"left_forearm_link": 5}, "capsules.left_forearm_link = 5"),
-        ({"left_forearm_link": 1}, "capsules.left_forearm_link = 1"),
+        ({"left_forearm_link": 0}, "capsules.left_forearm_link = 0"),
+        ({"left_elbow": 1}, "capsules.left_elbow: no link with a mesh"),
     ],
-    ids=["no link of the cell", "a box", "too many", "one, which is usual"],
+    ids=["no link of the cell", "a box", "too many", "none", "one, of no link of the cell"],
 )
 def test_capsules_that_cannot_be_are_refused(capsules: dict[str, int], says: str) -> None:
     text = yaml.safe_dump(_ur5().model_dump(mode="json", exclude_unset=True) | {"capsules": capsules})
