@@ -272,7 +272,7 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
         config = validated(Config, "", content, as_json=True, strict=True, context={"folder": folder})
         return _within_driver_limits(config)
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise error.at(f"{path}: ") from error
     except (ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
 
