@@ -32,7 +32,7 @@ from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_na
 from q2r2_control.robot.reachability import nearest_approaches, srdf_text
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
-from q2r2_control.robot.unchecked import shapeless_links
+from q2r2_control.robot.unchecked import moving_links
 from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
@@ -205,7 +205,8 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
 
 def _enclose_drawings(draft: _Draft, yes: bool) -> None:
     """Capsules around the drawings of links that weigh something and have no collision shape."""
-    links = [link for link in shapeless_links(Robot.from_config(draft.config())) if link.is_body and link.drawn]
+    moving = moving_links(Robot.from_config(draft.config()))
+    links = [link for link in moving if link.is_unchecked and link.drawn and not link.shaped]
     names = ", ".join(link.name for link in links)
     if not links or not (yes or typer.confirm(f"watch {names} by capsules around their drawings", default=True)):
         return

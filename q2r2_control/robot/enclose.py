@@ -40,8 +40,9 @@ def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | No
     """Replace in place every shape that is not a capsule, a sphere or a box fixed in the world; names and pairs stay.
 
     ``capsules`` has links of whose meshes each becomes that many capsules at most; 1 is for other shapes too. The
-    first one has the mesh's name, the others follow all shapes, as further ones of their link. Raises :class:`RobotError` for a shape without extent
-    or without bounds, and :class:`ConfigError` for a link in ``capsules`` that has no mesh.
+    first one has the mesh's name, the others follow all shapes, as further ones of their link. Raises
+    :class:`RobotError` for a shape without extent or without bounds, and :class:`ConfigError` for a link in
+    ``capsules`` that has no mesh.
     """
     capsules = capsules or {}
     numbers = Counter(link_of(item.name) for item in geometry.geometryObjects)

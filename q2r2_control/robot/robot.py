@@ -23,6 +23,7 @@ from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, p
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.finger_bodies import sweep_fingers
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
+from q2r2_control.robot.followers import followers_of, with_followers
 from q2r2_control.robot.held_objects import HeldObjects, held_objects
 from q2r2_control.robot.near_pairs import warning_at_home
 from q2r2_control.robot.pairs import (
@@ -93,6 +94,7 @@ class Robot:
         velocity_limit: The model's limits (nv,) [rad/s].
         torque_limit: The model's limits (nv,) [Nm].
         urdf: The whole cell as a text.
+        following_links: By link, the arm's joint that a link beside the arm follows; it is watched where it is at home.
         unchecked_links: Names of links without a collision shape that nothing keeps off anything, by the maker's will.
     """
 
@@ -145,6 +147,7 @@ class Robot:
             self.arms[name] = replace(arm, finger_way=max(ways, default=0.0) or arm.stroke)
         self.ignored_pairs = self._monitor(tree, exclusions, list(own_links.values()))
         self.objects = HeldObjects(self.collision_model, {}, ())
+        self.following_links: dict[str, str] = dict(parts.following)
         self.unchecked_links: tuple[str, ...] = tuple(unchecked_links)
         for link in self.unchecked_links:
             if link != tree.root and link not in tree.joint_to:
@@ -323,8 +326,13 @@ def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[s
         except ConfigError as error:
             raise RobotError(f"{where}: {error}") from None
     limits = {name: joint_limits(joint) for name, joint in joints.items()}
-    usual = {name: 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2 for name, (lower, upper) in limits.items()}
-    return usual | {name: float(position) for name, position in given.items()}
+    followers = followers_of(urdf.findall("joint"), driven=given)
+    usual = {
+        name: 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2
+        for name, (lower, upper) in limits.items()
+        if name not in followers
+    }
+    return with_followers(usual | {name: float(position) for name, position in given.items()}, followers)
 
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:
