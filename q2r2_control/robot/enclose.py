@@ -105,7 +105,9 @@ def _cached_capsule(found: bytes) -> Capsule:
     points = _corners(np.frombuffer(found).reshape(-1, 3))
     centre = points.mean(axis=0)
     scale = max(float(np.abs(points - centre).max()), 1e-9)
-    frame, view = _best_view(points - centre, np.linalg.svd(points - centre, full_matrices=True)[2], scale)
+    # Full matrices only where fewer points than axes leave some out: of n points they are n x n.
+    axes = np.linalg.svd(points - centre, full_matrices=len(points) < 3)[2]
+    frame, view = _best_view(points - centre, axes, scale)
     options = {"maxiter": 600, "xatol": 1e-4, "fatol": 1e-5}
     start = _start(view)
     result = minimize(lambda x: _volume(*_fit(view, x)), start, method="Nelder-Mead", options=options)

@@ -19,7 +19,7 @@ from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.cell_parts import check_position
 from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.compose import compose
-from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
+from q2r2_control.robot.description import CONTINUOUS_RANGE, LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.finger_bodies import sweep_fingers
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
@@ -91,6 +91,7 @@ class Robot:
             arrays of joints, and ``tool_frame``, the name of its tool's link.
         home: Joint positions at which the cell starts (nv,) [rad].
         position_lower: The model's limits (nv,) [rad]; ``position_upper`` likewise.
+        endless: Whether each joint turns on for ever (nv,).
         velocity_limit: The model's limits (nv,) [rad/s].
         torque_limit: The model's limits (nv,) [Nm].
         urdf: The whole cell as a text.
@@ -129,6 +130,8 @@ class Robot:
         self.home: Array = np.array([home[joint] for joint in self.joint_names])
         self.position_lower: Array = self.model.lowerPositionLimit.copy()
         self.position_upper: Array = self.model.upperPositionLimit.copy()
+        # A continuous joint is known by the range that a model without limits gets, see description.parse_urdf.
+        self.endless = (self.position_lower <= -CONTINUOUS_RANGE) & (self.position_upper >= CONTINUOUS_RANGE)
         self.velocity_limit: Array = self.model.velocityLimit.copy()
         self.torque_limit: Array = self.model.effortLimit.copy()
         joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -227,3 +228,16 @@ def test_capsules_that_cannot_be_are_refused(capsules: dict[str, int], says: str
     text = yaml.safe_dump(_ur5().model_dump(mode="json", exclude_unset=True) | {"capsules": capsules})
     with pytest.raises(ConfigError, match=re.escape(says)):
         Robot.from_config(parse_config(text, "cell.yaml"))
+
+
+def test_a_round_mesh_needs_memory_for_its_points_only() -> None:
+    points = np.random.default_rng(0).normal(size=(3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)  # all of them are corners
+    tracemalloc.start()
+    try:
+        radius, _, _ = enclosing_capsule(points)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert radius >= 0.999
+    assert peak < 20e6, "3000 x 3000 numbers are 72 MB"
