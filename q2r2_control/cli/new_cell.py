@@ -184,7 +184,9 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         if gripper := gripper_of(described[side], tree, found[side]):
             arms[side]["gripper"] = gripper
             driven = ", ".join(gripper["joints"])
-            draft.notes.append(f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints")
+            draft.notes.append(
+                f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints: arms.{side}.gripper"
+            )
     # Fingers are all that they sweep, which finer shapes would hardly make smaller.
     moved = {
         side: links_moved_by(tree, [joint.get("name", "") for joint in chains[side]])

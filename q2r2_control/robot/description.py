@@ -260,6 +260,10 @@ def _check_joint(joint: ET.Element, links: set[str], where: str) -> None:
     direction = [float(part) for part in ("" if axis is None else axis.get("xyz", "")).split()]
     if kind != "fixed" and direction and math.hypot(*direction) < _SHORTEST_AXIS:
         raise RobotError(f"{where}: joint {name} has axis {direction}; allowed: a direction")
+    lower, upper = joint_limits(joint)
+    if kind in ("revolute", "prismatic") and lower > upper:
+        limits = f"position limits {lower:g} .. {upper:g}"
+        raise RobotError(f"{where}: joint {name} has {limits}; allowed: lower below upper")
 
 
 def _example_robot(name: str) -> tuple[Path, Path | None]:

@@ -74,8 +74,8 @@ def test_a_heavy_link_without_a_shape_is_a_fault_until_the_cell_names_it(tmp_pat
     assert "FAULT right" in checked.stdout
     assert f"left{says}" in ran.stderr
     assert checked.stdout.endswith("\nthis cell cannot run: 2 faults\n")
-    with Path(cell).open("a", encoding="utf-8") as file:
-        file.write("\nunchecked_links: [left_link_3, right_link_3]\n")
+    text = Path(cell).read_text(encoding="utf-8")
+    Path(cell).write_text(text.replace("unchecked_links: []", "unchecked_links: [left_link_3, right_link_3]"))
     named = q2r2("check", cell)
     assert (named.exit_code, "FAULT" in named.stdout) == (0, False)
     assert "NOTE unchecked_links: nothing keeps left_link_3, right_link_3 off anything\n" in named.stdout
