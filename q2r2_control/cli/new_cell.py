@@ -183,9 +183,9 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         arms[side] |= {"tip": found[side], "home": [float(np.mean(joint_limits(joint))) for joint in joints]}
         if gripper := gripper_of(described[side], tree, found[side]):
             arms[side]["gripper"] = gripper
-            driven = ", ".join(gripper["joints"])
+            driven, key = ", ".join(gripper["joints"]), f"arms.{side}.gripper"
             draft.notes.append(
-                f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints: arms.{side}.gripper"
+                f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints, see {key}"
             )
     # Fingers are all that they sweep, which finer shapes would hardly make smaller.
     moved = {
