@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 class Q2R2Error(Exception):
     """Base class of all errors that q2r2_control raises on purpose."""
 
 
 class ConfigError(Q2R2Error):
-    """A configuration cannot be used. The message names file, key and value, and says what is allowed."""
+    """A configuration cannot be used. The message names file, key and value, and says what is allowed.
+
+    Attributes:
+        faults: A line for each fault, if more than one is known; else the message alone.
+    """
+
+    def __init__(self, message: str, faults: Sequence[str] = ()) -> None:
+        super().__init__(message)
+        self.faults = tuple(faults) or (message,)
+
+    def at(self, where: str) -> ConfigError:
+        """Return the same error with ``where`` at the beginning of each line."""
+        return ConfigError(f"{where}{self}", [f"{where}{fault}" for fault in self.faults])
 
 
 class RobotError(Q2R2Error):

@@ -16,14 +16,17 @@ import typer
 from typer.core import TyperGroup
 
 from q2r2_control.cli.commands import COMMANDS, CommandOnDemand
-from q2r2_control.errors import Q2R2Error
+from q2r2_control.errors import ConfigError, Q2R2Error
 
 # typer raises its own copy of click's exceptions, or click's, depending on its version; this is the root of either.
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
 
 class ErrorHandlingGroup(TyperGroup):
-    """All commands; bad usage and :class:`Q2R2Error` end in one line on stderr and exit code 2, Ctrl-C in 130."""
+    """All commands; Ctrl-C ends them in exit code 130, bad usage and :class:`Q2R2Error` in 2.
+
+    Each fault is a line on stderr.
+    """
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -44,14 +47,17 @@ class ErrorHandlingGroup(TyperGroup):
             sys.exit(code if isinstance(code, int) else 0)
         except (KeyboardInterrupt, typer.Abort):
             sys.exit(130)
+        except ConfigError as error:
+            messages = error.faults
         except Q2R2Error as error:
-            message = str(error)
+            messages = (str(error),)
         except _BadUsage as error:
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "q2r2"
             message = error.format_message()  # type: ignore[attr-defined]
-            message = f"{message.rstrip('.')}; see {command} --help"
-        print(f"q2r2: {' '.join(message.split())}", file=sys.stderr)
+            messages = (f"{message.rstrip('.')}; see {command} --help",)
+        for message in messages:
+            print(f"q2r2: {' '.join(message.split())}", file=sys.stderr)
         sys.exit(2)
 
 

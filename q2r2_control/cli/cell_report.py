@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import timeit
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -27,6 +27,7 @@ from q2r2_control.robot.near_pairs import lines_to_paste
 from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.robot.stop_torque import StopTorque, stop_torques
+from q2r2_control.robot.unchecked import unchecked_notes
 from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.types import DeviceControls
 
@@ -100,7 +101,8 @@ def check_cell(config: Config) -> CellCheck:
     if config.external is not None and not config.external.filtered:
         notes.append(RAW_WARNING)
     notes += _notes_on_models(config)
-    if config.capsules:
+    notes += unchecked_notes(robot)
+    if any(count > 1 for count in config.capsules.values()):
         notes.append(_capsules_note(config, robot))
     if config.note_on_grippers is not None:
         notes.append(config.note_on_grippers)
@@ -109,7 +111,6 @@ def check_cell(config: Config) -> CellCheck:
         notes.append(f"{' and '.join(allowed.pair)} may touch in torque mode: {inside}")
     # Without a controller, whose kernels take minutes to compile: at rest its certificate says no more than this.
     faults = (*preflight_faults(robot, settings, None), *_plant_faults(config, robot))
-    number = f"{len(faults)} fault{'s' * (len(faults) > 1)}"
     return CellCheck(
         name=config.name,
         arms=arms,
@@ -126,8 +127,14 @@ def check_cell(config: Config) -> CellCheck:
         driven={} if config.external is None else describe(config.external),
         controls=config.teleop.bindings.meanings(),
         notes=notes + [_stop_note(stop) for stop in stops if stop.stop.ratio > 1.0],
-        verdict=f"this cell cannot run: {number}" if faults else "this cell can run",
+        verdict=verdict_on(faults),
     )
+
+
+def verdict_on(faults: Sequence[str]) -> str:
+    """One line that says whether a cell with these ``faults`` can run."""
+    number = f"{len(faults)} fault{'s' * (len(faults) > 1)}"
+    return f"this cell cannot run: {number}" if faults else "this cell can run"
 
 
 def _plant_faults(config: Config, robot: Robot) -> list[str]:

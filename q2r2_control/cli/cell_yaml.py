@@ -41,7 +41,7 @@ def commented_yaml(data: Mapping[str, Any], robot: Robot) -> str:
     if "srdf" in data:
         lines.append(f"srdf: {_flow(data['srdf'])}   # pairs of links that cannot meet")
     if capsules := data.get("capsules"):
-        lines.append(f"capsules: {_flow(capsules)}   # for each mesh of these links, where one would be much larger")
+        lines.append(f"capsules: {_flow(capsules)}   # for each mesh, or drawing, of these links")
     if control := data.get("control"):
         lines += ["", "control:"]
         if "acceleration_limit" in control:

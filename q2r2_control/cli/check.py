@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,10 +12,10 @@ from rich.console import Console
 from rich.table import Table
 from typer import Exit, Option
 
-from q2r2_control.cli.cell_report import CellCheck, check_cell
-from q2r2_control.cli.output import ConfigFile, Json, as_json_text, counting, print_report
+from q2r2_control.cli.cell_report import CellCheck, check_cell, verdict_on
+from q2r2_control.cli.output import ConfigFile, Json, as_json_text, counting, print_report, say
 from q2r2_control.config.cell import Config, load_config
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.viewer.tables import figure_table, print_table
@@ -61,8 +62,8 @@ def check(
     json: Json = False,
 ) -> None:
     """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
-    cell = load_config(config)
     if pairs is not None:
+        cell = load_config(config)
         with counting() as progress:
             found = write_pairs(cell, pairs, samples, clearance, progress)
         table = figure_table(
@@ -73,12 +74,27 @@ def check(
         )
         print_report(found, (table,), json)
     else:
-        result = check_cell(cell)
+        with _verdict_on_refusal(config, json):
+            result = check_cell(load_config(config))
         if json:
             print(as_json_text(result))
         else:
             _print_cell(result)
         raise Exit(1 if result.faults else 0)
+
+
+@contextmanager
+def _verdict_on_refusal(file: str, json: bool) -> Iterator[None]:
+    """Print what is wrong with a cell that cannot even be built, and the verdict. Exit 2, as of all that is refused."""
+    try:
+        yield
+    except Q2R2Error as error:
+        faults = error.faults if isinstance(error, ConfigError) else (str(error),)
+        for fault in faults:
+            say(f"q2r2: {fault}")
+        verdict = verdict_on(faults)
+        print(as_json_text({"file": file, "faults": faults, "verdict": verdict}) if json else verdict)
+        raise Exit(2) from error
 
 
 def _print_cell(cell: CellCheck) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import pinocchio as pin
+import typer
 import yaml
 from rich.console import Console
 from typer import Argument, Exit, Option
@@ -32,6 +33,7 @@ from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_na
 from q2r2_control.robot.reachability import nearest_approaches, srdf_text
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
+from q2r2_control.robot.unchecked import moving_links
 from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
@@ -112,6 +114,7 @@ def new_cell(
     models = without_mjcf(given, name, velocity, yes, answers)
     robot = models.get("robot")
     _survey(draft, dict.fromkeys(tips, robot) if robot else models, tips, shared=robot)
+    _enclose_drawings(draft, yes)
     _mount(draft, distance, height, answers)
     _place(draft, answers)
     with counting() as progress:
@@ -188,8 +191,10 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         arms[side] |= {"tip": found[side], "home": [float(np.mean(joint_limits(joint))) for joint in joints]}
         if gripper := gripper_of(described[side], tree, found[side]):
             arms[side]["gripper"] = gripper
-            driven = ", ".join(gripper["joints"])
-            draft.notes.append(f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints")
+            driven, key = ", ".join(gripper["joints"]), f"arms.{side}.gripper"
+            draft.notes.append(
+                f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints, see {key}"
+            )
     # Fingers are all that they sweep, which finer shapes would hardly make smaller.
     moved = {
         side: links_moved_by(tree, [joint.get("name", "") for joint in chains[side]])
@@ -206,6 +211,24 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
                 capsules[name] = max(fit.capsules, capsules.get(name, 0))
     if capsules:
         draft.data["capsules"] = capsules
+
+
+def _enclose_drawings(draft: _Draft, yes: bool) -> None:
+    """Capsules around the drawings of links that weigh something and have no collision shape."""
+    moving = moving_links(Robot.from_config(draft.config()))
+    links = [link for link in moving if link.is_unchecked and link.drawn and not link.shaped]
+    names = ", ".join(link.name for link in links)
+    if not links or not (yes or typer.confirm(f"watch {names} by capsules around their drawings", default=True)):
+        return
+    before = draft.data.get("capsules", {})
+    draft.data["capsules"] = before | {link.name: 1 for link in links}
+    try:
+        Robot.from_config(draft.config())
+    except Q2R2Error as error:
+        draft.notes.append(f"no capsules around drawings: {error}")
+        draft.data["capsules"] = before
+        return
+    draft.notes.append(f"{names}: drawn, without a collision shape, hence watched by capsules around the drawings")
 
 
 def _mount(draft: _Draft, distance: float | None, height: float | None, answers: RememberedAnswers) -> None:

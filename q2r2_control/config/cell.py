@@ -162,8 +162,13 @@ class Config(StrictModel):
     srdf: LocalPath | None = Field(
         None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it"
     )
-    capsules: dict[str, Annotated[int, Field(ge=2, le=4)]] = Field(
-        default_factory=dict, description="links of whose meshes each becomes so many capsules at most; others: one"
+    capsules: dict[str, Annotated[int, Field(ge=1, le=4)]] = Field(
+        default_factory=dict,
+        description="links of whose meshes each becomes so many capsules at most, or of whose drawings where a link "
+        "has no collision shape; others: one",
+    )
+    unchecked_links: tuple[str, ...] = Field(
+        (), description="links without a collision shape that nothing keeps off anything"
     )
     supervision: SupervisionSettings = SupervisionSettings()
     loop_rate_hz: _LoopRate = Field(
@@ -267,7 +272,7 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
         config = validated(Config, "", content, as_json=True, strict=True, context={"folder": folder})
         return _within_driver_limits(config)
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise error.at(f"{path}: ") from error
     except (ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
 

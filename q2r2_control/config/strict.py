@@ -6,6 +6,7 @@ from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import Any, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Tag, ValidationError
+from pydantic_core import ErrorDetails
 
 from q2r2_control.errors import ConfigError, shown
 
@@ -24,7 +25,7 @@ class StrictModel(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise ConfigError(f"{type(self).__name__}: {first_fault(error, type(self))}") from error
+            raise config_error(error, type(self)).at(f"{type(self).__name__}: ") from error
 
     @classmethod
     def model_validate(cls, obj: Any, **options: Any) -> Self:
@@ -52,28 +53,37 @@ def validated(model: type[Model], where: str, values: object, *, as_json: bool =
     try:
         made: Model = (validator.validate_json if as_json else validator.validate_python)(values, **options)
     except ValidationError as error:
-        raise ConfigError(f"{where}{first_fault(error, model)}") from error
+        raise config_error(error, model).at(where) from error
     return made
 
 
-def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
-    """One line about the first fault in a ``model``: key, value, what is allowed, and how many more there are."""
+def config_error(error: ValidationError, model: type[BaseModel]) -> ConfigError:
+    """All faults in a ``model``; the message is that of the first one, and says how many more there are."""
     # A misspelt key leaves others missing or empty; the misspelling says more.
-    faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
-    fault = faults[0]
+    found = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
+    # A value that none of several kinds fits has a fault for each of them.
+    faults = list({key: _line(key, fault, model) for fault in reversed(found) for key in [_key(fault)]}.values())[::-1]
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return ConfigError(faults[0] + more, faults)
+
+
+def _key(fault: ErrorDetails) -> str:
     # In brackets stand notes of pydantic: "[key]", and tags of models among which a key's value is one.
     key = ".".join(str(part) for part in fault["loc"] if not str(part).startswith("["))
-    key = " ".join(key.split())[:300] or "(top level)"
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return " ".join(key.split())[:300] or "(top level)"
+
+
+def _line(key: str, fault: ErrorDetails, model: type[BaseModel]) -> str:
+    """One line about a ``fault`` in a ``model``: key, value, and what is allowed."""
     if fault["type"] == "missing":
-        return f"{key}: missing, and has no default{more}"
+        return f"{key}: missing, and has no default"
     allowed = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
         allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1], model))}"
     # Of a whole block the text says itself which of its keys do not go together.
     is_block = fault["type"] == "value_error" and isinstance(fault["input"], dict)
     value = "" if is_block else f" = {shown(fault['input'])}"
-    return f"{key}{value}: {allowed}{more}"
+    return f"{key}{value}: {allowed}"
 
 
 def _keys_at(location: tuple[int | str, ...], root: type[BaseModel]) -> list[str]:

@@ -31,6 +31,7 @@ from q2r2_control.pipeline.target_lead import TargetLead
 from q2r2_control.plants.base import Plant, SessionPlant, check_mode, check_state, make_plant
 from q2r2_control.process.scheduling import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.turns import TurnCounter
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import RunStart, Tick
 from q2r2_control.supervision.joint_watch import watch_settings
@@ -296,6 +297,8 @@ class Pipeline(RequestedRun):
         self.plant.reset()
         self._state = check_state(self.plant.state(), self.robot)  # The newest measured state.
         self._clock = self.make_clock(realtime)
+        self._turns = TurnCounter(self.robot)
+        self._turns.counted(self._state.q, self._clock.now)
         if realtime and self._rested_since is not None:
             self.controller.pass_time(self._clock.now - self._rested_since)
         self._start = RunStart(self._clock.now, self._state)
@@ -359,7 +362,7 @@ class Pipeline(RequestedRun):
         braked, dt = (0.0, self.loop.pace(gap)) if self._sessions is None else self._sessions.due(now)
         began = time.perf_counter()
         samples = self._operator.poll(now) if self._following else []
-        state = self._state = self.plant.state()
+        state = self._state = self._turns.of_state(self.plant.state(), now)
         seen, passed = self._plant_clock.stamped(state, now)
         lost = None if self._sessions is None else self._sessions.fault()
         self.loop.observe(seen, now, passed, lost)

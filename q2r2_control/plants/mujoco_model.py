@@ -30,9 +30,9 @@ from q2r2_control.plants.scene import (
     let_objects_yield,
     set_obstacles,
 )
+from q2r2_control.robot.followers import Follower, followers_of
 from q2r2_control.robot.pairs import ENVELOPE, link_of, pair_names
 from q2r2_control.robot.robot import Robot
-from q2r2_control.robot.urdf_parts import mimic_of
 
 # Least viscous friction [Nm s/rad]: it keeps light wrist joints steady.
 _MIN_DAMPING = 0.2
@@ -185,15 +185,13 @@ def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
             servo.set_to_position(kp=stiffness, dampratio=1.0)
             servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             servo.forcerange = (-gripper.force, gripper.force)
-        couplings = dict.fromkeys(names[1:], (names[0], 1.0, 0.0))  # follower -> leader, multiplier, offset
-        for joint in robot_urdf.iterfind("joint"):
-            mimic, name = mimic_of(joint), joint.get("name", "")
-            if mimic is not None and mimic[0] in names and name not in names:
-                couplings[name] = mimic
-        for name, (leader, multiplier, offset) in couplings.items():
-            coupling = spec.add_equality(name=f"{name}_coupling", name1=name, name2=leader)
+        couplings = dict.fromkeys(names[1:], Follower(names[0], 1.0, 0.0))
+        followers = followers_of(robot_urdf.findall("joint"), driven=names)
+        couplings |= {name: one for name, one in followers.items() if one.driver in names}
+        for name, follower in couplings.items():
+            coupling = spec.add_equality(name=f"{name}_coupling", name1=name, name2=follower.driver)
             coupling.type, coupling.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
-            coupling.data[:5] = (offset, multiplier, 0, 0, 0)
+            coupling.data[:5] = (follower.offset, follower.multiplier, 0, 0, 0)
         moved = [names[0], *couplings]
         for name in moved:
             for geom in spec.joint(name).parent.geoms:

@@ -19,16 +19,17 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import ArmAssembly, Model, check_position, load_model
 from q2r2_control.robot.description import LinkTree
 from q2r2_control.robot.floor import FLOOR, floor_link
-from q2r2_control.robot.pairs import KnownParts, exclusions_of_file
+from q2r2_control.robot.followers import followers_of, with_followers
+from q2r2_control.robot.pairs import KnownParts, exclusions_of_file, links_that_follow
 from q2r2_control.robot.pinocchio_models import joint_origin, lock_joints, resting_position
 from q2r2_control.robot.urdf_parts import (
     WORLD,
     fixed_joint,
-    mimic_of,
     name_shapes,
     obstacle_link,
     renamed_exclusions,
     set_acceleration_limit,
+    shape_from_drawings,
 )
 from q2r2_control.types import SIDES
 
@@ -80,12 +81,15 @@ def compose(config: Config) -> ComposedCell:
         srdf.extend(arm.mounted_exclusions())
     _check_apart(urdf)
     home = _home(urdf, arms)
+    of_arms = [arm.name_in_cell(joint.get("name", "")) for arm in arms.values() for joint in arm.joints]
+    following = links_that_follow(LinkTree(urdf, config.name), of_arms)
     resting = {} if config.robot is None else config.robot.home
     _check_resting(urdf, resting, home)
     lock_joints(urdf, home, _locked_at(urdf, home | resting))
     for arm in arms.values():
         for name, limit in arm.acceleration_limits().items():
             set_acceleration_limit(next(joint for joint in urdf.findall("joint") if joint.get("name") == name), limit)
+    shape_from_drawings(urdf.findall("link"), config.capsules)
     name_shapes(urdf.findall("link"))
     for name, obstacle in config.obstacles.items():
         _check_obstacle_name(name, urdf)
@@ -114,6 +118,7 @@ def compose(config: Config) -> ComposedCell:
             tool_links={side: arm.tool_links() for side, arm in arms.items()},
             obstacles=(*config.obstacles, *([] if config.floor is None else [FLOOR])),
             capsules=config.capsules,
+            following=following,
         ),
     )
 
@@ -143,10 +148,8 @@ def _home(urdf: ET.Element, arms: Mapping[str, ArmAssembly]) -> dict[str, float]
                 raise ConfigError(f"{arm.key}: joint {name} is one of {owner[name]} as well; allowed: one arm a joint")
             home[name], owner[name] = position, arm.key
         fingers |= set(arm.finger_names())
-    for follower in urdf.findall("joint"):
-        if (mimic := mimic_of(follower)) is not None and mimic[0] in fingers:
-            home.setdefault(follower.get("name", ""), mimic[1] * home[mimic[0]] + mimic[2])
-    return home
+    followers = followers_of(urdf.findall("joint"), driven=home)
+    return with_followers(home, {name: one for name, one in followers.items() if one.driver in fingers})
 
 
 def _check_resting(urdf: ET.Element, resting: Mapping[str, float], home: Mapping[str, float]) -> None:
@@ -161,11 +164,9 @@ def _check_resting(urdf: ET.Element, resting: Mapping[str, float], home: Mapping
 def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]:
     """Position of every joint: as ``given``, as its mimic says, or as near 0 as allowed."""
     joints = urdf.findall("joint")
-    at = {joint.get("name", ""): resting_position(joint) for joint in joints} | dict(given)
-    for joint in joints:
-        if (mimic := mimic_of(joint)) is not None and joint.get("name") not in given:
-            at[joint.get("name", "")] = mimic[1] * at.get(mimic[0], 0.0) + mimic[2]
-    return at
+    followers = followers_of(joints, driven=given)
+    resting = {name: resting_position(joint) for joint in joints if (name := joint.get("name", "")) not in followers}
+    return with_followers(resting | dict(given), followers)
 
 
 def _check_apart(urdf: ET.Element) -> None:

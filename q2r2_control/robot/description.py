@@ -14,6 +14,7 @@ from pathlib import Path
 
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.robot.followers import narrow_limits
 from q2r2_control.robot.packages import expand_xacro, package_file
 from q2r2_control.robot.urdf_forms import notes_on, scale_to_metres, unify
 from q2r2_control.robot.urdf_parts import ATTRIBUTES
@@ -117,8 +118,9 @@ def parse_urdf(
     """Parse a URDF, check that it is one tree with unique names and finite numbers, and make mesh paths absolute.
 
     Continuous joints become revolute ones with :data:`CONTINUOUS_RANGE` each way, since the controller's guarantees
-    need a bound. ``where`` names the text in errors, ``folder`` is what relative mesh paths start from, ``packages``
-    has folders of ``package://`` by name. Raises :class:`RobotError`.
+    need a bound. Joints that others follow go as far as these may follow. ``where`` names the text in errors,
+    ``folder`` is what relative mesh paths start from, ``packages`` has folders of ``package://`` by name. Raises
+    :class:`RobotError`.
     """
     root = parse_srdf(text, where)  # both begin alike
     _check_numbers(root, where)
@@ -141,6 +143,7 @@ def parse_urdf(
             limit.set("lower", repr(-CONTINUOUS_RANGE))
             limit.set("upper", repr(CONTINUOUS_RANGE))
     LinkTree(root, where)
+    narrow_limits(root.findall("joint"), f"{where}: ")
     for mesh in root.iter("mesh"):
         mesh.set("filename", _mesh_file(mesh.get("filename", ""), where, folder, packages or {}))
     return root
@@ -257,6 +260,10 @@ def _check_joint(joint: ET.Element, links: set[str], where: str) -> None:
     direction = [float(part) for part in ("" if axis is None else axis.get("xyz", "")).split()]
     if kind != "fixed" and direction and math.hypot(*direction) < _SHORTEST_AXIS:
         raise RobotError(f"{where}: joint {name} has axis {direction}; allowed: a direction")
+    lower, upper = joint_limits(joint)
+    if kind in ("revolute", "prismatic") and lower > upper:
+        limits = f"position limits {lower:g} .. {upper:g}"
+        raise RobotError(f"{where}: joint {name} has {limits}; allowed: lower below upper")
 
 
 def _example_robot(name: str) -> tuple[Path, Path | None]:

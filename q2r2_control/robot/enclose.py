@@ -39,15 +39,16 @@ _SLABS = 12  # of equal height, which the capsules of a mesh share
 def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | None = None) -> None:
     """Replace in place every shape that is not a capsule, a sphere or a box fixed in the world; names and pairs stay.
 
-    ``capsules`` has links of whose meshes each becomes that many capsules at most. The first one has the mesh's name,
-    the others follow all shapes, as further ones of their link. Raises :class:`RobotError` for a shape without extent
-    or without bounds, and :class:`ConfigError` for a link in ``capsules`` that has no mesh.
+    ``capsules`` has links of whose meshes each becomes that many capsules at most; 1 is for other shapes too. The
+    first one has the mesh's name, the others follow all shapes, as further ones of their link. Raises
+    :class:`RobotError` for a shape without extent or without bounds, and :class:`ConfigError` for a link in
+    ``capsules`` that has no mesh.
     """
     capsules = capsules or {}
     numbers = Counter(link_of(item.name) for item in geometry.geometryObjects)
     meshes = {link_of(one.name) for one in geometry.geometryObjects if isinstance(one.geometry, coal.BVHModelBase)}
-    for link in capsules:
-        if link not in meshes:
+    for link, count in capsules.items():
+        if link not in (meshes if count > 1 else numbers):
             allowed = ", ".join(sorted(meshes)) or "none in this cell"
             raise ConfigError(f"capsules.{link!s:.60}: no link with a mesh; allowed: {allowed}")
     more = []
@@ -104,7 +105,9 @@ def _cached_capsule(found: bytes) -> Capsule:
     points = _corners(np.frombuffer(found).reshape(-1, 3))
     centre = points.mean(axis=0)
     scale = max(float(np.abs(points - centre).max()), 1e-9)
-    frame, view = _best_view(points - centre, np.linalg.svd(points - centre, full_matrices=True)[2], scale)
+    # Full matrices only where fewer points than axes leave some out: of n points they are n x n.
+    axes = np.linalg.svd(points - centre, full_matrices=len(points) < 3)[2]
+    frame, view = _best_view(points - centre, axes, scale)
     options = {"maxiter": 600, "xatol": 1e-4, "fatol": 1e-5}
     start = _start(view)
     result = minimize(lambda x: _volume(*_fit(view, x)), start, method="Nelder-Mead", options=options)

@@ -17,10 +17,10 @@ import pinocchio as pin
 
 from q2r2_control.robot.description import LinkTree, joint_end, joint_limits
 from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
+from q2r2_control.robot.followers import Follower, followers_of
 from q2r2_control.robot.pairs import KnownParts, link_of, links_moved_by
 from q2r2_control.robot.pinocchio_models import joint_axis
 from q2r2_control.robot.turning_fingers import FingerJoint, TurningBody, TurningSweeps
-from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 
@@ -142,11 +142,12 @@ def _finger_joint(
     the joint that it follows is at the end of its travel.
     """
     name = joint.get("name", "")
-    driver, multiplier, offset = _driver(tree, joint, driven if stroke is not None else ())
-    lower, upper = joint_limits(driver)
+    followers = followers_of(tree.joint_to.values(), driven if stroke is not None else ())
+    followed = followers.get(name, Follower(name, 1.0, 0.0))
+    lower, upper = joint_limits(next(one for one in tree.joint_to.values() if one.get("name") == followed.driver))
     closed, opened = (lower, upper) if stroke is None else stroke
     ends = closed, opened, *((lower, upper) if opened >= closed else (upper, lower))
-    closed, opened, before, beyond = (multiplier * end + offset for end in ends)
+    closed, opened, before, beyond = map(followed.at, ends)
     placement = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)].placement
     axis: Array = placement.rotation @ joint_axis(joint)
     return FingerJoint(
@@ -158,23 +159,8 @@ def _finger_joint(
         open=opened,
         before=before,
         beyond=beyond,
-        driver=driver.get("name", ""),
+        driver=followed.driver,
     )
-
-
-def _driver(tree: LinkTree, joint: ET.Element, driven: Collection[str]) -> tuple[ET.Element, float, float]:
-    """The joint that another one follows in the end, itself if none, and multiplier and offset of its position.
-
-    A joint that the gripper drives is its own driver, whatever it mimics.
-    """
-    movable, multiplier, offset, seen = tree.movable(), 1.0, 0.0, {joint.get("name", "")}
-    while joint.get("name", "") not in driven and (mimic := mimic_of(joint)) is not None:
-        leader, by, beside = mimic
-        if leader not in movable or leader in seen:
-            break
-        seen.add(leader)
-        joint, multiplier, offset = movable[leader], multiplier * by, offset + multiplier * beside
-    return joint, multiplier, offset
 
 
 def _ends(item: pin.GeometryObject) -> Array:

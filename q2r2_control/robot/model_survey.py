@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.arm_chain import arm_ends, default_tip, end_of
 from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits
 from q2r2_control.robot.enclose import Capsule, capsules_around, enclose_shapes
+from q2r2_control.robot.followers import Follower, followers_of, with_followers
 from q2r2_control.robot.pairs import link_of, links_moved_by
 from q2r2_control.robot.pinocchio_models import read_models
 from q2r2_control.robot.urdf_parts import mimic_of
@@ -105,7 +106,8 @@ def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, 
     enclose_shapes(geometry)
     moved = links_moved_by(tree, driven)
     shapes = [item for item in geometry.geometryObjects if link_of(item.name) in moved]
-    spans = [_span(model, shapes, last.get("name", ""), beyond, driven, end) for end in ends]
+    followers = followers_of(tree.joint_to.values(), driven)
+    spans = [_span(model, shapes, last.get("name", ""), beyond, driven, followers, end) for end in ends]
     closed, opened = ends if spans[0] < spans[1] else ends[::-1]
     limit = beyond[driven[0]].find("limit")
     speed, force = (0.0 if limit is None else float(limit.get(what, "0")) for what in ("velocity", "effort"))
@@ -124,22 +126,23 @@ def _span(
     axis_joint: str,
     beyond: dict[str, ET.Element],
     driven: Sequence[str],
+    followers: Mapping[str, Follower],
     end: float,
 ) -> float:
     """Mean distance of the fingers from the axis of the arm's last joint [m]."""
     q, data = pin.neutral(model), model.createData()
-    for name, joint in beyond.items():
-        leader, by, beside = mimic_of(joint) or (name, 1.0, 0.0)
-        if leader in driven and model.joints[index := model.getJointId(name)].nq == 1:
-            q[model.joints[index].idx_q] = by * end + beside
+    places = with_followers(dict.fromkeys(driven, end), followers)
+    for name in beyond:
+        if name in places and model.joints[index := model.getJointId(name)].nq == 1:
+            q[model.joints[index].idx_q] = places[name]
     pin.forwardKinematics(model, data, q)
     last = model.getJointId(axis_joint)
     along = pin.computeJointJacobian(model, data, q, last)[:, model.joints[last].idx_v][3:]
     axis = data.oMi[last].rotation @ along
     moved = {model.getJointId(name) for name in beyond}
-    places = [data.oMi[item.parentJoint].act(item.placement.translation) for item in shapes]
-    places = places or [data.oMi[joint].translation for joint in moved]
-    levers = [place - data.oMi[last].translation for place in places]
+    points = [data.oMi[item.parentJoint].act(item.placement.translation) for item in shapes]
+    points = points or [data.oMi[joint].translation for joint in moved]
+    levers = [point - data.oMi[last].translation for point in points]
     return float(np.mean([np.linalg.norm(lever - (lever @ axis) * axis) for lever in levers]))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import combinations
@@ -15,6 +15,7 @@ from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.description import LinkTree, joint_end, parse_srdf
+from q2r2_control.robot.followers import followers_of
 from q2r2_control.types import Array
 
 
@@ -37,6 +38,7 @@ class KnownParts:
     obstacles: tuple[str, ...] = ()  # links
     strokes: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # finger joints closed and open [m or rad]
     capsules: Mapping[str, int] = field(default_factory=dict)  # of each mesh, at most, by link; else one
+    following: Mapping[str, str] = field(default_factory=dict)  # joint of an arm that a link beside it follows, by link
 
     @classmethod
     def carried_by(cls, tree: LinkTree, chains: Mapping[str, Sequence[str]]) -> KnownParts:
@@ -51,7 +53,8 @@ class KnownParts:
             )
             for arm, link in last.items()
         }
-        return cls(fingers, {arm: tuple(sorted(hand_links(tree, joints))) for arm, joints in fingers.items()})
+        hands = {arm: tuple(sorted(hand_links(tree, joints))) for arm, joints in fingers.items()}
+        return cls(fingers, hands, following=links_that_follow(tree, of_arms))
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,14 +80,19 @@ def roles_of(tree: LinkTree, own_links: Mapping[str, set[str]], parts: KnownPart
 
 
 def links_moved_by(tree: LinkTree, joints: Iterable[str]) -> set[str]:
-    """Links that ``joints``, or joints that mimic one of them, carry."""
+    """Links that ``joints``, or joints that follow one of them, carry."""
     named = set(joints)
-    moved = {
-        child
-        for child, joint in tree.joint_to.items()
-        if named & {joint.get("name"), *(mimic.get("joint") for mimic in joint.findall("mimic"))}
-    }
+    followers = followers_of(tree.joint_to.values(), driven=named)
+    named |= {name for name, one in followers.items() if one.driver in named}
+    moved = {child for child, joint in tree.joint_to.items() if joint.get("name") in named}
     return {link for link in tree.joint_to if moved & set(tree.path(link))}
+
+
+def links_that_follow(tree: LinkTree, joints: Collection[str]) -> dict[str, str]:
+    """Links of parts beside an arm, such as the bars of a parallelogram, each with the one of ``joints`` it follows."""
+    followers = followers_of(tree.joint_to.values(), driven=joints)
+    beside = {name: one.driver for name, one in followers.items() if one.driver in joints}
+    return {link: driver for name, driver in beside.items() for link in sorted(links_moved_by(tree, [name]))}
 
 
 def hand_links(tree: LinkTree, finger_joints: Iterable[str]) -> set[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,10 +19,11 @@ from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.cell_parts import check_position
 from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.compose import compose
-from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
+from q2r2_control.robot.description import CONTINUOUS_RANGE, LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.finger_bodies import sweep_fingers
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
+from q2r2_control.robot.followers import followers_of, with_followers
 from q2r2_control.robot.held_objects import HeldObjects, held_objects
 from q2r2_control.robot.near_pairs import warning_at_home
 from q2r2_control.robot.pairs import (
@@ -37,6 +38,7 @@ from q2r2_control.robot.pairs import (
 )
 from q2r2_control.robot.pinocchio_models import build_models, checked_chain
 from q2r2_control.robot.turning_fingers import TurningBody
+from q2r2_control.robot.unchecked import unchecked_faults
 from q2r2_control.robot.urdf_parts import acceleration_limit
 from q2r2_control.types import Array
 
@@ -89,9 +91,12 @@ class Robot:
             arrays of joints, and ``tool_frame``, the name of its tool's link.
         home: Joint positions at which the cell starts (nv,) [rad].
         position_lower: The model's limits (nv,) [rad]; ``position_upper`` likewise.
+        endless: Whether each joint turns on for ever (nv,).
         velocity_limit: The model's limits (nv,) [rad/s].
         torque_limit: The model's limits (nv,) [Nm].
         urdf: The whole cell as a text.
+        following_links: By link, the arm's joint that a link beside the arm follows; it is watched where it is at home.
+        unchecked_links: Names of links without a collision shape that nothing keeps off anything, by the maker's will.
     """
 
     def __init__(
@@ -102,6 +107,7 @@ class Robot:
         home: Mapping[str, float],
         where: str,
         parts: KnownParts | None = None,
+        unchecked_links: Collection[str] = (),
     ) -> None:
         tree = LinkTree(urdf, where)
         chains = {name: checked_chain(tree, name, frame, where) for name, frame in tool_frames.items()}
@@ -124,6 +130,8 @@ class Robot:
         self.home: Array = np.array([home[joint] for joint in self.joint_names])
         self.position_lower: Array = self.model.lowerPositionLimit.copy()
         self.position_upper: Array = self.model.upperPositionLimit.copy()
+        # A continuous joint is known by the range that a model without limits gets, see description.parse_urdf.
+        self.endless = (self.position_lower <= -CONTINUOUS_RANGE) & (self.position_upper >= CONTINUOUS_RANGE)
         self.velocity_limit: Array = self.model.velocityLimit.copy()
         self.torque_limit: Array = self.model.effortLimit.copy()
         joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}
@@ -142,6 +150,12 @@ class Robot:
             self.arms[name] = replace(arm, finger_way=max(ways, default=0.0) or arm.stroke)
         self.ignored_pairs = self._monitor(tree, exclusions, list(own_links.values()))
         self.objects = HeldObjects(self.collision_model, {}, ())
+        self.following_links: dict[str, str] = dict(parts.following)
+        self.unchecked_links: tuple[str, ...] = tuple(unchecked_links)
+        for link in self.unchecked_links:
+            if link != tree.root and link not in tree.joint_to:
+                links = ", ".join([tree.root, *tree.joint_to])
+                raise RobotError(f"{where}: unchecked_links: no link {link!r:.60}; links: {links}")
         self._data: pin.Data = self.model.createData()
         self._distances = CoalDistances(self.model, self.collision_model)
 
@@ -151,7 +165,8 @@ class Robot:
         check_kind("config", config, Config, "a Config, as load_config returns")
         cell = compose(config)
         urdf = parse_urdf(cell.urdf, cell.name)
-        robot = cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name, cell.parts)
+        exclusions, unchecked = parse_srdf(cell.srdf, cell.name), config.unchecked_links
+        robot = cls(urdf, exclusions, cell.tool_frames, cell.home, cell.name, cell.parts, unchecked)
         robot._add_objects(config)
         robot._check_operators_frames(config)
         return robot
@@ -163,6 +178,7 @@ class Robot:
         arms: Mapping[str, str],
         srdf: str | os.PathLike[str] | None = None,
         home: Mapping[str, float] | None = None,
+        unchecked_links: Collection[str] = (),
     ) -> Robot:
         """A robot from any URDF, given as file or text.
 
@@ -171,7 +187,8 @@ class Robot:
         positions by joint [rad or m]; other joints are at 0, or in the middle of their range where 0 is outside.
         ``srdf`` (file or text) says which pairs need no watching; without one, links of one arm that overlap at home
         are taken to overlap by construction. Pairs at home that would hold the arm up, or overlap there only, are
-        named in a warning. Raises :class:`RobotError`.
+        named in a warning. ``unchecked_links`` names links without a collision shape that nothing shall keep off
+        anything. Raises :class:`RobotError`, also for a link that weighs something, has no shape and is not named.
         """
         text, where, folder = _text_of(path_or_xml, "URDF text")
         urdf = parse_urdf(text, where, folder)
@@ -183,7 +200,10 @@ class Robot:
         if len(set(arms.values())) < len(arms):
             raise RobotError(f"{where}: arms = {shown(arms, 200)}: allowed: a tool frame of its own for each arm")
         positions = _home_of(urdf, home or {}, where)
-        robot = cls(urdf, exclusions, dict(arms), positions, where)
+        check_kind("unchecked_links", unchecked_links, (list, tuple, set, frozenset), "names of links", RobotError)
+        robot = cls(urdf, exclusions, dict(arms), positions, where, unchecked_links=unchecked_links)
+        if faults := unchecked_faults(robot, in_cell=False):
+            raise RobotError(f"{where}: {'; '.join(faults)}")
         if (warning := warning_at_home(robot, exclusions, positions)) is not None:
             _logger.warning(warning)
         return robot
@@ -309,8 +329,13 @@ def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[s
         except ConfigError as error:
             raise RobotError(f"{where}: {error}") from None
     limits = {name: joint_limits(joint) for name, joint in joints.items()}
-    usual = {name: 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2 for name, (lower, upper) in limits.items()}
-    return usual | {name: float(position) for name, position in given.items()}
+    followers = followers_of(urdf.findall("joint"), driven=given)
+    usual = {
+        name: 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2
+        for name, (lower, upper) in limits.items()
+        if name not in followers
+    }
+    return with_followers(usual | {name: float(position) for name, position in given.items()}, followers)
 
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:

@@ -6,7 +6,7 @@ import copy
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from q2r2_control.config.arms import PoseConfig
 from q2r2_control.config.cell import ObstacleConfig
@@ -37,6 +37,15 @@ def renamed_exclusions(parts: Sequence[ET.Element], name_of: Callable[[str], str
         for attribute in naming[part.tag]:
             part.set(attribute, name_of(part.get(attribute, "")))
     return found
+
+
+def shape_from_drawings(links: Sequence[ET.Element], names: Collection[str]) -> None:
+    """Give each link called by one of ``names`` that has no collision shape those of its drawing."""
+    for link in links:
+        if link.get("name") in names and link.find("collision") is None:
+            for drawing in link.findall("visual"):
+                shape = ET.SubElement(link, "collision")
+                shape.extend(copy.deepcopy(part) for part in drawing if part.tag in ("origin", "geometry"))
 
 
 def name_shapes(links: Sequence[ET.Element]) -> None:

@@ -17,6 +17,7 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import joints_that_cannot_hold
+from q2r2_control.robot.unchecked import unchecked_faults
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.types import Array, Reference
 
@@ -261,8 +262,8 @@ def preflight_faults(
 ) -> tuple[str, ...]:
     """Return one line for each reason why the robot should not start at home; empty if the cell may run.
 
-    The home posture is checked against position limits with their margin, torque limits under gravity, and the distance
-    that every monitored pair keeps.
+    Every link with a mass needs a shape, unless the cell names it. The home posture is checked against position limits
+    with their margin, torque limits under gravity, and the distance that every monitored pair keeps.
 
     Args:
         robot: The robot.
@@ -272,13 +273,7 @@ def preflight_faults(
     """
     lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
     change = "to change: control.position_margin, or a fixed joint in the model"
-    # The index of a joint in Pinocchio's model is one more than its index in vectors, because the world comes first.
-    shaped = {item.parentJoint - 1 for item in robot.collision_model.geometryObjects}
-    faults = [
-        f"{name} arm: no link between its base and its tool has a collision shape; allowed: a model with <collision>"
-        for name, arm in robot.arms.items()
-        if not shaped & set(arm.joints[:-1].tolist())  # The last joint moves only the tool.
-    ]
+    faults = unchecked_faults(robot)
     faults += [
         f"{name}: position_margin leaves {max(left, 0.0):g} rad of its range; {change}"
         for name, left in zip(robot.joint_names, upper - lower, strict=True)

@@ -10,8 +10,8 @@ import numpy as np
 import pinocchio as pin
 import trimesh
 
+from q2r2_control.robot.followers import followers_of
 from q2r2_control.robot.pairs import ENVELOPE, link_of
-from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.shown_robot import ShownRobot
 
@@ -30,10 +30,12 @@ class JointTree:
         for arm, config in shown.config.arms.items():
             joints = [self._index[name] for name in shown.fingers[arm]]
             self._strokes[arm] = joints, config.gripper.closed_position, config.gripper.open_position
-        self._mimics = [
-            (self._index[joint.get("name", "")], self._index[mimic[0]], *mimic[1:])
-            for joint in ET.fromstring(shown.urdf).findall("joint")
-            if (mimic := mimic_of(joint)) is not None and joint.get("name") in self._index
+        driven = [joint for joints in shown.fingers.values() for joint in joints]
+        followers = followers_of(ET.fromstring(shown.urdf).findall("joint"), driven)
+        self._followers = [
+            (self._index[name], self._index[one.driver], one)
+            for name, one in followers.items()
+            if name in self._index and one.driver in self._index
         ]
         visual, solid = (
             pin.buildGeomFromUrdfString(self.model, shown.urdf, kind)
@@ -53,8 +55,8 @@ class JointTree:
         full[self._arms] = q
         for arm, (joints, closed, opened) in self._strokes.items():
             full[joints] = closed + openings.get(arm, 1.0) * (opened - closed)
-        for joint, leader, factor, offset in self._mimics:
-            full[joint] = factor * full[leader] + offset
+        for joint, driver, follower in self._followers:
+            full[joint] = follower.at(full[driver])
         return full
 
     def meshes(self) -> Iterator[tuple[int, Colour, trimesh.Trimesh]]:

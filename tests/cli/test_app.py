@@ -49,7 +49,7 @@ def test_the_version_is_that_of_the_installed_package() -> None:
         (("export", "mcap", "recordings", "--output", "out"), "export mcap: allowed: lerobot"),
         (("headset-check", "--host", "no such host"), "no such host"),
         (("headset-check", "--duration", "inf"), "--duration inf"),
-        (("check", "pyproject.toml"), "pyproject.toml"),
+        (("check", "pyproject.toml", "--pairs", "out.srdf"), "pyproject.toml"),
         (("bench", "--work", "--motion", "dance"), "motion 'dance': allowed: carry-"),
         (("bench", "--motion", "meet"), "needs --work"),
         *(

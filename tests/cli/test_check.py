@@ -65,6 +65,53 @@ def test_check_refuses_arms_that_a_run_refuses(tmp_path: Path, pattern: str, new
     assert fault in ran.stderr
 
 
+def test_a_heavy_link_without_a_shape_is_a_fault_until_the_cell_names_it(tmp_path: Path) -> None:
+    cell = other_arms(tmp_path, r'<collision name="link_3.*?</collision>', "")
+    checked, ran = q2r2("check", cell), q2r2("run", cell, "--fast", "--headless", "--duration", "0.1")
+    says = "_link_3: weighs 3.39 kg and has no collision shape"
+    assert (checked.exit_code, ran.exit_code) == (1, 2)
+    assert f"FAULT left{says}" in checked.stdout
+    assert "FAULT right" in checked.stdout
+    assert f"left{says}" in ran.stderr
+    assert checked.stdout.endswith("\nthis cell cannot run: 2 faults\n")
+    text = Path(cell).read_text(encoding="utf-8")
+    Path(cell).write_text(text.replace("unchecked_links: []", "unchecked_links: [left_link_3, right_link_3]"))
+    named = q2r2("check", cell)
+    assert (named.exit_code, "FAULT" in named.stdout) == (0, False)
+    assert "NOTE unchecked_links: nothing keeps left_link_3, right_link_3 off anything\n" in named.stdout
+
+
+def test_check_and_run_list_everything_that_is_wrong_in_a_file(tmp_path: Path) -> None:
+    (file := tmp_path / "cell.yaml").write_text(
+        "name: cell\narms: {left: {model: iiwa7, home: [0, 0, 0, 0, 0, 0, up]}}\nfloor: low\n"
+        "control: {solvr: daqp, min_distance: -1}\n",
+        encoding="utf-8",
+    )
+    lines = [
+        f"q2r2: {file}: control.solvr = 'daqp': unknown key; allowed here: acceleration_limit, ",
+        f"q2r2: {file}: arms.left.home.6 = 'up': Input should be a valid number",
+        f"q2r2: {file}: floor = 'low': Input should be a valid number",
+        f"q2r2: {file}: control.min_distance = -1: Input should be greater than or equal to 0",
+    ]
+    checked, ran = q2r2("check", str(file)), q2r2("run", str(file), "--headless")
+    data = q2r2("check", str(file), "--json")
+    assert checked.exit_code == data.exit_code == ran.exit_code == 2
+    for result in (checked, ran):
+        said = result.stderr.splitlines()
+        assert len(said) == len(lines)
+        assert all(line.startswith(start) for line, start in zip(said, lines, strict=True)), said
+    assert checked.stdout == "this cell cannot run: 4 faults\n"
+    found = one_object(data.stdout)
+    assert [f"q2r2: {fault}"[: len(line)] for fault, line in zip(found["faults"], lines, strict=True)] == lines
+    assert found["verdict"] == "this cell cannot run: 4 faults"
+
+
+def test_a_model_that_cannot_be_read_has_a_verdict_too(tmp_path: Path) -> None:
+    result = q2r2("check", changed_cell(tmp_path, "model: iiwa7", "model: iiwa8"))
+    assert (result.exit_code, result.stdout) == (2, "this cell cannot run: 1 fault\n")
+    assert "iiwa8" in result.stderr
+
+
 def test_check_compiles_no_kernel(tmp_path: Path) -> None:
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
     command = [sys.executable, "-m", "q2r2_control", "check", CELL]

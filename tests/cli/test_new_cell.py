@@ -9,7 +9,7 @@ import pytest
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.robot.pairs import pair_names
+from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from tests.cli.command import one_object, q2r2
 
@@ -67,6 +67,18 @@ def test_links_without_masses_are_left_to_do() -> None:
     assert result.exit_code == 1
     assert "FAULT left arm: links that move without a mass, which simulation needs: link_1, link_2" in result.stdout
     assert "left to do" in result.stdout
+
+
+@pytest.mark.slow
+def test_links_that_are_drawn_and_have_no_shape_are_watched_by_capsules_around_their_drawings(tmp_path: Path) -> None:
+    Path("arm.urdf").write_text(re.sub(r'<collision name="link_3.*?</collision>', "", IIWA, flags=re.DOTALL))
+    result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
+    assert result.exit_code == 0, result.output
+    assert "NOTE left_link_3: drawn, without a collision shape, hence watched by capsules" in result.stdout
+    cell = load_config(tmp_path / "cell.yaml")
+    assert cell.capsules["left_link_3"] == 1
+    watched = {link_of(name) for pair in pair_names(Robot.from_config(cell).collision_model) for name in pair}
+    assert "left_link_3" in watched
 
 
 @pytest.mark.slow

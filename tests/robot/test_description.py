@@ -34,6 +34,11 @@ ENDS = '<parent link="base"/><child link="tip"/>'
         ('radius="0.1"', 'radius="-0.1"', "more than 0"),
         ('xyz="0 0 1"', 'xyz="0 1"', "3 finite number"),
         ('xyz="0 0 1"', 'xyz="0 0 0"', "axis"),
+        (
+            'lower="-1" upper="1"',
+            'lower="1" upper="-1"',
+            "joint turn has position limits 1 .. -1; allowed: lower below",
+        ),
         ('value="1"', 'value="-1"', "0 or more"),
         ("<axis", '<mimic joint="turn" multiplier="twice"/><axis', "multiplier = 'twice'"),
         ("<sphere", "<ball", "ball"),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -218,11 +219,25 @@ def test_a_cell_watches_each_capsule_of_a_link() -> None:
         ({"forearm_link": 2}, "capsules.forearm_link: no link with a mesh; allowed: left_base_link, left_forearm_link"),
         ({"left_ee_link": 2}, "capsules.left_ee_link: no link with a mesh"),
         ({"left_forearm_link": 5}, "capsules.left_forearm_link = 5"),
-        ({"left_forearm_link": 1}, "capsules.left_forearm_link = 1"),
+        ({"left_forearm_link": 0}, "capsules.left_forearm_link = 0"),
+        ({"left_elbow": 1}, "capsules.left_elbow: no link with a mesh"),
     ],
-    ids=["no link of the cell", "a box", "too many", "one, which is usual"],
+    ids=["no link of the cell", "a box", "too many", "none", "one, of no link of the cell"],
 )
 def test_capsules_that_cannot_be_are_refused(capsules: dict[str, int], says: str) -> None:
     text = yaml.safe_dump(_ur5().model_dump(mode="json", exclude_unset=True) | {"capsules": capsules})
     with pytest.raises(ConfigError, match=re.escape(says)):
         Robot.from_config(parse_config(text, "cell.yaml"))
+
+
+def test_a_round_mesh_needs_memory_for_its_points_only() -> None:
+    points = np.random.default_rng(0).normal(size=(3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)  # all of them are corners
+    tracemalloc.start()
+    try:
+        radius, _, _ = enclosing_capsule(points)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert radius >= 0.999
+    assert peak < 20e6, "3000 x 3000 numbers are 72 MB"

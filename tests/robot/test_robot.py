@@ -105,8 +105,10 @@ def test_with_an_srdf_only_what_overlaps_everywhere_is_left_out() -> None:
     bent = _urdf(3).replace('xyz="0 0 0.3"', 'xyz="0 0 0.3" rpy="0 1 0"')
     touching_at_home, touching_always = bent.replace("0.1", "0.28"), bent.replace("0.1", "0.301")
     assert Robot.from_urdf(touching_at_home, {"left": "l3"}, srdf="<robot/>").ignored_pairs == ()
-    assert Robot.from_urdf(touching_at_home, {"left": "l3"}).ignored_pairs == (("l1_0", "l3_0"),)
-    assert Robot.from_urdf(touching_always, {"left": "l3"}, srdf="<robot/>").ignored_pairs == (("l1_0", "l3_0"),)
+    robot = Robot.from_urdf(touching_at_home, {"left": "l3"}, unchecked_links=["l3"])
+    assert robot.ignored_pairs == (("l1_0", "l3_0"),)
+    robot = Robot.from_urdf(touching_always, {"left": "l3"}, srdf="<robot/>", unchecked_links=["l3"])
+    assert robot.ignored_pairs == (("l1_0", "l3_0"),)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +122,7 @@ def test_with_an_srdf_only_what_overlaps_everywhere_is_left_out() -> None:
         pytest.param(_urdf(limit='lower="1" upper="-1" velocity="1" effort="1"'), "1 .. -1", id="limits swapped"),
         pytest.param(_urdf(kind="floating"), "joint j1 is floating", id="a floating joint in the arm"),
         pytest.param(
-            _urdf().replace("<axis", '<mimic joint="j1"/><axis', 1), "joint j1 is mimic", id="a mimic joint in the arm"
+            _urdf().replace("<axis", '<mimic joint="j2"/><axis', 1), "joint j1 is mimic", id="a mimic joint in the arm"
         ),
         pytest.param("arm.urdf", "neither XML nor a file", id="a file that is not there"),
     ],
@@ -145,8 +147,8 @@ def test_arms_that_the_urdf_does_not_have_are_refused(arms: dict[str, str], comp
         Robot.from_urdf(_urdf(), arms)
 
 
-def test_a_robot_without_collision_shapes_loads_and_watches_no_pair() -> None:
-    robot = Robot.from_urdf(BARE, {"left": "rod"})
+def test_a_robot_without_collision_shapes_whose_link_is_named_watches_no_pair() -> None:
+    robot = Robot.from_urdf(BARE, {"left": "rod"}, unchecked_links=["rod"])
     assert robot.distances(robot.home) == []
     assert robot.ignored_pairs == ()
 
@@ -154,7 +156,7 @@ def test_a_robot_without_collision_shapes_loads_and_watches_no_pair() -> None:
 @pytest.mark.slow
 def test_a_link_and_a_fixed_joint_may_have_one_name() -> None:
     file = load_description("example-robot-data:z1").file
-    robot = Robot.from_urdf(file, {"left": "gripperMover"})
+    robot = Robot.from_urdf(file, {"left": "gripperMover"}, unchecked_links=["link01", "link05"])
     assert robot.joint_names == (*(f"joint{number}" for number in range(1, 7)), "jointGripper")
     model = pin.buildModelFromUrdf(str(file))
     data = model.createData()

@@ -50,6 +50,7 @@ TIAGO: dict[str, Any] = {
     "name": "tiago",
     "robot": {"model": "example-robot-data:tiago_dual", "home": {"torso_lift_joint": 0.2}},
     "srdf": "tiago.srdf",
+    "unchecked_links": ["arm_left_7_link", "arm_right_7_link"],
     "arms": {
         side: {"tip": f"hand_{side}_grasping_frame", "home": [0.2, 0.5, 1.5, 1.6, 0.0, 0.0, 0.0]}
         for side in ("left", "right")

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from q2r2_control.config.strict import first_fault
+from q2r2_control.config.strict import config_error
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.messages import HandMessage, HandPose, MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, Reception
@@ -79,4 +79,4 @@ def read(message: str | bytes) -> PageMessage:
     try:
         return _MESSAGES.validate_json(message)
     except ValidationError as error:
-        raise ProtocolError(f"{message!r:.60} is no message of the page: {first_fault(error, PageMessage)}") from None
+        raise ProtocolError(f"{message!r:.60} is no message of the page: {config_error(error, PageMessage)}") from None

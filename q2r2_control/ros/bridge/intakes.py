@@ -21,6 +21,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.turns import TurnCounter
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.joint_outputs import joints_of
 from q2r2_control.ros.bridge.messages import (
@@ -189,6 +190,7 @@ class JointIntake:
         self._joint_names = list(robot.joint_names)
         self._publishers = Publishers(node, self._topics)
         self._values = np.zeros((3, len(robot.joint_names)))
+        self._turns = TurnCounter(robot)
         self.state: RobotState | None = None  # the newest of all arms
         self._own_names: set[str] = set()  # topics on which the arms' own names have come
         self.theirs: dict[str, str] = {}  # names of joints that an arm's driver calls otherwise, by ours
@@ -259,6 +261,7 @@ class JointIntake:
             return
         oldest = float(self._stamps.min())
         q, v, tau = self._values.copy()
+        q = self._turns.counted(q, now)
         if oldest == -math.inf:
             return
         silent = now - self._external_stamp > STREAM_TIMEOUT

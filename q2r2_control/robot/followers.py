@@ -1,0 +1,90 @@
+"""Joints that follow another one, as ``<mimic>`` says: each as a function of the joint that drives it in the end."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.urdf_parts import mimic_of
+
+
+@dataclass(frozen=True, slots=True)
+class Follower:
+    """A joint that is at ``multiplier * q + offset`` where its driver is at ``q`` [rad or m]."""
+
+    driver: str  # a joint that follows none
+    multiplier: float
+    offset: float
+
+    def at(self, position: float) -> float:
+        """Position of the follower with its driver at ``position``."""
+        return self.multiplier * position + self.offset
+
+
+def followers_of(joints: Iterable[ET.Element], driven: Collection[str] = (), where: str = "") -> dict[str, Follower]:
+    """All joints that follow another one, by name. A follower of a follower follows what drives that one.
+
+    ``driven`` joints have a motor, hence follow none, whatever they mimic. A fixed joint follows none either. Raises
+    :class:`RobotError` that begins with ``where`` for a joint that follows none of ``joints``, or itself in the end.
+    """
+    named = {joint.get("name", ""): joint for joint in joints}
+    leads = {
+        name: mimic
+        for name, joint in named.items()
+        if joint.get("type") != "fixed" and name not in driven and (mimic := mimic_of(joint)) is not None
+    }
+    found = {}
+    for name in leads:
+        way, multiplier, offset = [name], 1.0, 0.0
+        while way[-1] in leads:
+            leader, by, beside = leads[way[-1]]
+            if leader not in named:
+                raise RobotError(f"{where}joint {way[-1]} mimics {leader!r:.60}; allowed: a joint of the model")
+            if leader in way:
+                circle = " mimics ".join([*way[way.index(leader) :], leader])
+                raise RobotError(f"{where}joint {circle}; allowed: mimics that end at a joint without one")
+            multiplier, offset = multiplier * by, offset + multiplier * beside
+            way.append(leader)
+        found[name] = Follower(way[-1], multiplier, offset)
+    return found
+
+
+def with_followers(positions: Mapping[str, float], followers: Mapping[str, Follower]) -> dict[str, float]:
+    """``positions`` by joint [rad or m], and those of all followers of these joints that it does not have yet."""
+    followed = {name: one.at(positions[one.driver]) for name, one in followers.items() if one.driver in positions}
+    return followed | dict(positions)
+
+
+def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
+    """Let each joint go only where all its followers may follow it: narrow the limits of drivers in place.
+
+    A follower without a range of its own, and one that stands still, narrows nothing. One whose range has the wrong
+    sign, as models have it of fingers that mirror each other, gets the range in which it follows. Raises
+    :class:`RobotError` that begins with ``where`` for followers as by :func:`followers_of`, and for one that leaves its
+    driver no range.
+    """
+    limits = {joint.get("name", ""): joint.find("limit") for joint in joints}
+    for name, follower in followers_of(joints, where=where).items():
+        own, driver = limits[name], limits[follower.driver]
+        if own is None or driver is None or follower.multiplier == 0.0:
+            continue
+        lower, upper = (float(own.get(end, "0")) for end in ("lower", "upper"))
+        least, most = (float(driver.get(end, "0")) for end in ("lower", "upper"))
+        if not (lower < upper and least < most):
+            continue
+        first, last = sorted((end - follower.offset) / follower.multiplier for end in (lower, upper))
+        low, high = max(least, first), min(most, last)
+        if not low < high:  # mirrored
+            first, last = sorted((-end - follower.offset) / follower.multiplier for end in (lower, upper))
+            low, high = max(least, first), min(most, last)
+            lower, upper = sorted(map(follower.at, (low, high)))
+            own.set("lower", repr(lower))
+            own.set("upper", repr(upper))
+        if not low < high:
+            follows = f"joint {name}, at {lower:g} .. {upper:g}, follows {follower.driver}, at {least:g} .. {most:g}"
+            by = f"by {follower.multiplier:g} times it and {follower.offset:g}"
+            raise RobotError(f"{where}{follows}, {by}, which leaves no way; allowed: limits that meet")
+        driver.set("lower", repr(low))
+        driver.set("upper", repr(high))

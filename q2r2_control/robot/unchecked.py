@@ -1,0 +1,122 @@
+"""Links that move with an arm and that no distance is kept from, since no collision shape stands for them.
+
+A certificate says nothing about such a link. A robot that has one is refused, unless its cell names the link.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from q2r2_control.robot.description import LinkTree
+
+if TYPE_CHECKING:
+    from q2r2_control.robot.robot import Robot
+
+# A lighter link stands for a frame [kg]. Models give frames of sensors and tools 0.1 mg to 10 g, because some programs
+# need a mass; the lightest body that real models have without a shape, a jaw, weighs 20 g.
+LIGHTEST_BODY = 0.015
+
+
+@dataclass(frozen=True, slots=True)
+class MovingLink:
+    """A link that moves with an arm's joints."""
+
+    name: str
+    mass: float | None  # [kg]; None: the model says none
+    drawn: bool  # it has a <visual>
+    shaped: bool  # it has a <collision>
+    follows: str | None  # joint of an arm, which a joint beside the arm mimics; the link is watched where it is at home
+    arms: tuple[str, ...]  # that move it
+
+    @property
+    def is_body(self) -> bool:
+        """True unless the link is a mere frame: it weighs something, or is drawn and nothing says that it is light."""
+        return self.shaped or (self.drawn if self.mass is None else self.mass >= LIGHTEST_BODY)
+
+    @property
+    def is_unchecked(self) -> bool:
+        """True for a body that is not watched where it is."""
+        return self.is_body and (not self.shaped or self.follows is not None)
+
+    def fault(self, in_cell: bool) -> str:
+        """One line on what is missing, and how to mend it; ``in_cell``: in the YAML of a cell."""
+        named = _named([self.name], in_cell)
+        if self.follows is not None:
+            moves = f"follows {self.follows} as its joint mimics it, and would be watched where it is at home"
+            return f"{self.name}: {moves}; allowed: a fixed joint in its model, or {named}"
+        what = "is drawn" if self.mass is None else f"weighs {self.mass:.3g} kg"
+        shape = f", capsules: {{{self.name}: 1}} around its drawing" if in_cell and self.drawn else ""
+        return (
+            f"{self.name}: {what} and has no collision shape, so that nothing keeps it off anything; "
+            f"allowed: <collision> in its model{shape}, or {named}"
+        )
+
+
+def moving_links(robot: Robot) -> list[MovingLink]:
+    """All links that an arm of ``robot`` moves, frames included."""
+    urdf = ET.fromstring(robot.urdf)
+    tree, found = LinkTree(urdf, robot.name), []
+    for link in urdf.findall("link"):
+        name = link.get("name", "")
+        follows = robot.following_links.get(name)
+        movers = {joint.get("name", "") for joint in tree.chain(name)} | {follows}
+        arms = [arm for arm, its in robot.arms.items() if movers & {robot.joint_names[joint] for joint in its.joints}]
+        if arms:
+            masses = [float(mass.get("value", "0")) for mass in link.findall("inertial/mass")]
+            mass = sum(masses) if any(masses) else None
+            drawn, shaped = (link.find(tag) is not None for tag in ("visual", "collision"))
+            found.append(MovingLink(name, mass, drawn, shaped, follows, tuple(arms)))
+    return found
+
+
+def unchecked_faults(robot: Robot, in_cell: bool = True) -> list[str]:
+    """One line for each link, and each arm, that no distance is kept from and that the robot's maker did not name.
+
+    ``in_cell``: the lines name keys of a cell's YAML as remedies, and else arguments of :meth:`Robot.from_urdf`.
+    """
+    named, moving = set(robot.unchecked_links), moving_links(robot)
+    faults, told = [], set[str]()
+    for arm in robot.arms:
+        if (lacks := _lack_of(robot, arm)) is None:
+            continue
+        of_arm = [link for link in moving if arm in link.arms and not link.shaped]
+        named_best = [link.name for link in of_arm if link.is_body] or [link.name for link in of_arm]
+        links = named_best or [robot.arms[arm].tool_frame]
+        if not set(links) <= named:
+            told |= set(links)
+            allowed = f"allowed: <collision> in the model, or {_named(links, in_cell)}"
+            faults.append(f"{arm} arm: {lacks}, so that nothing keeps {', '.join(links)} off anything; {allowed}")
+    unchecked = [link for link in moving if link.is_unchecked and link.name not in named | told]
+    return faults + [link.fault(in_cell) for link in unchecked]
+
+
+def unchecked_notes(robot: Robot) -> Iterator[str]:
+    """Lines on what nothing keeps off anything by the maker's own will, or since it is drawn but hardly weighs."""
+    if robot.unchecked_links:
+        yield f"unchecked_links: nothing keeps {', '.join(robot.unchecked_links)} off anything"
+    if frames := [link.name for link in moving_links(robot) if link.drawn and not link.is_body]:
+        lighter = f"drawn, without a collision shape, and lighter than {1e3 * LIGHTEST_BODY:g} g"
+        yield f"not watched, since taken for frames ({lighter}): {', '.join(frames)}"
+
+
+def _lack_of(robot: Robot, arm: str) -> str | None:
+    """What leaves a whole arm without a distance that is kept; None where some are."""
+    joints = robot.arms[arm].joints
+    # A joint's index in Pinocchio's model is one more than in the vectors, since the world comes first.
+    of_body = {index: item.parentJoint - 1 for index, item in enumerate(robot.collision_model.geometryObjects)}
+    before_tool = joints[:-1] if len(joints) > 1 else joints  # the last joint moves the tool
+    if not np.isin(before_tool, list(of_body.values())).any():
+        return "no link between its base and its tool has a collision shape"
+    pairs = robot.collision_model.collisionPairs
+    if not any(of_body[end] in joints for pair in pairs for end in (pair.first, pair.second)):
+        return "no pair of its shapes is monitored"
+    return None
+
+
+def _named(links: list[str], in_cell: bool) -> str:
+    return f"unchecked_links{': ' if in_cell else '='}[{', '.join(links if in_cell else map(repr, links))}]"
