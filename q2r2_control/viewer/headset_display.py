@@ -9,13 +9,14 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.events import Event, ReasonKind
+from q2r2_control.device_words import DeviceWords
+from q2r2_control.events import ReasonKind
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.webxr.exchange import Display
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
-from q2r2_control.viewer.live import next_press, why
+from q2r2_control.viewer.arm_words import Told, told_after
 from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.state_colours import state_colour
 
@@ -48,7 +49,7 @@ class ShownTick(NamedTuple):
 
     tick: Tick
     binding: tuple[ActiveLimit, ...]  # limits that held a step back since the last one
-    last: Mapping[str, Event]  # of each arm
+    told: Mapping[str, Told]  # of each arm
     recording: str
 
 
@@ -57,7 +58,9 @@ class RunDisplay:
 
     def __init__(self, run: ShownRobot) -> None:
         self._run = run
-        self._names = {arm: [run.joint_names[index] for index in its] for arm, its in run.joints.items()}
+        # The page knows what is in the operator's hands, and puts its words in.
+        bound = {binding.control for binding in run.config.teleop.bindings.bound()}
+        self._words = run.words(DeviceWords(nouns={control: f"{{{control}}}" for control in bound}))
 
     def scene(self) -> Mapping[str, Any]:
         """Meshes, each in the frame of a joint."""
@@ -78,13 +81,14 @@ class RunDisplay:
 
     def message(self, shown: ShownTick) -> Mapping[str, Any]:
         """Poses as x y z qx qy qz qw in the world, of joints by their index in the meshes."""
-        tick, bindings = shown.tick, self._run.config.teleop.bindings
+        tick, words = shown.tick, self._words
+        words.told = shown.told
         pin.forwardKinematics(self._tree.model, self._data, self._tree.posture(tick.state.q, tick.grippers))
         arms = {
             arm: {
                 "state": tick.states[arm],
-                "why": why(tick, arm, self._names[arm], shown.binding, shown.last.get(arm)),
-                "next": next_press(tick, arm, bindings),
+                "why": words.why(tick, arm, shown.binding),
+                "next": words.next_press(tick, arm),
                 "colour": state_colour(tick.states[arm]),
                 "target": None if (target := tick.targets[arm].pose) is None else _rounded(target),
             }
@@ -105,14 +109,14 @@ class HeadsetView:
         self._source, self._recorded = source, recorded
         self._due = 0.0  # of the next message, by the clock on the wall [s]
         self._binding: dict[ActiveLimit, None] = {}
-        self._last: dict[str, Event] = {}
+        self._told: dict[str, Told] = {}
         self._episodes, self._open = 0, False
         source.show_on(RunDisplay(ShownRobot.of(pipeline.robot, pipeline.config)))
         pipeline.listeners.append(self)
 
     def __call__(self, tick: Tick) -> None:
+        self._told = told_after(self._told, tick.events)
         for event in tick.events:
-            self._last[event.arm] = event
             if event.kind is ReasonKind.EPISODE_BEGINS:
                 self._episodes, self._open = self._episodes + (not self._open), True
             elif event.kind in _EPISODE_OVER:
@@ -120,9 +124,7 @@ class HeadsetView:
         if tick.reference.report.binding:
             self._binding.update(dict.fromkeys(tick.reference.report.binding))
         now = time.monotonic()
-        if now >= self._due and self._source.show(
-            ShownTick(tick, tuple(self._binding), dict(self._last), self._recording())
-        ):
+        if now >= self._due and self._source.show(ShownTick(tick, tuple(self._binding), self._told, self._recording())):
             self._due = now + _PERIOD
             self._binding = {}
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from q2r2_control.config.strict import first_fault
+from q2r2_control.device_words import QUEST_WORDS
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.messages import HandMessage, HandPose, MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, Reception
@@ -15,7 +17,13 @@ from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandFault, HandIn
 
 LONGEST = 4096  # of a message [bytes]; those of the page have under 600
 # A pinch of bare fingers, or a touch of a phone's screen: devices without any other button.
-CONTROLS = DeviceControls(buttons=(*QUEST_CONTROLS.buttons, "pinch"), axes=QUEST_CONTROLS.axes)
+_NOUNS = {**QUEST_WORDS.nouns, "lower": "A, X or Space", "upper": "B, Y or G", "pinch": "the pinch"}
+_ABSENT = "nothing: no browser drives, open the page"
+CONTROLS = DeviceControls(
+    buttons=(*QUEST_CONTROLS.buttons, "pinch"),
+    axes=QUEST_CONTROLS.axes,
+    words=replace(QUEST_WORDS, nouns=_NOUNS, absent=_ABSENT),
+)
 
 _Hand = Literal["left", "right"]
 _Seven = tuple[float, float, float, float, float, float, float]

@@ -167,6 +167,11 @@ class WebXrInput:
         """The page's first URL; None before :meth:`start`."""
         return self.urls[0] if self.urls else None
 
+    @property
+    def driver(self) -> str | None:
+        """The address of the headset that drives; None if none does."""
+        return self._stream.peer
+
     def poll(self, now: float) -> list[HandSample]:
         return self._stream.take()
 
