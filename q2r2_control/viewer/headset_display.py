@@ -1,10 +1,10 @@
-"""The display of a run on a headset: states with their reasons, the robot, targets, and the recording."""
+"""The display of a run on a headset: states with their reasons, the robot, parts, targets, and the recording."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
@@ -13,12 +13,16 @@ from q2r2_control.device_words import DeviceWords
 from q2r2_control.events import ReasonKind
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.webxr.exchange import Display
+from q2r2_control.inputs.webxr.page_messages import PageRequest
+from q2r2_control.inputs.webxr.shown import Point, Seven, ShownArm, ShownPair, ShownScene, ShownState
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import ActiveLimit
+from q2r2_control.types import ActiveLimit, Array
 from q2r2_control.viewer.arm_words import Told, told_after
-from q2r2_control.viewer.shown_robot import ShownRobot
+from q2r2_control.viewer.shown_robot import ShownRobot, places_of_parts
 from q2r2_control.viewer.state_colours import state_colour
+from q2r2_control.viewer.tightest_pair import TightestPair
 
 _PERIOD = 1.0 / 30.0  # between messages [s]
 _DIGITS = 4  # of metres and quaternions
@@ -34,8 +38,8 @@ _EPISODE_OVER = (
 class DisplayInput(Input, Protocol):
     """An input whose device shows the run, as a headset does."""
 
-    def show_on(self, display: Display) -> None:
-        """Show a run by ``display``; before ``start``."""
+    def show_on(self, display: Display, requests: Mapping[PageRequest, Callable[[], None]]) -> None:
+        """Show a run by ``display``; its buttons call ``requests``, in any thread. Before ``start``."""
 
     def show(self, content: Any) -> bool:
         """Show the newest state; False where the last one still waits. Never waits."""
@@ -50,56 +54,95 @@ class ShownTick(NamedTuple):
     tick: Tick
     binding: tuple[ActiveLimit, ...]  # limits that held a step back since the last one
     told: Mapping[str, Told]  # of each arm
+    hands: Mapping[str, str]  # that drive each arm
+    moved: Array | None  # MuJoCo's positions of all that moves
     recording: str
 
 
 class RunDisplay:
     """Makes messages, in the process that sends them, where the robot is read from its URDF."""
 
-    def __init__(self, run: ShownRobot) -> None:
-        self._run = run
+    def __init__(self, run: ShownRobot, model: pin.Model, pairs: pin.GeometryModel, parts: Mapping[str, int]) -> None:
+        """``pairs`` of bodies of the controller's ``model`` are monitored; ``parts`` are :func:`places_of_parts`."""
+        self._run, self._model, self._pairs, self._parts = run, model, pairs, parts
         # The page knows what is in the operator's hands, and puts its words in.
         bound = {binding.control for binding in run.config.teleop.bindings.bound()}
         self._words = run.words(DeviceWords(nouns={control: f"{{{control}}}" for control in bound}))
 
-    def scene(self) -> Mapping[str, Any]:
-        """Meshes, each in the frame of a joint."""
-        from q2r2_control.viewer.joint_tree import JointTree  # for which trimesh is needed, an extra
+    def scene(self) -> ShownScene:
+        """Meshes, each in the frame of a joint, and the loose parts."""
+        from q2r2_control.viewer.joint_tree import JointTree, colour_of  # for which trimesh is needed, an extra
 
-        self._tree = JointTree(self._run)
+        self._tree, self._tightest = JointTree(self._run), TightestPair(self._model, self._pairs)
         self._data = self._tree.model.createData()
-        meshes = [
-            {
-                "joint": joint,
-                "colour": colour,
-                "vertices": np.asarray(mesh.vertices).round(_DIGITS).ravel().tolist(),
-                "faces": np.asarray(mesh.faces).ravel().tolist(),
-            }
-            for joint, colour, mesh in self._tree.meshes()
-        ]
-        return {"meshes": meshes}
+        objects = self._run.config.mujoco.objects
+        return {
+            "name": self._run.config.name,
+            "meshes": [
+                {
+                    "joint": joint,
+                    "colour": colour,
+                    "vertices": np.asarray(mesh.vertices).round(_DIGITS).ravel().tolist(),
+                    "faces": np.asarray(mesh.faces).ravel().tolist(),
+                }
+                for joint, colour, mesh in self._tree.meshes()
+            ],
+            "hands": {arm: self._joints_of_tool(joints) for arm, joints in self._run.joints.items()},
+            "parts": {
+                name: {"size": cast(Point, tuple(objects[name].size)), "colour": colour_of(objects[name].colour)}
+                for name in self._parts
+            },
+            "floor": self._run.config.floor or 0.0,
+        }
 
-    def message(self, shown: ShownTick) -> Mapping[str, Any]:
-        """Poses as x y z qx qy qz qw in the world, of joints by their index in the meshes."""
+    def _joints_of_tool(self, joints: Array) -> list[int]:
+        """The last joint of an arm and all that it carries, as its fingers."""
+        model = self._tree.model
+        carried = [model.getJointId(self._run.joint_names[joints[-1]])]
+        for joint in range(carried[0] + 1, model.njoints):
+            if model.parents[joint] in carried:
+                carried.append(joint)
+        return carried
+
+    def message(self, shown: ShownTick) -> ShownState:
+        """A moment of the run."""
         tick, words = shown.tick, self._words
         words.told = shown.told
         pin.forwardKinematics(self._tree.model, self._data, self._tree.posture(tick.state.q, tick.grippers))
-        arms = {
+        arms: dict[str, ShownArm] = {
             arm: {
                 "state": tick.states[arm],
                 "why": words.why(tick, arm, shown.binding),
                 "next": words.next_press(tick, arm),
                 "colour": state_colour(tick.states[arm]),
+                "hand": shown.hands[arm],
+                "tool": _rounded(tool),
                 "target": None if (target := tick.targets[arm].pose) is None else _rounded(target),
             }
-            for arm in tick.tools
+            for arm, tool in tick.tools.items()
         }
         joints = [_rounded(placement) for placement in self._data.oMi]
-        return {"arms": arms, "joints": joints, "recording": shown.recording}
+        parts = {} if shown.moved is None else {name: _part(shown.moved, at) for name, at in self._parts.items()}
+        return {"arms": arms, "joints": joints, "parts": parts, "pair": self._pair(tick), "recording": shown.recording}
+
+    def _pair(self, tick: Tick) -> ShownPair | None:
+        report = tick.reference.report
+        self._tightest.place(tick.reference.q)
+        ends = self._tightest.ends(report)
+        if ends is None:
+            return None
+        first, second = ends.round(_DIGITS).tolist()
+        return {"ends": (tuple(first), tuple(second)), "margin": round(report.margin, _DIGITS)}
 
 
-def _rounded(pose: pin.SE3) -> list[float]:
-    return [round(number, _DIGITS) for number in pin.SE3ToXYZQUATtuple(pose)]
+def _rounded(pose: pin.SE3) -> Seven:
+    return cast(Seven, tuple(round(number, _DIGITS) for number in pin.SE3ToXYZQUATtuple(pose)))
+
+
+def _part(moved: Array, at: int) -> Seven:
+    """The pose of a part, whose quaternion MuJoCo writes w x y z."""
+    x, y, z, qw, qx, qy, qz = moved[at : at + 7].round(_DIGITS).tolist()
+    return x, y, z, qx, qy, qz, qw
 
 
 class HeadsetView:
@@ -111,11 +154,16 @@ class HeadsetView:
         self._binding: dict[ActiveLimit, None] = {}
         self._told: dict[str, Told] = {}
         self._episodes, self._open = 0, False
-        source.show_on(RunDisplay(ShownRobot.of(pipeline.robot, pipeline.config)))
+        self._hand_of = pipeline.teleop.hand_of
+        self._plant = pipeline.plant if isinstance(pipeline.plant, MujocoPlant) else None
+        robot, parts = pipeline.robot, places_of_parts(pipeline.plant, pipeline.config)
+        display = RunDisplay(ShownRobot.of(robot, pipeline.config), robot.model, robot.collision_model, parts)
+        source.show_on(display, {PageRequest.STOP: pipeline.stop, PageRequest.HOME: pipeline.go_home})
         pipeline.listeners.append(self)
 
     def __call__(self, tick: Tick) -> None:
-        self._told = told_after(self._told, tick.events)
+        if tick.events:
+            self._told = told_after(self._told, tick.events)
         for event in tick.events:
             if event.kind is ReasonKind.EPISODE_BEGINS:
                 self._episodes, self._open = self._episodes + (not self._open), True
@@ -124,7 +172,11 @@ class HeadsetView:
         if tick.reference.report.binding:
             self._binding.update(dict.fromkeys(tick.reference.report.binding))
         now = time.monotonic()
-        if now >= self._due and self._source.show(ShownTick(tick, tuple(self._binding), self._told, self._recording())):
+        if now < self._due:
+            return
+        hands = {arm: self._hand_of(arm) for arm in tick.tools}
+        moved = None if self._plant is None else self._plant.observed_qpos
+        if self._source.show(ShownTick(tick, tuple(self._binding), self._told, hands, moved, self._recording())):
             self._due = now + _PERIOD
             self._binding = {}
 

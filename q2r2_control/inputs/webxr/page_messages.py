@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import StrEnum
 from typing import Literal
 
 import numpy as np
@@ -24,6 +25,14 @@ CONTROLS = DeviceControls(
     axes=QUEST_CONTROLS.axes,
     words=replace(QUEST_WORDS, nouns=_NOUNS, absent=_ABSENT),
 )
+
+
+class PageRequest(StrEnum):
+    """The requests of the page's buttons. A page that watches may ask for a stop only."""
+
+    STOP = "stop"  # bring the arms to rest, and end the run
+    HOME = "home"
+
 
 _Hand = Literal["left", "right"]
 _Seven = tuple[float, float, float, float, float, float, float]
@@ -49,6 +58,7 @@ class PageMessage(_PageModel):
 
     seq: int = Field(ge=0, le=1 << 53)
     hands: dict[_Hand, HeadsetHand] = Field(default_factory=dict)
+    request: PageRequest | None = None  # of its buttons
     virtual: bool = False  # keys or a gamepad move the hands, which rest without noise
 
     @property

@@ -19,6 +19,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
+from q2r2_control.viewer.shown_robot import places_of_parts
 from q2r2_control.viewer.web.exchange import (
     Frame,
     PageChange,
@@ -81,10 +82,7 @@ class PageView(Page):
             source = operator
         self._input = source if isinstance(source, WebInput) else None
         self._source, self._nobody = source, pipeline.input.controls.words.nobody
-        parts = {}
-        if isinstance(plant, MujocoPlant):
-            self._plant = plant
-            parts = {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in config.mujoco.objects}
+        self._plant = plant if isinstance(plant, MujocoPlant) else None
         self._requests = {
             PageRequest.STOP: pipeline.stop,
             PageRequest.ENGAGE: pipeline.engage,
@@ -107,7 +105,7 @@ class PageView(Page):
             title,
             tuple(one for one in self._requests if one not in hidden),
             tuple(one for one in self._changes if one not in hidden),
-            parts=parts,
+            parts=places_of_parts(plant, config),
             device=pipeline.input.controls.words,
             driven=self._input is not None,
             replayed=replayed,
