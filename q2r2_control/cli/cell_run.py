@@ -41,7 +41,7 @@ from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
-from q2r2_control.viewer.headset_display import DisplayInput, HeadsetView
+from q2r2_control.viewer.headset_view import DisplayInput, HeadsetView
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.live_pictures import LivePictures
 from q2r2_control.viewer.shown_robot import ShownRobot

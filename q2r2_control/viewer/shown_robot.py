@@ -8,7 +8,6 @@ from typing import Self
 
 from q2r2_control.config.cell import Config
 from q2r2_control.device_words import DeviceWords
-from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.viewer.arm_words import ArmWords
@@ -38,10 +37,3 @@ class ShownRobot:
         """Sentences on the arms, in the words of the ``device`` that drives them."""
         joints = {arm: [self.joint_names[index] for index in its] for arm, its in self.joints.items()}
         return ArmWords(joints, self.config.teleop.bindings, device)
-
-
-def places_of_parts(plant: object, config: Config) -> dict[str, int]:
-    """Loose parts of a simulated cell by name, and where in MuJoCo's positions the pose of each begins."""
-    if not isinstance(plant, MujocoPlant):
-        return {}
-    return {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in config.mujoco.objects}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
@@ -98,7 +99,7 @@ def test_a_reason_calls_a_control_as_its_operator_does(robot: Robot) -> None:
     assert words(paused, told=(pressed,)) == "A or X"
 
 
-def press(tick: Tick, device: DeviceWords = QUEST_WORDS, **bindings: str) -> str:
+def press(tick: Tick, bindings: Mapping[str, str] = {}, device: DeviceWords = QUEST_WORDS) -> str:
     return ArmWords(JOINTS, BindingSettings.model_validate(bindings), device).next_press(tick, "left")
 
 
@@ -113,10 +114,10 @@ def test_the_next_press_is_told_by_state_and_gripper(robot: Robot) -> None:
 def test_the_next_press_is_that_of_the_control_that_is_bound(robot: Robot) -> None:
     engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
     swapped = {"lower": "gripper_toggle", "upper": "pause_toggle"}
-    assert press(paused, **swapped) == "press B or Y to engage, press A or X to close the gripper"
+    assert press(paused, swapped) == "press B or Y to engage, press A or X to close the gripper"
     dead_man = {"lower": "none", "upper": "none", "grip": "dead_man", "trigger": "precision"}
-    assert press(paused, **dead_man) == "hold the grip to engage"
-    assert press(engaged, **dead_man) == "let go of the grip to pause"
+    assert press(paused, dead_man) == "hold the grip to engage"
+    assert press(engaged, dead_man) == "let go of the grip to pause"
 
 
 def test_the_handles_of_a_page_are_its_device_also_before_anybody_drags_them(robot: Robot) -> None:
@@ -131,4 +132,4 @@ def test_the_handles_of_a_page_are_its_device_also_before_anybody_drags_them(rob
 
 def test_nobody_is_asked_to_press_what_a_script_presses(robot: Robot) -> None:
     scripted = replace(QUEST_WORDS, nobody="a script moves the hands")
-    assert press(tick_at(robot, 1.0), scripted) == "nothing: a script moves the hands"
+    assert press(tick_at(robot, 1.0), {}, scripted) == "nothing: a script moves the hands"

@@ -31,7 +31,7 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     wait_for_row(page, "why", 1, "a program asks for a pause")
     assert table(page)["next"] == ["nothing: a script moves the hands"] * 2
     # News that change no state, as those of a slider, do not hide the reason.
-    page.get_by_text("Settings").click()
+    page.get_by_text("Settings", exact=True).click()
     page.locator("input:visible").first.fill("50")
     page.locator("input:visible").first.press("Enter")
     page.wait_for_timeout(5e3)

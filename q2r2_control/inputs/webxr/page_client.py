@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 from contextlib import suppress
-from dataclasses import asdict
 from typing import Any
 
 from websockets.asyncio.server import ServerConnection
@@ -62,7 +61,9 @@ class PageClient(Peer):
                 if driver is not None:
                     await self._tell({"driver": driver})
                 for vibration in vibrations.values():
-                    await self._tell({"vibration": ShownVibration(**asdict(vibration))})
+                    hand, frequency, amplitude = vibration.hand, vibration.frequency, vibration.amplitude
+                    shown_vibration = ShownVibration(hand=hand, frequency=frequency, amplitude=amplitude)
+                    await self._tell({"vibration": shown_vibration})
                 if shown is not None and display is not None:
                     await self._tell({"state": display.message(shown), "acknowledged": self.acknowledged})
                 if self.picture is not None and not connection.transport.get_write_buffer_size():

@@ -5,7 +5,9 @@ Poses are x y z qx qy qz qw in the world, in metres; points are x y z. Colours a
 
 from __future__ import annotations
 
-from typing_extensions import NotRequired, TypedDict
+from typing import NotRequired
+
+from typing_extensions import TypedDict
 
 Colour = tuple[int, int, int]
 Seven = tuple[float, float, float, float, float, float, float]

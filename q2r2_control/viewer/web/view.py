@@ -19,7 +19,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
-from q2r2_control.viewer.shown_robot import places_of_parts
+from q2r2_control.viewer.loose_parts import places_of_parts
 from q2r2_control.viewer.web.exchange import (
     Frame,
     PageChange,

@@ -16,7 +16,7 @@ const CALM = 0.1; // a pair with more to spare is green [m]
 const [CELLS, CELL] = [12, 0.5]; // of the floor's grid, and its width [m]
 const CONTROLLER = [0.035, 0.035, 0.11]; // [m]
 const FIELD_OF_VIEW = 0.9; // of the page, upwards [rad]
-const [DOWN, ACROSS] = [Math.sin(0.25), Math.cos(0.25)]; // of a look from 1.6 m up and 1.2 m behind
+const [DOWN, ACROSS] = [Math.sin(0.42), Math.cos(0.42)]; // of a look from 1.6 m up and 1.2 m behind
 const BEHIND = new Float32Array([
   1, 0, 0, 0, 0, ACROSS, DOWN, 0, 0, -DOWN, ACROSS, 0,
   0, -1.6 * ACROSS + 1.2 * DOWN, -1.6 * DOWN - 1.2 * ACROSS, 1,

@@ -1,6 +1,6 @@
 """Writes TypeScript types of the page's messages, of the classes that say their shapes: for a check of its scripts.
 
-python -m q2r2_control.inputs.webxr.page_types FILE
+python -m tests.web.page_types FILE
 """
 
 from __future__ import annotations
