@@ -192,10 +192,6 @@ class PageServer:
             client.end(FREE if self._driver is None else REFUSED, reason)
         else:
             self._watchers.append(client)
-            self._tell_driver(client)
-
-    def _tell_driver(self, client: PageClient) -> None:
-        if self._driver is not None:
             client.driver = self._driver.peer
             client.due.set()
 

@@ -2,6 +2,7 @@
 
 import { Board } from "./board.js";
 import { beamOf, inverseOf, matrixOf, projection, scaleOf, times } from "./matrices.js";
+import { boxOf, gridOf } from "./shapes.js";
 
 // The run's world as the operator has it: x forward, y left, z up, and the robot a step ahead.
 const WORLD = new Float32Array([0, 0, -1, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -0.7, 1]);
@@ -13,7 +14,6 @@ const [AMBER, RED, GREEN] = [[0.9, 0.63, 0.12], [0.84, 0.22, 0.22], [0.18, 0.63,
 const [GREY, LINES, GHOST] = [[0.35, 0.38, 0.41], [0.62, 0.66, 0.7], [0.47, 0.63, 0.9]];
 const SHORT = 0.01; // ways that are not drawn [m]
 const CALM = 0.1; // a pair with more to spare is green [m]
-const [CELLS, CELL] = [12, 0.5]; // of the floor's grid, and its width [m]
 const CONTROLLER = [0.035, 0.035, 0.11]; // [m]
 const FIELD_OF_VIEW = 0.9; // of the page, upwards [rad]
 const [DOWN, ACROSS] = [Math.sin(0.42), Math.cos(0.42)]; // of a look from 1.6 m up and 1.2 m behind
@@ -48,44 +48,6 @@ const BOARDS = {
  * @typedef {{ program: WebGLProgram, view: WebGLUniformLocation | null, model: WebGLUniformLocation | null, colour: WebGLUniformLocation | null }} Program
  * @typedef {{ x: number, y: number, width: number, height: number, view: Float32Array }} Eye
  */
-
-/**
- * A box from `low` to `high`.
- * @param {number[]} low
- * @param {number[]} high
- */
-function boxOf(low, high) {
-  /** @type {number[]} */
-  const vertices = [];
-  for (let corner = 0; corner < 8; corner++)
-    for (let axis = 0; axis < 3; axis++) vertices.push((corner >> axis) & 1 ? high[axis] : low[axis]);
-  const faces = [0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4, 2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5];
-  return { vertices, faces };
-}
-
-/**
- * Lines on the floor, as thin boxes.
- * @param {number} floor height [m]
- */
-function gridOf(floor) {
-  const [half, thin, top] = [(CELLS * CELL) / 2, 0.002, floor + 0.002];
-  /** @type {number[]} */
-  const vertices = [];
-  /** @type {number[]} */
-  const faces = [];
-  for (let line = 0; line <= CELLS; line++) {
-    const at = line * CELL - half;
-    for (const [low, high] of [
-      [[at - thin, -half, top - thin], [at + thin, half, top]],
-      [[-half, at - thin, top - thin], [half, at + thin, top]],
-    ]) {
-      const box = boxOf(low, high);
-      faces.push(...box.faces.map((corner) => corner + vertices.length / 3));
-      vertices.push(...box.vertices);
-    }
-  }
-  return { vertices, faces };
-}
 
 /**
  * Where each eye of a headset's frame is drawn, and how it sees; none where the head is not tracked.
