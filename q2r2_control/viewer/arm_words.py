@@ -28,7 +28,7 @@ class Told(NamedTuple):
     refusal: Event | None = None  # the newest one since
 
     def after(self, event: Event) -> Told:
-        """What is told after one more ``event``. News that change nothing hide no reason."""
+        """The events that are told after one more ``event``. News that change nothing hide no reason."""
         if event.source != event.destination:
             return Told(event)
         return Told(self.change, event) if is_refusal(event) else self
@@ -39,7 +39,7 @@ class Told(NamedTuple):
 
 
 def told_after(told: Mapping[str, Told], events: Iterable[Event]) -> dict[str, Told]:
-    """What is told of each arm after ``events``."""
+    """The events of each arm that are told after ``events``."""
     newest = dict(told)
     for event in events:
         newest[event.arm] = newest.get(event.arm, Told()).after(event)
@@ -88,7 +88,7 @@ class ArmWords:
         return sentence(reason, self._device)
 
     def next_press(self, tick: Tick, arm: str) -> str:
-        """What the operator of an arm can do, and what it will do."""
+        """Instructions for the operator of an arm, with their effects."""
         state, device, bindings = tick.states[arm], self._device, self._bindings
         if device.nobody:
             return f"nothing: {device.nobody}"

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from q2r2_control.events import ReasonKind
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.webxr.exchange import Display
-from q2r2_control.inputs.webxr.page_messages import PageRequest
+from q2r2_control.inputs.webxr.page_messages import HeadsetRequest
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
@@ -32,7 +32,7 @@ _EPISODE_OVER = (
 class DisplayInput(Input, Protocol):
     """An input whose device shows the run, as a headset does."""
 
-    def show_on(self, display: Display, requests: Mapping[PageRequest, Callable[[], None]]) -> None:
+    def show_on(self, display: Display, requests: Mapping[HeadsetRequest, Callable[[], None]]) -> None:
         """Show a run by ``display``; its buttons call ``requests``, in any thread. Before ``start``."""
 
     def show(self, content: Any) -> bool:
@@ -55,7 +55,7 @@ class HeadsetView:
         self._plant = pipeline.plant if isinstance(pipeline.plant, MujocoPlant) else None
         robot, parts = pipeline.robot, places_of_parts(pipeline.plant, pipeline.config)
         display = RunDisplay(ShownRobot.of(robot, pipeline.config), robot.model, robot.collision_model, parts)
-        source.show_on(display, {PageRequest.STOP: pipeline.stop, PageRequest.HOME: pipeline.go_home})
+        source.show_on(display, {HeadsetRequest.STOP: pipeline.stop, HeadsetRequest.HOME: pipeline.go_home})
         pipeline.listeners.append(self)
 
     def __call__(self, tick: Tick) -> None:

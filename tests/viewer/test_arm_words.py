@@ -1,4 +1,4 @@
-"""What is said of an arm: why it is where it is, and what its operator can do, in the words of the device in hand."""
+"""Sentences on an arm: why it is where it is, and what its operator can do, in the words of the device in hand."""
 
 from __future__ import annotations
 

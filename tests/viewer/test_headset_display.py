@@ -1,4 +1,4 @@
-"""What a run tells the page that headsets open: in the shapes for which the page's scripts are checked."""
+"""The messages of a run to the page that headsets open, in the shapes for which its scripts are checked."""
 
 from __future__ import annotations
 

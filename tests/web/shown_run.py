@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from q2r2_control.inputs.webxr.page_messages import PageRequest
+from q2r2_control.inputs.webxr.page_messages import HeadsetRequest
 from q2r2_control.inputs.webxr.shown import ShownArm, ShownScene, ShownState
 from q2r2_control.inputs.webxr.webxr import WebXrInput
 
@@ -54,7 +54,7 @@ class ShownRun:
     def __init__(self, source: WebXrInput) -> None:
         self.asked: list[str] = []
         self.source = source
-        requests = {request: lambda request=request: self.asked.append(str(request)) for request in PageRequest}
+        requests = {request: lambda request=request: self.asked.append(str(request)) for request in HeadsetRequest}
         source.show_on(GivenDisplay(), requests)
 
     def show(self, state: ShownState = STATE) -> None:

@@ -1,4 +1,4 @@
-"""What the page that headsets open says and offers on a screen, and what the board in VR shows."""
+"""Words and buttons of the page that headsets open, on a screen, and the board that it shows in VR."""
 
 from __future__ import annotations
 

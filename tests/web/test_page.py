@@ -44,7 +44,7 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     assert summary["at_rest"]
     kinds = [event["kind"] for event in summary["events"]]
     assert kinds.index("control_changed") < kinds.index("homing_arrived")
-    # What stays on the screen says so, and offers nothing that would not be done.
+    # The page that stays on the screen says so, and offers nothing that would not be done.
     wait_for(page, "The run is over after")
     assert not page.get_by_text("certified").is_visible()
     assert not page.get_by_text("Bring both arms home").is_visible()

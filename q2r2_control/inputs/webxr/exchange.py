@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 from q2r2_control.config.strict import Network
 from q2r2_control.inputs.session import Reception
-from q2r2_control.inputs.webxr.page_messages import PageRequest
+from q2r2_control.inputs.webxr.page_messages import HeadsetRequest
 from q2r2_control.inputs.webxr.shown import ShownScene, ShownState
 
 
@@ -64,7 +64,7 @@ class Received(NamedTuple):
 class Requested(NamedTuple):
     """A button of a page was pressed."""
 
-    request: PageRequest
+    request: HeadsetRequest
 
 
 class Logged(NamedTuple):

@@ -27,7 +27,7 @@ CONTROLS = DeviceControls(
 )
 
 
-class PageRequest(StrEnum):
+class HeadsetRequest(StrEnum):
     """The requests of the page's buttons. A page that watches may ask for a stop only."""
 
     STOP = "stop"  # bring the arms to rest, and end the run
@@ -58,7 +58,7 @@ class PageMessage(_PageModel):
 
     seq: int = Field(ge=0, le=1 << 53)
     hands: dict[_Hand, HeadsetHand] = Field(default_factory=dict)
-    request: PageRequest | None = None  # of its buttons
+    request: HeadsetRequest | None = None  # of its buttons
     virtual: bool = False  # keys or a gamepad move the hands, which rest without noise
 
     @property

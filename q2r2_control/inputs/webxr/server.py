@@ -40,7 +40,7 @@ from q2r2_control.inputs.webxr.exchange import (
     Shown,
 )
 from q2r2_control.inputs.webxr.page_client import MAX_MESSAGES_PER_SECOND, PageClient
-from q2r2_control.inputs.webxr.page_messages import LONGEST, PageRequest, read
+from q2r2_control.inputs.webxr.page_messages import LONGEST, HeadsetRequest, read
 from q2r2_control.types import HapticFeedback
 
 REFUSED, DROPPED, OVER, FREE = 4001, 4002, 4003, 4004  # codes with which a socket is closed, for the page
@@ -178,10 +178,10 @@ class PageServer:
             self._pass_on(client)
         client.newest = message
 
-    def _ask(self, client: PageClient, request: PageRequest | None) -> None:
+    def _ask(self, client: PageClient, request: HeadsetRequest | None) -> None:
         """Pass a button's request on: of every page a stop, of the one that drives any."""
-        is_stop = request is PageRequest.STOP
-        is_home = request is PageRequest.HOME and client is self._driver and client.requests.take(self._clock())
+        is_stop = request is HeadsetRequest.STOP
+        is_home = request is HeadsetRequest.HOME and client is self._driver and client.requests.take(self._clock())
         if request is not None and (is_stop or is_home):
             self._answer(Requested(request))
 

@@ -31,7 +31,7 @@ class ShownPart(TypedDict):
 
 
 class ShownScene(TypedDict):
-    """What does not change during a run."""
+    """The part of a run that does not change."""
 
     name: str
     meshes: list[ShownMesh]

@@ -39,7 +39,7 @@ from q2r2_control.inputs.webxr.exchange import (
     Requested,
     Shown,
 )
-from q2r2_control.inputs.webxr.page_messages import CONTROLS, PageRequest
+from q2r2_control.inputs.webxr.page_messages import CONTROLS, HeadsetRequest
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
@@ -80,7 +80,7 @@ class WebXrInput:
         self._silence = silence
         self._stream = HandStream(watch or HandsWatch())
         self._display: Display | None = None
-        self._requests: Mapping[PageRequest, Callable[[], None]] = {}
+        self._requests: Mapping[HeadsetRequest, Callable[[], None]] = {}
         self._process: HelperProcess | None = None
         self._ready = Event()
 
@@ -109,7 +109,7 @@ class WebXrInput:
         teleop = config.teleop.model_copy(update={"axes": TeleopSettings().axes})
         return config.model_copy(update={"teleop": teleop})
 
-    def show_on(self, display: Display, requests: Mapping[PageRequest, Callable[[], None]]) -> None:
+    def show_on(self, display: Display, requests: Mapping[HeadsetRequest, Callable[[], None]]) -> None:
         """Let pages show a run by ``display``, and ask for ``requests``; before :meth:`start`."""
         self._display, self._requests = display, requests
 

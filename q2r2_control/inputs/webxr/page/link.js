@@ -89,7 +89,7 @@ export class Link {
    * Send the hands, unless earlier ones still wait here, and return whether they are sent. Keys move `virtual` ones.
    * @param {Record<string, HeadsetHand>} hands
    * @param {boolean} virtual
-   * @param {PageRequest | null} request of a button
+   * @param {HeadsetRequest | null} request of a button
    */
   send(hands, virtual = false, request = null) {
     const now = performance.now();
@@ -118,7 +118,7 @@ export class Link {
 
   /**
    * Ask for what a button does, as soon as it can be sent on this connection. It says nothing of the hands.
-   * @param {PageRequest} request
+   * @param {HeadsetRequest} request
    * @param {WebSocket} socket
    */
   ask(request, socket = this.socket) {

@@ -188,7 +188,7 @@ async function offer() {
 
 button("leave").onclick = () => session?.end();
 button("fly").onclick = fly;
-/** @type {PageRequest[]} */ (["stop", "home"]).forEach((request) => {
+/** @type {HeadsetRequest[]} */ (["stop", "home"]).forEach((request) => {
   button(request).onclick = () => {
     button(request).blur(); // or Space, which engages, would press it again
     link.ask(request);
