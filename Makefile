@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 # One call of pip at a time, also where make runs with -j.
 PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot lerobot-ros test-lerobot test-learning test-web web-setup chromium lint bench docs picture page-picture soak wheel release-check arena clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot lerobot-ros test-lerobot test-learning test-web web-setup chromium lint lint-page bench docs picture page-picture soak wheel release-check arena clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed-dev
@@ -137,11 +137,20 @@ $(LEROBOT)/.installed-ros: $(LEROBOT)/.installed
 	$(LEROBOT)/bin/q2r2 ros build-interfaces
 	touch $@
 
-lint: setup
+lint: setup lint-page
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Lints and type-checks the scripts of the headset's page; a wheel that brings all it needs, so no Node has to be there.
+# The types of the page's messages are made of the classes that say their shapes; deno.json names the file.
+DENO := DENO_DIR=build/deno DENO_NO_UPDATE_CHECK=1 $(BIN)/deno
+
+lint-page: setup
+	$(BIN)/python -m tests.web.page_types build/page/messages.d.ts
+	$(DENO) lint q2r2_control/inputs/webxr/page tests/web/emulator.js
+	$(DENO) check q2r2_control/inputs/webxr/page/main.js
 
 bench: $(VENV)/.installed-bench
 	$(BIN)/q2r2 bench

@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # "as" says to type checkers that a name is public
     from q2r2_control.control.tasks.named_tasks import LookAt as LookAt
     from q2r2_control.control.tasks.named_tasks import RelativePose as RelativePose
     from q2r2_control.control.tasks.named_tasks import Upright as Upright
+    from q2r2_control.device_words import DeviceWords as DeviceWords
     from q2r2_control.errors import ConfigError as ConfigError
     from q2r2_control.errors import PlantError as PlantError
     from q2r2_control.errors import Q2R2Error as Q2R2Error
@@ -61,6 +62,7 @@ _MODULES = {
     "Constraint": "control.constraints",
     "ControllerSettings": "config.control",
     "DeviceControls": "types",
+    "DeviceWords": "device_words",
     "ElbowSwivel": "control.tasks.elbow",
     "EpisodeVectors": "export.episodes",
     "ExportFormat": "export.export_format",

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
+from q2r2_control.device_words import NO_WORDS, QUEST_WORDS, DeviceWords
 from q2r2_control.errors import ConfigError, shown
 from q2r2_control.events import Reason
 
@@ -81,6 +82,7 @@ class DeviceControls:
 
     buttons: tuple[str, ...]
     axes: tuple[str, ...]
+    words: DeviceWords = NO_WORDS
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,6 +92,7 @@ class DeviceControls:
 QUEST_CONTROLS = DeviceControls(
     buttons=("button_upper", "button_lower"),
     axes=("thumb_stick_horizontal", "thumb_stick_vertical", "press_index", "press_middle"),
+    words=QUEST_WORDS,
 )
 
 

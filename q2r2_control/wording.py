@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from q2r2_control.device_words import DeviceWords
 from q2r2_control.events import Event, Reason
 from q2r2_control.types import ActiveLimit, LimitKind
 
@@ -18,10 +19,15 @@ _LIMITS = {
 }
 
 
-def sentence(reason: Reason) -> str:
+def sentence(reason: Reason, words: DeviceWords | None = None) -> str:
+    """The sentence of ``reason``; with ``words``, controls are called as an operator of that device calls them."""
     fields: dict[str, Any] = {name: _text(value) for name, value in reason.detail.items()}
+    if words is not None and (control := reason.detail.get("control")) is not None:
+        fields["control"] = words.noun(control)
+    if words is not None and (controls := reason.detail.get("controls")) is not None:
+        fields["controls"] = _text([*map(words.noun, controls)])
     if reason.cause is not None:
-        fields["cause"] = sentence(reason.cause)
+        fields["cause"] = sentence(reason.cause, words)
     return reason.kind.template.format(**fields)
 
 

@@ -41,9 +41,10 @@ from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
-from q2r2_control.viewer.headset_display import DisplayInput, HeadsetView
+from q2r2_control.viewer.headset_view import DisplayInput, HeadsetView
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.live_pictures import LivePictures
+from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.state_colours import obstacle_colour
 from q2r2_control.viewer.tables import print_table
 from q2r2_control.viewer.web.view import PageView
@@ -272,11 +273,10 @@ def _run(
         if options.window:
             show_window(pipeline)
         if options.table:
-            robot = pipeline.robot
-            joints = {arm: [robot.joint_names[joint] for joint in its.joints] for arm, its in robot.arms.items()}
             title = f"{options.name}: Ctrl-C brings the arms to rest and ends"
-            bindings, simulated = pipeline.config.teleop.bindings, options.simulated_time
-            table = LiveTable(title, joints, bindings, options.steps, options.duration, simulated_time=simulated)
+            shown, simulated = ShownRobot.of(pipeline.robot, pipeline.config), options.simulated_time
+            words = shown.words(pipeline.input.controls.words)
+            table = LiveTable(title, words, options.steps, options.duration, simulated_time=simulated)
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         if isinstance(pipeline.plant, MujocoPlant):

@@ -99,6 +99,11 @@ class HeadsetServer:
         """Whether a headset is connected, and no loss is left that ``poll`` has not shown yet."""
         return self._stream.connected
 
+    @property
+    def driver(self) -> str | None:
+        """The address of the headset that drives; None if none does."""
+        return self._stream.peer
+
     def poll(self, now: float) -> list[HandSample]:
         """Samples since the last poll, oldest first. None of a lost connection: those poses are not the hand's."""
         return self._stream.take()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http
+import re
 import secrets
 import socket
 import ssl
@@ -15,6 +16,9 @@ from websockets.http11 import Request, Response
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.addresses import reachable_addresses
 from q2r2_control.inputs.listener import is_loopback, written
+
+_LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
+_PORT = re.compile(r":\d{1,5}$")
 
 
 def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:
@@ -49,7 +53,8 @@ class PageDoor:
     """A socket that listens, and the check of every request to it.
 
     A page of another site may not connect, since its ``Origin`` differs. Nor may a name that an attacker's DNS leads
-    here, since the ``Host`` of a loopback address is known. Beyond loopback, a request needs the token of the URL.
+    here, since the names of a loopback address are known. The port of a ``Host`` is free: ssh may forward another one,
+    and the name alone is what an attacker's page lacks. Beyond loopback, a request needs the token of the URL.
     """
 
     def __init__(
@@ -77,7 +82,7 @@ class PageDoor:
             raise ConfigError(message) from error
         self.port: int = self.socket.getsockname()[1]
         self._scheme = "http" if certificate is None else "https"
-        self._hosts = {f"{name}:{self.port}" for name in ("localhost", "127.0.0.1", "[::1]", host)}
+        self._names = {*_LOOPBACK, host.lower()}
         self.token = None if is_loopback(host) else token
         names = tuple(addresses) or reachable_addresses(host)
         self.urls = tuple(f"{self._scheme}://{written(name, self.port)}{self._query}" for name in names)
@@ -85,11 +90,15 @@ class PageDoor:
     def refusal(self, request: Request, *, with_token: bool = True) -> str | None:
         """Why a request is not answered, or None."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        if len(hosts) != 1 or (self.token is None and hosts[0].lower() not in self._hosts):
-            return "unknown Host"
+        if len(hosts) != 1:
+            return "a request needs one Host"
+        if self.token is None and _PORT.sub("", hosts[0].lower()) not in self._names:
+            names = ", ".join(sorted(self._names))
+            forwarded = f"such as localhost:9000 after ssh -L 9000:localhost:{self.port}"
+            return f"unknown Host {hosts[0]!r:.60}; allowed: {names}, at any port, {forwarded}"
         is_socket = request.headers.get("Upgrade") is not None
         if is_socket and [origin.lower() for origin in origins] != [f"{self._scheme}://{hosts[0].lower()}"]:
-            return "unknown Origin"
+            return "unknown Origin; allowed: this page's own"
         if self.token is None or not with_token or self._is_known(request):
             return None
         return "the token of the URL is missing"

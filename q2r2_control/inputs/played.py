@@ -107,7 +107,7 @@ _LONGEST_BACKLOG = 1.0
 class PlayedInput:
     """Samples of hands along given ways, from the first poll on, whenever it is polled. Implements :class:`Input`."""
 
-    controls = QUEST_CONTROLS
+    controls = replace(QUEST_CONTROLS, words=replace(QUEST_CONTROLS.words, nobody="a script moves the hands"))
 
     def __init__(self, pose: HandPose, inputs: HandButtons, samplings: Mapping[str, SampleTiming]) -> None:
         self._pose, self._inputs = pose, inputs

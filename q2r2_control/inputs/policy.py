@@ -11,6 +11,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from types import NoneType
@@ -30,6 +31,7 @@ from q2r2_control.types import POSE_FIELDS, QUEST_CONTROLS, ActionChunk, Array, 
 MOTION_FIELDS = ("x", "y", "z", "rx", "ry", "rz")
 _GAPS = 0.002, 0.5  # from one action to the next [s]
 _MOST = 1000  # actions in a chunk
+_NO_OPERATOR = replace(QUEST_CONTROLS, words=replace(QUEST_CONTROLS.words, nobody="a policy moves the arms"))
 _KEPT = 20  # chunks between two ticks: of more, the newest
 _JOINED = 1.0  # how long a policy that computes may take to end with the run [s]
 
@@ -86,7 +88,7 @@ class PolicyInput:
             raise ConfigError(f"policy = {shown(policy)}: allowed: a function of an Observation, or None")
         check_kind("operator", operator, (Input, NoneType), "an object with all methods of Input, or None")
         self.space, self.period, self._policy, self.operator = ActionSpace(space), 1.0 / float(rate), policy, operator
-        self.controls = QUEST_CONTROLS if operator is None else operator.controls
+        self.controls = _NO_OPERATOR if operator is None else operator.controls
         self.observation: Observation | None = None  # the newest one
         self._chunks: deque[ActionChunk] = deque(maxlen=_KEPT)
         self._wake, self._ends = threading.Event(), threading.Event()

@@ -10,6 +10,7 @@ import numpy as np
 from q2r2_control.config.bindings import Action, BindingSettings
 from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.device_words import DeviceWords
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.types import DeviceControls, HandInputs, HandSample, HapticFeedback
 
@@ -17,6 +18,9 @@ _BINDINGS = BindingSettings(
     lower=Action.NONE,
     upper=Action.NONE,
     device={"drag": Action.DEAD_MAN, "gripper": Action.GRIPPER_TOGGLE},
+)
+_WORDS = DeviceWords(
+    nouns={"drag": "a tool's arrows or rings", "gripper": "the gripper's button"}, verbs={"drag": "drag"}, absent=""
 )
 _MOTION = ("stance", "axes", "position_scale", "rotation_scale", "axis_scales", "rotation_frame")
 
@@ -35,7 +39,7 @@ class WebInput:
     stamped with ``clock`` when it is received.
     """
 
-    controls = DeviceControls(buttons=("drag", "gripper"), axes=())
+    controls = DeviceControls(buttons=("drag", "gripper"), axes=(), words=_WORDS)
     cell = staticmethod(web_cell)
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

@@ -15,6 +15,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.control.solvers.registry import solver_of
+from q2r2_control.device_words import QUEST_WORDS
 from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.pipeline.loop_clock import LoopClock, WallPace
@@ -122,7 +123,8 @@ class ReplayPipeline(Pipeline):
         """``plant`` by its name; None: the recorded one, which no command moves."""
         recorded = _Recorded(ticks, about.plant_modes, self._ask_again)
         # A recording does not say which buttons of its own the device had.
-        recorded.controls = replace(QUEST_CONTROLS, buttons=QUEST_CONTROLS.buttons + config.teleop.bindings.of_device)
+        buttons = QUEST_CONTROLS.buttons + config.teleop.bindings.of_device
+        recorded.controls = replace(_Recorded.controls, buttons=buttons)
         moves = recorded if plant is None else make_plant(plant, robot, config)
         super().__init__(config, robot, recorded, moves, about.mode)
         self._recorded = ticks
@@ -162,7 +164,7 @@ class _Clock(LoopClock):
 class _Recorded:
     """Samples and measured states of the recorded tick; commands move nothing. Implements PolicySource and Plant."""
 
-    controls = QUEST_CONTROLS
+    controls = replace(QUEST_CONTROLS, words=replace(QUEST_WORDS, nobody="this is a recording"))
 
     def __init__(self, ticks: RecordedTicks, modes: tuple[str, ...], on_tick: Callable[[RecordedTick], None]) -> None:
         self._ticks, self._on_tick = ticks, on_tick

@@ -1,46 +1,23 @@
-"""The display of a run on a headset: states with their reasons, the robot, targets, and the recording."""
+"""The display of a run on a headset: states with their reasons, the robot, parts, targets, and the recording."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, cast
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.events import Event, ReasonKind
-from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.webxr.exchange import Display
-from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.device_words import DeviceWords
+from q2r2_control.inputs.webxr.shown import Point, Seven, ShownArm, ShownPair, ShownScene, ShownState
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import ActiveLimit
-from q2r2_control.viewer.live import next_press, why
+from q2r2_control.types import ActiveLimit, Array
+from q2r2_control.viewer.arm_words import Told
 from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.state_colours import state_colour
+from q2r2_control.viewer.tightest_pair import TightestPair
 
-_PERIOD = 1.0 / 30.0  # between messages [s]
 _DIGITS = 4  # of metres and quaternions
-_EPISODE_OVER = (
-    ReasonKind.EPISODE_ENDS,
-    ReasonKind.EPISODE_SUCCEEDED,
-    ReasonKind.EPISODE_FAILED,
-    ReasonKind.EPISODE_DISCARDED,
-)
-
-
-@runtime_checkable
-class DisplayInput(Input, Protocol):
-    """An input whose device shows the run, as a headset does."""
-
-    def show_on(self, display: Display) -> None:
-        """Show a run by ``display``; before ``start``."""
-
-    def show(self, content: Any) -> bool:
-        """Show the newest state; False where the last one still waits. Never waits."""
-
-    def show_picture(self, jpeg: bytes) -> bool:
-        """Show the newest picture of a camera, as :meth:`show`; from any thread."""
 
 
 class ShownTick(NamedTuple):
@@ -48,85 +25,93 @@ class ShownTick(NamedTuple):
 
     tick: Tick
     binding: tuple[ActiveLimit, ...]  # limits that held a step back since the last one
-    last: Mapping[str, Event]  # of each arm
+    told: Mapping[str, Told]  # of each arm
+    hands: Mapping[str, str]  # that drive each arm
+    moved: Array | None  # MuJoCo's positions of all that moves
     recording: str
 
 
 class RunDisplay:
     """Makes messages, in the process that sends them, where the robot is read from its URDF."""
 
-    def __init__(self, run: ShownRobot) -> None:
-        self._run = run
-        self._names = {arm: [run.joint_names[index] for index in its] for arm, its in run.joints.items()}
+    def __init__(self, run: ShownRobot, model: pin.Model, pairs: pin.GeometryModel, parts: Mapping[str, int]) -> None:
+        """``pairs`` of bodies of the controller's ``model`` are monitored; ``parts`` are :func:`places_of_parts`."""
+        self._run, self._model, self._pairs, self._parts = run, model, pairs, parts
+        # The page knows what is in the operator's hands, and puts its words in.
+        bound = {binding.control for binding in run.config.teleop.bindings.bound()}
+        self._words = run.words(DeviceWords(nouns={control: f"{{{control}}}" for control in bound}))
 
-    def scene(self) -> Mapping[str, Any]:
-        """Meshes, each in the frame of a joint."""
-        from q2r2_control.viewer.joint_tree import JointTree  # for which trimesh is needed, an extra
+    def scene(self) -> ShownScene:
+        """Meshes, each in the frame of a joint, and the loose parts."""
+        from q2r2_control.viewer.joint_tree import JointTree, colour_of  # for which trimesh is needed, an extra
 
-        self._tree = JointTree(self._run)
+        self._tree, self._tightest = JointTree(self._run), TightestPair(self._model, self._pairs)
         self._data = self._tree.model.createData()
-        meshes = [
-            {
-                "joint": joint,
-                "colour": colour,
-                "vertices": np.asarray(mesh.vertices).round(_DIGITS).ravel().tolist(),
-                "faces": np.asarray(mesh.faces).ravel().tolist(),
-            }
-            for joint, colour, mesh in self._tree.meshes()
-        ]
-        return {"meshes": meshes}
+        objects = self._run.config.mujoco.objects
+        return {
+            "name": self._run.config.name,
+            "meshes": [
+                {
+                    "joint": joint,
+                    "colour": colour,
+                    "vertices": np.asarray(mesh.vertices).round(_DIGITS).ravel().tolist(),
+                    "faces": np.asarray(mesh.faces).ravel().tolist(),
+                }
+                for joint, colour, mesh in self._tree.meshes()
+            ],
+            "hands": {arm: self._joints_of_tool(joints) for arm, joints in self._run.joints.items()},
+            "parts": {
+                name: {"size": cast(Point, tuple(objects[name].size)), "colour": colour_of(objects[name].colour)}
+                for name in self._parts
+            },
+            "floor": self._run.config.floor or 0.0,
+        }
 
-    def message(self, shown: ShownTick) -> Mapping[str, Any]:
-        """Poses as x y z qx qy qz qw in the world, of joints by their index in the meshes."""
-        tick, bindings = shown.tick, self._run.config.teleop.bindings
+    def _joints_of_tool(self, joints: Array) -> list[int]:
+        """The last joint of an arm and all that it carries, as its fingers."""
+        model = self._tree.model
+        carried = [model.getJointId(self._run.joint_names[joints[-1]])]
+        for joint in range(carried[0] + 1, model.njoints):
+            if model.parents[joint] in carried:
+                carried.append(joint)
+        return carried
+
+    def message(self, shown: ShownTick) -> ShownState:
+        """A moment of the run."""
+        tick, words = shown.tick, self._words
+        words.told = shown.told
         pin.forwardKinematics(self._tree.model, self._data, self._tree.posture(tick.state.q, tick.grippers))
-        arms = {
+        arms: dict[str, ShownArm] = {
             arm: {
                 "state": tick.states[arm],
-                "why": why(tick, arm, self._names[arm], shown.binding, shown.last.get(arm)),
-                "next": next_press(tick, arm, bindings),
+                "why": words.why(tick, arm, shown.binding),
+                "next": words.next_press(tick, arm),
                 "colour": state_colour(tick.states[arm]),
+                "hand": shown.hands[arm],
+                "tool": _rounded(tool),
                 "target": None if (target := tick.targets[arm].pose) is None else _rounded(target),
             }
-            for arm in tick.tools
+            for arm, tool in tick.tools.items()
         }
         joints = [_rounded(placement) for placement in self._data.oMi]
-        return {"arms": arms, "joints": joints, "recording": shown.recording}
+        parts = {} if shown.moved is None else {name: _part(shown.moved, at) for name, at in self._parts.items()}
+        return {"arms": arms, "joints": joints, "parts": parts, "pair": self._pair(tick), "recording": shown.recording}
+
+    def _pair(self, tick: Tick) -> ShownPair | None:
+        report = tick.reference.report
+        self._tightest.place(tick.reference.q)
+        ends = self._tightest.ends(report)
+        if ends is None:
+            return None
+        first, second = ends.round(_DIGITS).tolist()
+        return {"ends": (tuple(first), tuple(second)), "margin": round(report.margin, _DIGITS)}
 
 
-def _rounded(pose: pin.SE3) -> list[float]:
-    return [round(number, _DIGITS) for number in pin.SE3ToXYZQUATtuple(pose)]
+def _rounded(pose: pin.SE3) -> Seven:
+    return cast(Seven, tuple(round(number, _DIGITS) for number in pin.SE3ToXYZQUATtuple(pose)))
 
 
-class HeadsetView:
-    """A listener of one run. A tick stores references, 30 times a second the input's process gets them."""
-
-    def __init__(self, source: DisplayInput, pipeline: Pipeline, recorded: bool) -> None:
-        self._source, self._recorded = source, recorded
-        self._due = 0.0  # of the next message, by the clock on the wall [s]
-        self._binding: dict[ActiveLimit, None] = {}
-        self._last: dict[str, Event] = {}
-        self._episodes, self._open = 0, False
-        source.show_on(RunDisplay(ShownRobot.of(pipeline.robot, pipeline.config)))
-        pipeline.listeners.append(self)
-
-    def __call__(self, tick: Tick) -> None:
-        for event in tick.events:
-            self._last[event.arm] = event
-            if event.kind is ReasonKind.EPISODE_BEGINS:
-                self._episodes, self._open = self._episodes + (not self._open), True
-            elif event.kind in _EPISODE_OVER:
-                self._open = False
-        if tick.reference.report.binding:
-            self._binding.update(dict.fromkeys(tick.reference.report.binding))
-        now = time.monotonic()
-        if now >= self._due and self._source.show(
-            ShownTick(tick, tuple(self._binding), dict(self._last), self._recording())
-        ):
-            self._due = now + _PERIOD
-            self._binding = {}
-
-    def _recording(self) -> str:
-        if not self._recorded:
-            return ""
-        return f"records episode {self._episodes}" if self._open else f"records; {self._episodes} episodes so far"
+def _part(moved: Array, at: int) -> Seven:
+    """The pose of a part, whose quaternion MuJoCo writes w x y z."""
+    x, y, z, qw, qx, qy, qz = moved[at : at + 7].round(_DIGITS).tolist()
+    return x, y, z, qx, qy, qz, qw

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 import numpy as np
@@ -13,81 +13,16 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from q2r2_control.config.bindings import Action, BindingSettings
-from q2r2_control.events import REFUSALS, Event
 from q2r2_control.summary.tick import Tick
-from q2r2_control.teleop.arm_states import ArmState
-from q2r2_control.types import ActiveLimit, LimitKind
-from q2r2_control.wording import limit_name, sentence
+from q2r2_control.types import ActiveLimit
+from q2r2_control.viewer.arm_words import ArmWords
+from q2r2_control.wording import limit_name
 
-# A tool nearer to its target than this follows; what holds it back beyond that is said [m], [rad].
-_FOLLOWS, _TURNED = 0.005, 0.05
-_HELD_BY = {LimitKind.POSITION: "at its limit", LimitKind.VELOCITY: "as fast as it may turn"}
 _REFRESH_RATE = 6.0  # [Hz]
 # The loop gets the interpreter back within this time from drawing, which takes milliseconds of Python at a time [s].
 _SWITCH_INTERVAL = 2e-5
 _LIMITS_SHOWN, _BAR = 4, 20
-_FOLLOWS_WHAT = {str(ArmState.CARRIED): "goes with the other arm", str(ArmState.POLICY): "follows the policy"}
 _NEAR = 0.01  # a pair with less to spare is coloured [m]
-
-
-def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[ActiveLimit], last: Event | None) -> str:
-    """Why ``arm``, whose joints have these names, is where it is.
-
-    ``binding``: limits and pairs that held the last steps back, as in a report; ``last``: its last event.
-    """
-    if not tick.following:
-        return "the run ends"
-    if tick.states[arm] in (ArmState.ALIGNING, ArmState.HOMING):
-        return tick.states[arm]
-    if not tick.engaged[arm]:
-        if last is None:
-            return "not engaged yet"
-        return sentence(last.reason) if last.kind in REFUSALS else f"{tick.states[arm]}: {sentence(last.reason)}"
-    distance, angle = tick.tracking_error(arm)
-    if not (distance > _FOLLOWS or angle > _TURNED):
-        return _FOLLOWS_WHAT.get(tick.states[arm], "follows the hand")
-    return _held_by(tick, arm, joints, binding) or ("catches up" if np.isfinite(distance) else "holds")
-
-
-def next_press(tick: Tick, arm: str, bindings: BindingSettings) -> str:
-    """The effect of the next press of each button of the arm's hand, and of its dead man."""
-    state = tick.states[arm]
-    if not tick.connected:
-        return "nothing: no input is connected"
-    if state == ArmState.ALIGNING:
-        return "release both buttons to go on"
-    if state == ArmState.HOMING:
-        return "any press stops the way home"
-    if state == ArmState.CARRIED:
-        return f"{bindings.words_of(Action.CARRY)} of either hand ends it, or a pause"
-    if state == ArmState.STOPPED:
-        return f"{bindings.words_of(Action.STOP)} goes on"
-    moves = state in (ArmState.ENGAGED, ArmState.PAUSING)
-    words = {
-        Action.PAUSE_TOGGLE: "pauses" if moves else "engages",
-        Action.GRIPPER_TOGGLE: "opens the gripper" if tick.targets[arm].gripper < 0.5 else "closes the gripper",
-        Action.DEAD_MAN: "let go pauses" if moves else "held engages",
-    }
-    bound = ((bindings.words_of(action), what) for action, what in words.items())
-    return ", ".join(f"{control} {what}" for control, what in bound if control is not None)
-
-
-def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[ActiveLimit]) -> str | None:
-    """The pair or limit of an arm that is nearest to what moves the tool, if any is at work."""
-    report = tick.reference.report
-    pairs = [limit.names for limit in binding if limit.kind is LimitKind.SEPARATION]
-    pairs = [pair for pair in pairs if any(body.startswith(f"{arm}_") for body in pair)]
-    if report.tightest_pair in pairs:
-        return f"held by {' | '.join(report.tightest_pair)}, {1e3 * report.margin:.0f} mm to spare"
-    if pairs:
-        return f"held by {' | '.join(pairs[0])}"
-    if any(limit.kind is LimitKind.TOOL_SPEED and limit.names == (arm,) for limit in binding):
-        return "its tool is as fast as it may be"
-    for kind, words in _HELD_BY.items():
-        if mine := [limit.names[0] for limit in binding if limit.kind is kind and limit.names[0] in joints]:
-            return f"{mine[0]} {words}"
-    return None
 
 
 class LiveTable:
@@ -96,21 +31,19 @@ class LiveTable:
     def __init__(
         self,
         title: str,
-        joints: Mapping[str, Collection[str]],
-        bindings: BindingSettings,
+        words: ArmWords,
         steps: Sequence[tuple[float, str]] = (),
         duration: float | None = None,
         *,
         simulated_time: bool = False,
     ) -> None:
-        """``joints``: names of those that move each arm; ``bindings``: what the hands' controls do.
+        """``words`` are those of the run's arms.
 
         ``steps`` of the work, from when on and in words, of a run that takes ``duration``, both in [s].
         ``simulated_time`` is True if the table shall say how fast the run is, compared with real time.
         """
-        self._title, self._joints, self._bindings = title, joints, bindings
+        self._title, self._words = title, words
         self._steps, self._duration = steps, duration
-        self._last: dict[str, Event] = {}  # of each arm
         self._newest: Tick | None = None
         self._count = 0
         self._binding: dict[ActiveLimit, None] = {}
@@ -125,8 +58,7 @@ class LiveTable:
         self._binding.update(dict.fromkeys(tick.reference.report.binding))
         if tick.impedance is not None:
             self._repelled.update(dict.fromkeys(tick.impedance.repelled))
-        for event in tick.events:
-            self._last[event.arm] = event
+        self._words.follow(tick.events)
 
     @contextmanager
     def shown(self, console: Console) -> Iterator[None]:
@@ -188,9 +120,8 @@ class LiveTable:
             table.add_row(name, *values)
         if tick.sessions:
             table.add_row("cabinet", *(tick.sessions[arm] for arm in arms))
-        words = [why(tick, arm, self._joints[arm], binding, self._last.get(arm)) for arm in arms]
-        table.add_row("why", *map(escape, words))
-        table.add_row("next press", *(next_press(tick, arm, self._bindings) for arm in arms))
+        table.add_row("why", *(escape(self._words.why(tick, arm, binding)) for arm in arms))
+        table.add_row("next", *(escape(self._words.next_press(tick, arm)) for arm in arms))
         table.add_section()
         report = tick.reference.report
         names = [*map(limit_name, binding), *(f"{joint} pushed off its limit" for joint in repelled)]

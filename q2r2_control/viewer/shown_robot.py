@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import Self
 
 from q2r2_control.config.cell import Config
+from q2r2_control.device_words import DeviceWords
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
+from q2r2_control.viewer.arm_words import ArmWords
 
 
 @dataclass(frozen=True)
@@ -30,3 +32,8 @@ class ShownRobot:
             joints={arm: its.joints for arm, its in robot.arms.items()},
             fingers={arm: its.finger_joints for arm, its in robot.arms.items()},
         )
+
+    def words(self, device: DeviceWords) -> ArmWords:
+        """Sentences on the arms, in the words of the ``device`` that drives them."""
+        joints = {arm: [self.joint_names[index] for index in its] for arm, its in self.joints.items()}
+        return ArmWords(joints, self.config.teleop.bindings, device)

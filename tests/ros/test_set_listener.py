@@ -145,7 +145,7 @@ WHY: dict[str, tuple[tuple[NodeView, ...], str]] = {
     "no node": ((), "no node teleoperates this arm"),
     "a silent node": ((arm(age=7.2),), "/left_arm is silent for 7 s"),
     "something in the way": ((arm("/target has no subscriber"),), "/target has no subscriber"),
-    "ready": ((READY,), "lower of the left hand engages (last: lost: cable)"),
+    "ready": ((READY,), "A or X of the left hand engages (last: lost: cable)"),
     "stopped by a person": ((arm("stopped: by the left hand", state="stopped"),), "/left_arm/reset, or"),
     "on the way home": ((arm(state="homing"),), "goes home"),
     "engaged": ((ENGAGED, CONTROLLER), "follows the hand"),

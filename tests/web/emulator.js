@@ -52,8 +52,8 @@ window.press = async (button, frames = 8) => {
 };
 
 window.full = false; // whether the socket takes nothing at the moment
-const Socket = window.WebSocket;
-window.WebSocket = class extends Socket {
+const Socket = globalThis.WebSocket;
+globalThis.WebSocket = class extends Socket {
   get bufferedAmount() {
     return window.full ? 1 : super.bufferedAmount;
   }

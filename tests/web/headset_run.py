@@ -10,7 +10,7 @@ import sys
 
 from q2r2_control.inputs.webxr.webxr import WebXrInput
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.viewer.headset_display import HeadsetView
+from q2r2_control.viewer.headset_view import HeadsetView
 from tests.support.processes import cell
 from tests.web.browser import PATIENCE
 from tests.web.slow_run import SlowTime, patient

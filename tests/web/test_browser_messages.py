@@ -44,7 +44,7 @@ CHANGES: list[dict[str, Any]] = [
 @pytest.fixture
 def gui() -> Iterator[viser.GuiApi]:
     door = Door("127.0.0.1", 0)
-    with door.guards():
+    with door.guards("cell"):
         server = viser.ViserServer(host="127.0.0.1", port=door.port, verbose=False)
     yield server.gui
     server.stop()

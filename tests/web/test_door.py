@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import ssl
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -11,7 +12,9 @@ from urllib.parse import urlsplit
 
 import pytest
 import viser
+from websockets import Headers
 from websockets.exceptions import InvalidStatus
+from websockets.http11 import Request, Response
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
@@ -19,12 +22,13 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.page_door import is_loopback
 from q2r2_control.inputs.webxr.certificate import own_certificate
 from q2r2_control.viewer.web.door import Door
+from q2r2_control.viewer.web.page_file import PageFile
 
 
 @pytest.fixture(scope="module", params=["127.0.0.1", "0.0.0.0"], ids=["loopback", "all addresses"])
 def door(request: pytest.FixtureRequest) -> Iterator[Door]:
     made = Door(request.param, 0)
-    with made.guards():
+    with made.guards("cell"):
         server = viser.ViserServer(host=request.param, port=made.port, verbose=False)
     yield made
     server.stop()
@@ -70,6 +74,35 @@ def test_only_the_own_page_connects(door: Door) -> None:
     else:
         assert status(door) == 200
         assert status(door, Host=f"example.org:{door.port}") == 403  # a name that was made to lead here
+        assert status(door, Host="example.org:9000") == 403
+
+
+def test_a_forwarded_port_is_let_in_and_another_name_is_told_what_is_allowed(door: Door) -> None:
+    if door.token is not None:
+        pytest.skip("beyond loopback the token decides")
+    assert status(door, Host="localhost:9000") == 200  # after ssh -L 9000:localhost:PORT
+    request = Request("/", Headers({"Host": "example.org:9000"}))
+    assert door.refusal(request) == (
+        "unknown Host 'example.org:9000'; allowed: 127.0.0.1, [::1], localhost, at any port, "
+        f"such as localhost:9000 after ssh -L 9000:localhost:{door.port}"
+    )
+    # A page of another server of this computer is another site still.
+    stranger = Headers({"Host": f"localhost:{door.port}", "Origin": "http://localhost:5000", "Upgrade": "websocket"})
+    assert str(door.refusal(Request("/", stranger))).startswith("unknown Origin")
+    own = Headers({"Host": "localhost:9000", "Origin": "http://localhost:9000", "Upgrade": "websocket"})
+    assert door.refusal(Request("/", own)) is None
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "identity"])
+def test_the_tab_of_the_page_has_the_name_of_the_cell(encoding: str) -> None:
+    plain = b"<head><title>Viser</title></head>"
+    body = gzip.compress(plain) if encoding == "gzip" else plain
+    headers = Headers({"Content-Encoding": encoding, "Content-Length": str(len(body))})
+    response = Response(200, "OK", headers, body)
+    PageFile("<two> arms").change(response)
+    changed = gzip.decompress(response.body) if encoding == "gzip" else response.body
+    assert b"<title>&lt;two&gt; arms</title>" in changed
+    assert response.headers["Content-Length"] == str(len(response.body))
 
 
 def test_no_more_pages_than_a_few_connect(door: Door) -> None:
@@ -85,7 +118,7 @@ def test_beyond_this_machine_the_page_comes_by_tls_and_is_neither_kept_nor_frame
     far = Door("0.0.0.0", 0, str(certificate), ["192.168.1.5", "10.0.0.7"])
     token = token_of(far)
     assert far.urls == tuple(f"https://{address}:{far.port}/{token}" for address in ("192.168.1.5", "10.0.0.7"))
-    with far.guards():
+    with far.guards("cell"):
         server = viser.ViserServer(host="0.0.0.0", port=far.port, verbose=False)
     trusting = ssl.create_default_context(cafile=str(certificate))
     connection = HTTPSConnection("127.0.0.1", far.port, context=trusting)

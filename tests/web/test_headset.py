@@ -113,7 +113,7 @@ def test_hands_engage_the_arms_move_them_by_the_rooms_axes_and_feel_it(enter: An
     page.evaluate("hold(['x-button', 'y-button'], 'left', 0)")
     wait_for(page, "engaged")
     press(page, LOWER)
-    wait_for(page, "paused", "lower button")
+    wait_for(page, "paused", "{lower}")
     felt = page.evaluate("vibrations.filter(one => one.amplitude > 0).map(one => one.hand)")
     assert {"left", "right"} <= set(felt)
     assert page.evaluate("pulses") > 3

@@ -138,7 +138,7 @@ def test_a_package_that_is_missing_is_named_with_the_extra_that_has_it(
     monkeypatch.setattr("q2r2_control.inputs.webxr.webxr.find_spec", found.get)
     source = WebXrInput()
     if shows:
-        source.show_on(cast(Display, object()))
+        source.show_on(cast(Display, object()), {})
     with pytest.raises(InputError, match=re.escape(f"--input webxr needs {package}: {install_line('web')}")):
         source.start()
 

@@ -29,11 +29,25 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     wait_until(lambda: all(count(half, ORANGE) > 5 for half in np.array_split(pixels(page), 2, axis=1)))
     page.get_by_text("Pause both arms").click()
     wait_for_row(page, "why", 1, "a program asks for a pause")
+    assert table(page)["next"] == ["nothing: a script moves the hands"] * 2
+    # News that change no state, as those of a slider, do not hide the reason.
+    page.get_by_text("Settings", exact=True).click()
+    page.locator("input:visible").first.fill("50")
+    page.locator("input:visible").first.press("Enter")
+    page.wait_for_timeout(5e3)
+    assert table(page)["why"] == ["a program asks for a pause"] * 2
     page.get_by_text("Bring both arms home").click()
     wait_for_row(page, "why", 0, "at home")
+    assert page.title() == "dual_iiwa7"
     page.get_by_text("Stop: rest, and end the run").click()
     summary = run.end()
     assert summary["at_rest"]
+    kinds = [event["kind"] for event in summary["events"]]
+    assert kinds.index("control_changed") < kinds.index("homing_arrived")
+    # The page that stays on the screen says so, and offers nothing that would not be done.
+    wait_for(page, "The run is over after")
+    assert not page.get_by_text("certified").is_visible()
+    assert not page.get_by_text("Bring both arms home").is_visible()
     # The same page shows the next run at this address.
     command = ("q2r2_control", "run", CELL, "--plant", "kinematic", "--headless", "--json", "--web", "--web-port")
     again = start(*command, str(urlsplit(run.url).port))
@@ -47,6 +61,8 @@ def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open
     page, other = open_page(run.url), open_page(run.url)
     for one in (page, other):
         wait_for(one, "certified")
+    for words in table(page)["next"]:
+        assert words.startswith("drag a tool's arrows or rings to engage")
     before = tool(page)
     grab(page, "left")
     wait_for_row(page, "state", 0, "engaged")
@@ -69,6 +85,19 @@ def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open
     assert "connection lost" in table(other)["why"][0]
     run.interrupt()
     assert run.end()["at_rest"]
+
+
+def test_the_scene_and_the_panel_share_the_screen_of_a_phone(open_page: Open, start: Start) -> None:
+    page = open_page(start(SLOW, "web", "0", "0.01").url)
+    page.set_viewport_size({"width": 390, "height": 800})
+    wait_for(page, "certified")
+    scene = page.locator("canvas").first.bounding_box()
+    panel = page.locator(".mantine-Paper-root").first.bounding_box()
+    assert scene is not None
+    assert panel is not None
+    assert scene["height"] >= 300.0
+    assert scene["y"] + scene["height"] <= panel["y"]
+    assert (scene["width"], panel["width"]) == (390.0, 390.0)
 
 
 def test_a_replay_has_a_time_line_and_a_page_with_a_token_comes_back_when_it_is_loaded_anew(

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 from q2r2_control.config.strict import Network
 from q2r2_control.inputs.session import Reception
+from q2r2_control.inputs.webxr.page_messages import HeadsetRequest
+from q2r2_control.inputs.webxr.shown import ShownScene, ShownState
 
 
 class Display(Protocol):
     """Makes a headset's display of a run; made by the run, used in the process of the page."""
 
-    def scene(self) -> Mapping[str, Any]:
+    def scene(self) -> ShownScene:
         """Sent once to each page, as JSON."""
 
-    def message(self, shown: Any) -> Mapping[str, Any]:
+    def message(self, shown: Any) -> ShownState:
         """The JSON of what was given to :meth:`DisplayInput.show`."""
 
 
@@ -57,6 +59,12 @@ class Received(NamedTuple):
     """The newest hands of the page that drives."""
 
     receptions: list[Reception]
+
+
+class Requested(NamedTuple):
+    """A button of a page was pressed."""
+
+    request: HeadsetRequest
 
 
 class Logged(NamedTuple):

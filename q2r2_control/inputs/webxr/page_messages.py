@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from enum import StrEnum
 from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from q2r2_control.config.strict import config_error
+from q2r2_control.device_words import QUEST_WORDS
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.messages import HandMessage, HandPose, MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, Reception
@@ -15,7 +18,21 @@ from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandFault, HandIn
 
 LONGEST = 4096  # of a message [bytes]; those of the page have under 600
 # A pinch of bare fingers, or a touch of a phone's screen: devices without any other button.
-CONTROLS = DeviceControls(buttons=(*QUEST_CONTROLS.buttons, "pinch"), axes=QUEST_CONTROLS.axes)
+_NOUNS = {**QUEST_WORDS.nouns, "lower": "A, X or Space", "upper": "B, Y or G", "pinch": "the pinch"}
+_ABSENT = "nothing: no browser drives, open the page"
+CONTROLS = DeviceControls(
+    buttons=(*QUEST_CONTROLS.buttons, "pinch"),
+    axes=QUEST_CONTROLS.axes,
+    words=replace(QUEST_WORDS, nouns=_NOUNS, absent=_ABSENT),
+)
+
+
+class HeadsetRequest(StrEnum):
+    """The requests of the page's buttons. A page that watches may ask for a stop only."""
+
+    STOP = "stop"  # bring the arms to rest, and end the run
+    HOME = "home"
+
 
 _Hand = Literal["left", "right"]
 _Seven = tuple[float, float, float, float, float, float, float]
@@ -41,6 +58,7 @@ class PageMessage(_PageModel):
 
     seq: int = Field(ge=0, le=1 << 53)
     hands: dict[_Hand, HeadsetHand] = Field(default_factory=dict)
+    request: HeadsetRequest | None = None  # of its buttons
     virtual: bool = False  # keys or a gamepad move the hands, which rest without noise
 
     @property

@@ -8,7 +8,6 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from importlib.resources import files
 from ipaddress import ip_address
 from threading import Thread
@@ -24,8 +23,6 @@ from q2r2_control.inputs.connections import TURN
 from q2r2_control.inputs.listener import (
     MAX_HOSTS_NAMED,
     HostLog,
-    Peer,
-    RateLimit,
     is_allowed,
     verdicts,
     written,
@@ -39,42 +36,19 @@ from q2r2_control.inputs.webxr.exchange import (
     Logged,
     Lost,
     Received,
+    Requested,
     Shown,
 )
-from q2r2_control.inputs.webxr.page_messages import LONGEST, PageMessage, read
+from q2r2_control.inputs.webxr.page_client import MAX_MESSAGES_PER_SECOND, PageClient
+from q2r2_control.inputs.webxr.page_messages import LONGEST, HeadsetRequest, read
 from q2r2_control.types import HapticFeedback
 
-MAX_MESSAGES_PER_SECOND = 300  # headsets send up to 120
-REFUSED, DROPPED = 4001, 4002  # codes with which a socket is closed, for the page
+REFUSED, DROPPED, OVER, FREE = 4001, 4002, 4003, 4004  # codes with which a socket is closed, for the page
+_MOST_WATCHERS = 8
+_WATCHED = 0.1  # between states for pages that watch [s]
 _MOST_SOCKETS = 16
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 _POLICY = "default-src 'self'; connect-src 'self'; style-src 'self'; img-src 'self' blob: data:; base-uri 'none'"
-_LONGEST_REASON = 120  # of a closed socket [bytes]
-
-
-class PageClient(Peer):
-    """A page that is connected."""
-
-    def __init__(self, connection: ServerConnection, host: str, peer: str, page: str, now: float) -> None:
-        # A page keeps its number when it is reloaded, as the app repeats its registrations.
-        super().__init__(peer, host, since=now, last_frame=now, registrations=({"page": page} if page else {}, {}))
-        self.connection = connection
-        self.newest: PageMessage | None = None  # that is not passed on yet
-        self.acknowledged = -1  # number of the newest message
-        self.refused_hosts: set[str] = set()
-        self.due = asyncio.Event()
-        self.vibrations: dict[str, HapticFeedback] = {}  # the newest of each hand
-        self.shown: Any = None
-        self.picture: bytes | None = None
-        self.rate = RateLimit(MAX_MESSAGES_PER_SECOND)
-        self.reason = ""  # why this side has ended it
-        self.closing: asyncio.Future[None] | None = None
-
-    def end(self, code: int, reason: str) -> None:
-        """Close the socket, which takes as long as the page likes."""
-        self.reason = reason
-        shown = reason.encode()[:_LONGEST_REASON].decode(errors="ignore")
-        self.closing = asyncio.ensure_future(self.connection.close(code, shown))
 
 
 class PageServer:
@@ -86,6 +60,8 @@ class PageServer:
         self._log = HostLog(_logger_of(answer))
         self._driver: PageClient | None = None
         self._waiting: list[PageClient] = []
+        self._watchers: list[PageClient] = []  # which never drive
+        self._watched = 0.0  # when they were shown the last state [s]
         self._sockets = 0
         folder = files(__package__).joinpath("page")
         self._files = {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir() if file.is_file()}
@@ -120,6 +96,14 @@ class PageServer:
             watch = asyncio.create_task(self._watch())
             await ended.wait()
             watch.cancel()
+            pages = self._pages
+            for client in pages:
+                client.end(OVER, "the run is over")
+            await asyncio.gather(*(client.closing for client in pages if client.closing is not None))
+
+    @property
+    def _pages(self) -> list[PageClient]:
+        return [*([] if self._driver is None else [self._driver]), *self._waiting, *self._watchers]
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
         """A file of the page, a refusal, or None for the socket."""
@@ -146,13 +130,17 @@ class PageServer:
 
     async def _serve(self, connection: ServerConnection) -> None:
         assert connection.request is not None
-        page = parse_qs(urlsplit(connection.request.path).query).get("page", [""])[0][:64]
+        query = parse_qs(urlsplit(connection.request.path).query)
+        page, watches = query.get("page", [""])[0][:64], "watch" in query
         host, peer = _peer_of(connection)
         client = PageClient(connection, host, peer, page, self._clock())
         self._sockets += 1
-        self._waiting.append(client)
+        if watches:
+            self._watch_with(client)
+        else:
+            self._waiting.append(client)
         self._settle(client.since)
-        sending = asyncio.create_task(self._send(client))
+        sending = asyncio.create_task(client.send_newest(self._scene, self._setup.display))
         reason = "closed by the page"
         try:
             async for message in connection:
@@ -175,6 +163,9 @@ class PageServer:
             raise ProtocolError(f"more than {MAX_MESSAGES_PER_SECOND} messages in a second")
         message = read(text)
         client.last_frame, client.acknowledged = now, message.seq
+        self._ask(client, message.request)
+        if client in self._watchers:
+            return
         if message.hands:
             client.last_pose = now
         if client is not self._driver:
@@ -186,6 +177,23 @@ class PageServer:
         elif client.newest.controls != message.controls:
             self._pass_on(client)
         client.newest = message
+
+    def _ask(self, client: PageClient, request: HeadsetRequest | None) -> None:
+        """Pass a button's request on: of every page a stop, of the one that drives any."""
+        is_stop = request is HeadsetRequest.STOP
+        is_home = request is HeadsetRequest.HOME and client is self._driver and client.requests.take(self._clock())
+        if request is not None and (is_stop or is_home):
+            self._answer(Requested(request))
+
+    def _watch_with(self, client: PageClient) -> None:
+        """Show the run to a page that never drives, while another one does."""
+        if self._driver is None or len(self._watchers) >= _MOST_WATCHERS:
+            reason = "nobody drives" if self._driver is None else f"{_MOST_WATCHERS} pages watch"
+            client.end(FREE if self._driver is None else REFUSED, reason)
+        else:
+            self._watchers.append(client)
+            client.driver = self._driver.peer
+            client.due.set()
 
     def _pass_on(self, client: PageClient) -> None:
         message, client.newest = client.newest, None
@@ -203,32 +211,15 @@ class PageServer:
                 driver.vibrations[request.hand] = request
             case Shown():
                 driver.shown = request.content
+                if self._clock() >= self._watched + _WATCHED:
+                    self._watched = self._clock()
+                    for client in self._watchers:
+                        client.shown = request.content
+                        client.due.set()
             case CameraPicture():
                 driver.picture = request.jpeg
                 return  # it goes after the next pose has come
         driver.due.set()
-
-    async def _send(self, client: PageClient) -> None:
-        """Send the newest only, whenever the page has taken what was sent before."""
-        connection = client.connection
-        try:
-            if self._scene is not None:
-                await connection.send(self._scene)
-            while True:
-                await client.due.wait()
-                client.due.clear()
-                vibrations, client.vibrations = client.vibrations, {}
-                shown, client.shown = client.shown, None
-                for vibration in vibrations.values():
-                    await connection.send(json.dumps({"vibration": asdict(vibration)}))
-                if shown is not None and self._setup.display is not None:
-                    state = self._setup.display.message(shown)
-                    await connection.send(json.dumps({"state": state, "acknowledged": client.acknowledged}))
-                if client.picture is not None and not connection.transport.get_write_buffer_size():
-                    picture, client.picture = client.picture, None
-                    await connection.send(picture)
-        except ConnectionClosed:
-            pass
 
     async def _watch(self) -> None:
         """Look at silent pages, and at those that wait."""
@@ -266,10 +257,13 @@ class PageServer:
 
     def _forget(self, client: PageClient, reason: str) -> None:
         """A page is gone, or does not count any more; may be called twice."""
-        if client in self._waiting:
-            self._waiting.remove(client)
+        for pages in (self._waiting, self._watchers):
+            if client in pages:
+                pages.remove(client)
         if client is self._driver:
             self._driver = None
+            for watcher in self._watchers:
+                watcher.end(FREE, "nobody drives")
             self._answer(Lost(reason))
             self._write(client, logging.WARNING if client.reason else logging.INFO, f"gone: {reason}")
 

@@ -6,7 +6,7 @@ import io
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
@@ -36,9 +36,10 @@ from q2r2_control.inputs.webxr.exchange import (
     Logged,
     Lost,
     Received,
+    Requested,
     Shown,
 )
-from q2r2_control.inputs.webxr.page_messages import CONTROLS
+from q2r2_control.inputs.webxr.page_messages import CONTROLS, HeadsetRequest
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
@@ -79,6 +80,7 @@ class WebXrInput:
         self._silence = silence
         self._stream = HandStream(watch or HandsWatch())
         self._display: Display | None = None
+        self._requests: Mapping[HeadsetRequest, Callable[[], None]] = {}
         self._process: HelperProcess | None = None
         self._ready = Event()
 
@@ -107,9 +109,9 @@ class WebXrInput:
         teleop = config.teleop.model_copy(update={"axes": TeleopSettings().axes})
         return config.model_copy(update={"teleop": teleop})
 
-    def show_on(self, display: Display) -> None:
-        """Let pages show a run by ``display``; before :meth:`start`."""
-        self._display = display
+    def show_on(self, display: Display, requests: Mapping[HeadsetRequest, Callable[[], None]]) -> None:
+        """Let pages show a run by ``display``, and ask for ``requests``; before :meth:`start`."""
+        self._display, self._requests = display, requests
 
     def show(self, content: Any) -> bool:
         """Show the newest state of the run; False where the last one still waits. Never waits."""
@@ -167,6 +169,11 @@ class WebXrInput:
         """The page's first URL; None before :meth:`start`."""
         return self.urls[0] if self.urls else None
 
+    @property
+    def driver(self) -> str | None:
+        """The address of the headset that drives; None if none does."""
+        return self._stream.peer
+
     def poll(self, now: float) -> list[HandSample]:
         return self._stream.take()
 
@@ -209,6 +216,9 @@ class WebXrInput:
                 self._stream.admit(peer)
             case Lost(reason):
                 self._stream.lose(reason)
+            case Requested(request):
+                if request in self._requests:
+                    self._requests[request]()
             case Logged(level, text):
                 _LOG.log(level, "%s", text)
             case Listening(port, urls):

@@ -8,6 +8,7 @@ from typing import Any
 
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
+from q2r2_control.device_words import QUEST_WORDS
 from q2r2_control.events import Reason
 from q2r2_control.teleop.arm_states import AT_REST, ArmState
 from q2r2_control.wording import sentence
@@ -153,10 +154,11 @@ def _why(node: NodeView, controller: NodeView | None, cell: Config) -> str:
         return f"{node.message}; {node.name}/reset, or the control that stops, goes on"
     if state in AT_REST and values.get("ready"):
         bindings = cell.teleop.bindings
-        press = bindings.words_of(Action.PAUSE_TOGGLE) or bindings.words_of(Action.DEAD_MAN) or "a press"
-        last = values.get("last_event", "")
+        control = bindings.words_of(Action.PAUSE_TOGGLE) or bindings.words_of(Action.DEAD_MAN)
+        press = "a press" if control is None else QUEST_WORDS.noun(control)
+        last = str(values.get("last_event", "")).removeprefix(f"{state}: ")  # the state stands beside this
         return f"waits for its operator: {press} of the {values.get('hand')} hand engages (last: {last})"
-    return node.message
+    return node.message.removeprefix(f"{state}: ")
 
 
 def _why_engaged(values: Mapping[str, Any], controller: NodeView | None, arm: str) -> str:

@@ -16,6 +16,7 @@ from websockets.http11 import Request, Response
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.page_door import PageDoor, protect, text_response
 from q2r2_control.viewer.web.browser_messages import LONGEST_MESSAGE, BrowserMessages, FilteredConnection
+from q2r2_control.viewer.web.page_file import PageFile
 
 _MOST_CLIENTS = 12
 # viser's page is one file: its scripts and styles are in it, it compiles WebAssembly, and it starts workers from blobs.
@@ -52,12 +53,14 @@ class Door(PageDoor):
         return secrets.compare_digest(path.strip("/").encode(), str(self.token).encode())
 
     @contextmanager
-    def guards(self) -> Iterator[None]:
+    def guards(self, name: str) -> Iterator[None]:
         """Servers of ``websockets`` that are started meanwhile, as viser's, listen behind this door.
+
+        Their page has the ``name`` of a cell, which is the browser tab's.
 
         Raises :class:`ConfigError` where none was: then nothing would check requests.
         """
-        serve, used = websockets.asyncio.server.serve, False
+        serve, used, page = websockets.asyncio.server.serve, False, PageFile(name)
 
         def guarded(handler: Callable[[ServerConnection], Awaitable[None]], *_: Any, **settings: Any) -> Any:
             nonlocal used
@@ -70,6 +73,7 @@ class Door(PageDoor):
                 request.path = "/"  # the page is all that viser serves
                 response: Response | None = answer(connection, request)
                 if response is not None:
+                    page.change(response)
                     protect(response, _POLICY)
                     response.headers["X-Frame-Options"] = "DENY"  # a page around this one could steal a click
                 return response

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import pinocchio as pin
 
+from q2r2_control.device_words import DeviceWords
 from q2r2_control.events import Event
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit, Array
@@ -33,6 +34,7 @@ class PageSetup(ShownRobot):
     parts: Mapping[str, int]  # loose objects by name -> where their pose begins in ``Frame.moved``
     requests: tuple[PageRequest, ...]  # whose buttons are shown
     changes: tuple[PageSetting, ...]  # whose sliders are shown
+    device: DeviceWords  # of what drives the arms
     driven: bool  # whether the page is the run's input
     replayed: bool  # whether the run is a recorded one
 
@@ -50,6 +52,7 @@ class Frame:
     end: float = 0.0  # of what can be shown of a replay, by its time [s]
     ages: Mapping[str, float] = field(default_factory=dict)  # of the newest pose of each arm's hand [s]
     why: Mapping[str, str] = field(default_factory=dict)  # of each arm, where another program knows it
+    driver: str = ""  # who drives, in words; empty where that is not known
     notice: str = ""  # what became of a request
     pictures: Mapping[str, bytes] = field(default_factory=dict)  # newest ones by camera, JPEG or PNG
 

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any, Self
 
 from q2r2_control.config.cell import Config
+from q2r2_control.device_words import QUEST_WORDS, DeviceWords
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.addresses import reachable_addresses
@@ -64,6 +65,7 @@ class Page:
         changes: tuple[PageSetting, ...] = (),
         *,
         parts: Mapping[str, int] = MappingProxyType({}),
+        device: DeviceWords = QUEST_WORDS,
         driven: bool = False,
         replayed: bool = False,
     ) -> str:
@@ -86,6 +88,7 @@ class Page:
             parts=dict(parts),
             requests=requests,
             changes=changes,
+            device=device,
             driven=driven,
             replayed=replayed,
         )

@@ -9,10 +9,10 @@ from threading import Event as Flag
 from threading import Thread
 from typing import Any
 
-from q2r2_control.events import Event
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.summary.tick import Tick
+from q2r2_control.viewer.arm_words import Told, told_after
 from q2r2_control.viewer.web.exchange import Frame, PagePlay, PageRequest, PageSeek
 from q2r2_control.viewer.web.view import PageView
 
@@ -28,7 +28,7 @@ class Playback:
         self._view = view
         self._frames: list[Frame] = []
         self._times: list[float] = []  # of the frames
-        self._last: dict[str, Event] = {}  # of each arm
+        self._told: dict[str, Told] = {}  # of each arm
         self._ticks, self._slowest = 0, 0.0
         self._position, self._playing, self._complete = 0.0, True, False
         self._ended = Flag()
@@ -44,10 +44,10 @@ class Playback:
         """Keep one tick where a frame is due."""
         self._ticks += 1
         self._slowest = max(self._slowest, tick.compute_time)
-        self._last |= {event.arm: event for event in tick.events}
+        self._told = told_after(self._told, tick.events)
         if not self._times or tick.t >= self._times[-1] + _KEPT:
             binding = tuple(tick.reference.report.binding)
-            events = tuple(self._last.values())
+            events = tuple(event for told in self._told.values() for event in told.events)
             self._frames.append(Frame(tick, events, binding, self._ticks, self._slowest, None))
             self._times.append(tick.t)
             self._ticks, self._slowest = 0, 0.0

@@ -8,10 +8,10 @@ import numpy as np
 import pinocchio as pin
 import viser
 
-from q2r2_control.robot.pairs import pair_names
 from q2r2_control.types import Array, RobotState
 from q2r2_control.viewer.joint_tree import Colour, JointTree, colour_of
 from q2r2_control.viewer.state_colours import AMBER, GREEN, GREY, RED, state_colour
+from q2r2_control.viewer.tightest_pair import TightestPair
 from q2r2_control.viewer.web.exchange import Frame, PageSetup
 from q2r2_control.viewer.web.figure import CapsuleFigure, ObstacleFigure, RobotFigure, place
 
@@ -44,9 +44,8 @@ class CellScene:
     def __init__(self, server: viser.ViserServer, setup: PageSetup) -> None:
         scene, config = server.scene, setup.config
         self._setup = setup
-        self._model, self._pairs = setup.model, setup.collision_model
-        self._names = pair_names(self._pairs)
-        self._data, self._pair_data = self._model.createData(), self._pairs.createData()
+        self._model, self._data = setup.model, setup.model.createData()
+        self._tightest = TightestPair(setup.model, setup.collision_model)
         self._tree = JointTree(setup)
         scene.set_up_direction("+z")
         scene.configure_default_lights(cast_shadow=False)  # a browser without a graphics card is ten times as fast
@@ -67,7 +66,7 @@ class CellScene:
             RobotFigure(scene, "/robot", self._tree),
             RobotFigure(scene, "/ghost", self._tree, True),
         )
-        self._capsules = CapsuleFigure(scene, "/capsules", self._pairs)
+        self._capsules = CapsuleFigure(scene, "/capsules", setup.collision_model)
         self._obstacles = ObstacleFigure(scene, "/obstacles")
         self._ghost_always = self._add_choices(server)
         arms = list(setup.joints)
@@ -189,16 +188,13 @@ class CellScene:
 
     def _show_pair(self, frame: Frame) -> None:
         report = frame.tick.reference.report
-        q = frame.tick.reference.q
-        pin.updateGeometryPlacements(self._model, self._data, self._pairs, self._pair_data, q)
+        self._tightest.place(frame.tick.reference.q)
         if self._capsules.root.visible:
-            self._capsules.show(self._pair_data)
-        known = report.tightest_pair in self._names and math.isfinite(report.margin)
-        self._pair.visible = self._pair_label.visible = known
-        if not known:
+            self._capsules.show(self._tightest.placed)
+        ends = self._tightest.ends(report)
+        self._pair.visible = self._pair_label.visible = ends is not None
+        if ends is None:
             return
-        result = pin.computeDistance(self._pairs, self._pair_data, self._names.index(report.tightest_pair))
-        ends = np.array([result.getNearestPoint1(), result.getNearestPoint2()])
         calm = min(max(report.margin / _NEAR, 0.0), 1.0)
         colour = tuple(round(calm * one + (1.0 - calm) * other) for one, other in zip(GREEN, RED, strict=True))
         self._pair.points, self._pair.colors = ends[None], np.array([[colour, colour]], dtype=np.uint8)

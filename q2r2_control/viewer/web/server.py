@@ -19,6 +19,7 @@ from q2r2_control.viewer.web.panel import Panel
 from q2r2_control.viewer.web.scene import CellScene
 
 _NICENESS = 10  # the loop goes first
+_LAST_WORDS = 0.5  # for browsers to hear that the run is over, before their connections end [s]
 _RATE, _BURST = 500.0, 50.0  # answers a second, and at once; two hands that a page moves need 220 a second
 
 
@@ -74,7 +75,7 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
     with suppress(OSError):
         os.nice(_NICENESS)
     door, newest = Door(setup.host, setup.port, setup.certificate, setup.addresses), _Newest()
-    with door.guards():
+    with door.guards(setup.config.name):
         server = viser.ViserServer(host=setup.host, port=door.port, verbose=False)
     open_pages: set[int] = set()
 
@@ -104,4 +105,7 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
             panel.show(frame)
         if driving is not None:
             driving.show(frame)
+    panel.end()
+    server.flush()
+    time.sleep(_LAST_WORDS)
     server.stop()

@@ -19,6 +19,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
+from q2r2_control.viewer.loose_parts import places_of_parts
 from q2r2_control.viewer.web.exchange import (
     Frame,
     PageChange,
@@ -53,6 +54,8 @@ class PageView(Page):
         self._requests: dict[PageRequest, Callable[[], None]] = {}
         self._changes: dict[PageSetting, Callable[[float], None]] = {}
         self._hand_of: Callable[[str], str]  # that drives an arm
+        self._source: object = None  # of the hands
+        self._nobody = ""  # why no person drives
         super().__init__(host, port, self._do, certificate)
 
     def begin(self, pipeline: Pipeline, title: str, recorded: bool) -> str:
@@ -78,10 +81,8 @@ class PageView(Page):
         while (operator := getattr(source, "operator", None)) is not None:  # of a policy: its hands
             source = operator
         self._input = source if isinstance(source, WebInput) else None
-        parts = {}
-        if isinstance(plant, MujocoPlant):
-            self._plant = plant
-            parts = {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in config.mujoco.objects}
+        self._source, self._nobody = source, pipeline.input.controls.words.nobody
+        self._plant = plant if isinstance(plant, MujocoPlant) else None
         self._requests = {
             PageRequest.STOP: pipeline.stop,
             PageRequest.ENGAGE: pipeline.engage,
@@ -104,7 +105,8 @@ class PageView(Page):
             title,
             tuple(one for one in self._requests if one not in hidden),
             tuple(one for one in self._changes if one not in hidden),
-            parts=parts,
+            parts=places_of_parts(plant, config),
+            device=pipeline.input.controls.words,
             driven=self._input is not None,
             replayed=replayed,
         )
@@ -129,10 +131,26 @@ class PageView(Page):
         moved = None if self._plant is None else self._plant.observed_qpos
         stamps = {arm: self._heard.get(self._hand_of(arm)) for arm in tick.tools}
         ages = {arm: tick.now - stamp for arm, stamp in stamps.items() if stamp is not None}
-        frame = Frame(tick, tuple(self._events), tuple(self._binding), self._ticks, self._slowest, moved, ages=ages)
+        frame = Frame(
+            tick,
+            tuple(self._events),
+            tuple(self._binding),
+            self._ticks,
+            self._slowest,
+            moved,
+            ages=ages,
+            driver=self._driver,
+        )
         if self.send(frame):
             self._due = now + _PERIOD
             self._events, self._binding, self._ticks, self._slowest = [], {}, 0, 0.0
+
+    @property
+    def _driver(self) -> str:
+        """Who drives, in words; empty for an input that does not know."""
+        if self._nobody or not hasattr(self._source, "driver"):
+            return self._nobody
+        return "nobody drives" if self._source.driver is None else f"the headset at {self._source.driver} drives"
 
     def _do(self, answer: Any) -> None:
         """In a thread of its own."""

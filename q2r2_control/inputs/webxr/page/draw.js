@@ -1,17 +1,27 @@
-// Draws the robot, the targets and the board in WebGL 2. Matrices are column by column, as WebGL wants them.
+// Draws the run and the board in WebGL 2.
+
+import { Board } from "./board.js";
+import { beamOf, inverseOf, matrixOf, projection, scaleOf, times } from "./matrices.js";
+import { boxOf, gridOf } from "./shapes.js";
 
 // The run's world as the operator has it: x forward, y left, z up, and the robot a step ahead.
 const WORLD = new Float32Array([0, 0, -1, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -0.7, 1]);
-const BOARD = new Float32Array([0.6, 0, 0, 0, 0, 0.375, 0, 0, 0, 0, 1, 0, 0, 1.75, -2.0, 1]); // 1.2 m wide
+const ROOM = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]);
 const AXES = [[0.9, 0.2, 0.2], [0.2, 0.75, 0.3], [0.25, 0.45, 0.95]];
 const [LENGTH, THICKNESS, KNOB] = [0.1, 0.004, 0.02]; // of a target's axes, and its middle [m]
+const [LEASH, PAIR] = [0.003, 0.006]; // thickness of lines [m]
+const [AMBER, RED, GREEN] = [[0.9, 0.63, 0.12], [0.84, 0.22, 0.22], [0.18, 0.63, 0.35]];
+const [GREY, LINES, GHOST] = [[0.35, 0.38, 0.41], [0.62, 0.66, 0.7], [0.47, 0.63, 0.9]];
+const SHORT = 0.01; // ways that are not drawn [m]
+const CALM = 0.1; // a pair with more to spare is green [m]
+const CONTROLLER = [0.035, 0.035, 0.11]; // [m]
 const FIELD_OF_VIEW = 0.9; // of the page, upwards [rad]
-const [DOWN, ACROSS] = [Math.sin(0.25), Math.cos(0.25)]; // of a look from 1.6 m up and 1.2 m behind
+const [DOWN, ACROSS] = [Math.sin(0.42), Math.cos(0.42)]; // of a look from 1.6 m up and 1.2 m behind
 const BEHIND = new Float32Array([
   1, 0, 0, 0, 0, ACROSS, DOWN, 0, 0, -DOWN, ACROSS, 0,
   0, -1.6 * ACROSS + 1.2 * DOWN, -1.6 * DOWN - 1.2 * ACROSS, 1,
 ]);
-const GHOST = 0.45; // opacity in the operator's own room
+const [AR_OPACITY, GHOST_OPACITY] = [0.45, 0.35]; // of the robot in the operator's own room, and of a target's ghost
 
 const SHAPES = {
   vertex: `#version 300 es
@@ -33,88 +43,82 @@ const BOARDS = {
     void main() { shown = texture(picture, at); }`,
 };
 
-export function times(a, b) {
-  const product = new Float32Array(16);
-  for (let column = 0; column < 4; column++)
-    for (let row = 0; row < 4; row++)
-      for (let k = 0; k < 4; k++) product[4 * column + row] += a[4 * k + row] * b[4 * column + k];
-  return product;
-}
+/**
+ * @typedef {{ array: WebGLVertexArrayObject, count: number }} Mesh on the graphics card
+ * @typedef {{ program: WebGLProgram, view: WebGLUniformLocation | null, model: WebGLUniformLocation | null, colour: WebGLUniformLocation | null }} Program
+ * @typedef {{ x: number, y: number, width: number, height: number, view: Float32Array }} Eye
+ */
 
-// Of a pose x y z qx qy qz qw.
-export function matrixOf([px, py, pz, x, y, z, w]) {
-  return new Float32Array([
-    1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w), 0,
-    2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w), 0,
-    2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y), 0,
-    px, py, pz, 1,
-  ]);
-}
-
-// A box from `low` to `high`.
-function boxOf(low, high) {
-  const vertices = [];
-  for (let corner = 0; corner < 8; corner++)
-    for (let axis = 0; axis < 3; axis++) vertices.push((corner >> axis) & 1 ? high[axis] : low[axis]);
-  const faces = [0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4, 2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5];
-  return { vertices, faces };
-}
-
-// Where each eye of a headset's frame is drawn, and how it sees; none where the head is not tracked.
+/**
+ * Where each eye of a headset's frame is drawn, and how it sees; none where the head is not tracked.
+ * @param {XRFrame} frame
+ * @param {XRReferenceSpace} space
+ * @returns {Eye[]}
+ */
 export function eyesOf(frame, space) {
-  const layer = frame.session.renderState.baseLayer;
+  const layer = /** @type {XRWebGLLayer} */ (frame.session.renderState.baseLayer);
   return (frame.getViewerPose(space)?.views ?? [])
     .map((eye) => {
-      const { x, y, width, height } = layer.getViewport(eye);
+      const { x, y, width, height } = /** @type {XRViewport} */ (layer.getViewport(eye));
       return { x, y, width, height, view: times(eye.projectionMatrix, eye.transform.inverse.matrix) };
     })
     .filter(({ width }) => width > 0);
 }
 
-// Of a screen so many times as wide as high.
-function projection(aspect) {
-  const [near, far, scale] = [0.1, 20, 1 / Math.tan(FIELD_OF_VIEW / 2)];
-  const depth = [(far + near) / (near - far), (2 * far * near) / (near - far)];
-  return new Float32Array([scale / aspect, 0, 0, 0, 0, scale, 0, 0, 0, 0, depth[0], -1, 0, 0, depth[1], 0]);
-}
-
 export class Drawing {
+  /** @param {HTMLCanvasElement} canvas */
   constructor(canvas) {
+    this.board = new Board();
+    /** @type {ShownScene | null} */
+    this.scene = null;
     const gl = canvas.getContext("webgl2", { xrCompatible: true, antialias: true });
-    this.gl = gl;
-    if (!gl) return; // the hands are sent all the same
+    this.gl = /** @type {WebGL2RenderingContext} */ (gl); // null in a browser without it: the hands are sent all the same
     this.shapes = this.program(SHAPES);
     this.boards = this.program(BOARDS);
     const half = THICKNESS / 2;
     this.axes = AXES.map((colour, axis) => {
       const [low, high] = [[-half, -half, -half], [half, half, half]];
       high[axis] = LENGTH;
-      return { ...this.mesh(boxOf(low, high)), colour };
+      return { mesh: this.mesh(boxOf(low, high)), colour };
     });
-    this.knob = this.mesh(boxOf([-KNOB / 2, -KNOB / 2, -KNOB / 2], [KNOB / 2, KNOB / 2, KNOB / 2]));
-    this.board = this.mesh({ vertices: [-1, -1, 0, 1, -1, 0, -1, 1, 0, 1, 1, 0], faces: [0, 1, 2, 2, 1, 3] });
-    this.texture = gl.createTexture();
+    this.cube = this.mesh(boxOf([-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]));
+    this.square = this.mesh({ vertices: [-1, -1, 0, 1, -1, 0, -1, 1, 0, 1, 1, 0], faces: [0, 1, 2, 2, 1, 3] });
+    this.texture = gl ? gl.createTexture() : null;
+    /** @type {{ mesh: Mesh, joint: number, colour: number[] }[]} */
     this.robot = [];
+    /** @type {Mesh | null} */
+    this.grid = null;
   }
 
+  /**
+   * @param {{ vertex: string, solid: string }} sources
+   * @returns {Program}
+   */
   program({ vertex, solid }) {
     const { gl } = this;
+    if (!gl) return /** @type {any} */ ({});
     const program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, solid]]) {
-      const shader = gl.createShader(kind);
+    for (const [kind, source] of /** @type {[number, string][]} */ ([[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, solid]])) {
+      const shader = /** @type {WebGLShader} */ (gl.createShader(kind));
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
     }
     gl.bindAttribLocation(program, 0, "position");
     gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(String(gl.getProgramInfoLog(program)));
+    /** @param {string} name */
     const place = (name) => gl.getUniformLocation(program, name);
     return { program, view: place("view"), model: place("model"), colour: place("colour") };
   }
 
+  /**
+   * @param {{ vertices: number[], faces: number[] }} shape
+   * @returns {Mesh}
+   */
   mesh({ vertices, faces }) {
     const { gl } = this;
+    if (!gl) return /** @type {any} */ ({});
     const array = gl.createVertexArray();
     gl.bindVertexArray(array);
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
@@ -127,71 +131,168 @@ export class Drawing {
     return { array, count: faces.length };
   }
 
-  setScene({ meshes }) {
-    if (this.gl) this.robot = meshes.map((mesh) => ({ ...this.mesh(mesh), joint: mesh.joint, colour: mesh.colour }));
+  /** @param {ShownScene} scene */
+  setScene(scene) {
+    this.scene = scene;
+    if (!this.gl) return;
+    this.robot = scene.meshes.map((shape) => ({
+      mesh: this.mesh(shape),
+      joint: shape.joint,
+      colour: shape.colour.map((part) => part / 255),
+    }));
+    this.grid = this.mesh(gridOf(scene.floor));
   }
 
+  /** @param {XRSession} session */
   async bind(session) {
     const { gl } = this;
     if (!gl) throw new Error("This browser has no WebGL 2.");
     await gl.makeXRCompatible();
+    this.board = new Board();
     session.updateRenderState({ baseLayer: new XRWebGLLayer(session, gl) });
   }
 
-  // On the page itself, as seen from behind the robot.
-  drawOnPage(state, panel) {
-    if (!this.gl) return;
-    const { canvas } = this.gl;
-    [canvas.width, canvas.height] = [canvas.clientWidth, canvas.clientHeight];
-    const [width, height] = [canvas.width, canvas.height];
-    const view = times(projection(width / height), BEHIND);
-    this.draw(null, [{ x: 0, y: 0, width, height, view }], state, panel, false);
+  /** @param {ArrayLike<number> | undefined} head matrix of the operator's head, if it is tracked */
+  lookFrom(head) {
+    if (head) this.board.lookFrom(head);
   }
 
-  draw(framebuffer, eyes, state, panel, transparent) {
+  /**
+   * On the page itself, as seen from behind the robot. Words stand beside it.
+   * @param {ShownState | null} state
+   */
+  drawOnPage(state) {
+    if (!this.gl) return;
+    const canvas = /** @type {HTMLCanvasElement} */ (this.gl.canvas);
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    const view = times(projection(width / height, FIELD_OF_VIEW), BEHIND);
+    this.draw(null, [{ x: 0, y: 0, width, height, view }], state, null, [], false);
+  }
+
+  /**
+   * @param {WebGLFramebuffer | null} framebuffer
+   * @param {Eye[]} eyes
+   * @param {ShownState | null} state
+   * @param {import("./panel.js").Panel | null} panel on the board
+   * @param {Float32Array[]} hands matrices in the room
+   * @param {boolean} transparent whether the operator sees the room
+   */
+  draw(framebuffer, eyes, state, panel, hands, transparent) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    gl.clearColor(...(transparent ? [0, 0, 0, 0] : [0.93, 0.945, 0.957, 1]));
+    if (transparent) gl.clearColor(0, 0, 0, 0);
+    else gl.clearColor(0.93, 0.945, 0.957, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    if (panel.changed) {
+    if (panel?.changed) {
       panel.changed = false;
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, panel.canvas);
       gl.generateMipmap(gl.TEXTURE_2D);
     }
     for (const { x, y, width, height, view } of eyes) {
       gl.viewport(x, y, width, height);
-      gl.useProgram(this.boards.program);
-      gl.uniformMatrix4fv(this.boards.view, false, view);
-      this.show(this.boards, this.board, BOARD);
+      if (panel) {
+        gl.useProgram(this.boards.program);
+        gl.uniformMatrix4fv(this.boards.view, false, view);
+        this.show(this.boards, this.square, this.board.place(panel.canvas.height / panel.canvas.width));
+      }
       gl.useProgram(this.shapes.program);
       gl.uniformMatrix4fv(this.shapes.view, false, view);
-      if (state) this.drawRun(state, transparent ? GHOST : 1);
+      for (const hand of hands) this.shape(this.cube, ROOM, times(hand, scaleOf(CONTROLLER)), GREY);
+      if (state && this.scene) this.drawRun(state, this.scene, transparent);
     }
   }
 
-  drawRun({ joints, arms }, opacity) {
-    const places = joints.map((joint) => times(WORLD, matrixOf(joint)));
-    for (const { target, colour } of Object.values(arms)) {
-      if (!target) continue;
-      const place = times(WORLD, matrixOf(target));
-      for (const axis of this.axes) this.show(this.shapes, axis, place, axis.colour);
-      this.show(this.shapes, this.knob, place, colour.map((part) => part / 255));
+  /**
+   * @param {ShownState} state
+   * @param {ShownScene} scene
+   * @param {boolean} transparent
+   */
+  drawRun({ joints, arms, parts, pair }, scene, transparent) {
+    const places = joints.map(matrixOf);
+    if (this.grid && !transparent) this.shape(this.grid, WORLD, ROOM, LINES);
+    for (const [name, pose] of Object.entries(parts)) {
+      const { size, colour } = scene.parts[name];
+      this.shape(this.cube, WORLD, times(matrixOf(pose), scaleOf(size)), colour.map((part) => part / 255));
     }
-    for (const mesh of this.robot) {
-      if (opacity < 1 && mesh.joint === 0) continue; // what does not move would hide the room
-      this.show(this.shapes, mesh, places[mesh.joint], mesh.colour.map((part) => part / 255), opacity);
+    for (const arm of Object.values(arms)) if (arm.target) this.drawTarget(arm, arm.target);
+    if (pair) {
+      const calm = Math.min(Math.max(pair.margin / CALM, 0), 1);
+      const colour = GREEN.map((part, index) => calm * part + (1 - calm) * RED[index]);
+      this.shape(this.cube, WORLD, beamOf(pair.ends[0], pair.ends[1], PAIR), colour);
+    }
+    for (const { mesh, joint, colour } of this.robot) {
+      if (transparent && joint === 0) continue; // what does not move would hide the room
+      this.shape(mesh, WORLD, places[joint], colour, transparent ? AR_OPACITY : 1);
+    }
+    for (const [name, arm] of Object.entries(arms)) {
+      const way = arm.target && leashOf(arm.tool, arm.target);
+      if (arm.target && way && way > SHORT) this.drawGhost(scene.hands[name], places, arm.tool, arm.target);
     }
   }
 
-  show(program, mesh, model, colour, opacity = 1) {
+  /**
+   * A target's axes, a knob in the colour of the arm's state, and the leash from the tool to it.
+   * @param {ShownArm} arm
+   * @param {Seven} target
+   */
+  drawTarget({ tool, colour }, target) {
+    const place = matrixOf(target);
+    for (const axis of this.axes) this.shape(axis.mesh, WORLD, place, axis.colour);
+    this.shape(this.cube, WORLD, times(place, scaleOf([KNOB, KNOB, KNOB])), colour.map((part) => part / 255));
+    if (leashOf(tool, target) > SHORT) {
+      const ends = [tool, target].map(([x, y, z]) => /** @type {Point} */ ([x, y, z]));
+      this.shape(this.cube, WORLD, beamOf(ends[0], ends[1], LEASH), AMBER);
+    }
+  }
+
+  /**
+   * A translucent gripper at the target.
+   * @param {number[]} joints that go with the tool
+   * @param {Float32Array[]} places of all joints
+   * @param {Seven} tool
+   * @param {Seven} target
+   */
+  drawGhost(joints, places, tool, target) {
+    const moved = times(matrixOf(target), inverseOf(matrixOf(tool)));
+    this.gl.depthMask(false); // what is behind it is seen through it
+    for (const { mesh, joint } of this.robot)
+      if (joints.includes(joint)) this.shape(mesh, WORLD, times(moved, places[joint]), GHOST, GHOST_OPACITY);
+    this.gl.depthMask(true);
+  }
+
+  /**
+   * @param {Mesh} mesh
+   * @param {Float32Array} space where `place` counts
+   * @param {Float32Array} place
+   * @param {number[]} colour
+   */
+  shape(mesh, space, place, colour, opacity = 1) {
+    const [red, green, blue] = colour;
+    this.gl.uniform4f(this.shapes.colour, red, green, blue, opacity);
+    this.show(this.shapes, mesh, times(space, place));
+  }
+
+  /**
+   * @param {Program} program
+   * @param {Mesh} mesh
+   * @param {Float32Array} model
+   */
+  show(program, mesh, model) {
     const { gl } = this;
     gl.uniformMatrix4fv(program.model, false, model);
-    if (colour) gl.uniform4f(program.colour, ...colour, opacity);
     gl.bindVertexArray(mesh.array);
     gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 0);
   }
 }
+
+/**
+ * The distance of a target from its tool [m].
+ * @param {Seven} tool
+ * @param {Seven} target
+ */
+const leashOf = (tool, target) => Math.hypot(target[0] - tool[0], target[1] - tool[1], target[2] - tool[2]);

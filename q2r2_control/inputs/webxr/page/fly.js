@@ -7,23 +7,33 @@ const LONGEST = 0.05; // of a frame that a hand moves for [s]
 // Chromium on X begins to repeat after 660 ms, and goes on every 40 ms. A page that draws slowly hears it later.
 const [PRESSED, REPEATED] = [750, 600]; // [ms]
 const DEAD = 0.12; // of a stick
-const START = { left: [0.3, 0.2, 1.1], right: [0.3, -0.2, 1.1] }; // x forward, y left, z up [m]
+/** @type {Record<string, Seven>} */
+const START = { left: [0.3, 0.2, 1.1, 0, 0, 0, 1], right: [0.3, -0.2, 1.1, 0, 0, 0, 1] }; // x forward, y left, z up [m]
 // Each moves along or turns about an axis: 0 to 2 x y z, 3 to 5 about x y z.
+/** @type {Record<string, [number, number]>} */
 const KEYS = {
   KeyW: [0, 1], KeyS: [0, -1], KeyA: [1, 1], KeyD: [1, -1], KeyE: [2, 1], KeyQ: [2, -1],
   KeyO: [3, 1], KeyU: [3, -1], KeyK: [4, 1], KeyI: [4, -1], KeyJ: [5, 1], KeyL: [5, -1],
 };
-const LOWER = "Space", UPPER = "KeyG", HANDS = { Digit1: "left", Digit2: "right" };
-const BUTTONS = [LOWER, UPPER], MODIFIERS = ["Control", "Meta", "Alt"];
+const [LOWER, UPPER] = ["Space", "KeyG"];
+/** @type {Record<string, string>} */
+const HANDS = { Digit1: "left", Digit2: "right" };
+const BUTTONS = [LOWER, UPPER];
+const MODIFIERS = ["Control", "Meta", "Alt"];
 const PAD = { a: 0, b: 1, bumpers: { left: 4, right: 5 }, tilt: [[12, 4, 1], [13, 4, -1], [14, 3, -1], [15, 3, 1]] };
 
 export const HELP =
   "1, 2: left or right hand. Space: engage or pause. W S A D E Q: move. I K J L U O: turn. G: gripper. Shift: slowly. " +
   "Gamepad: sticks move, and turn about the vertical; cross tilts; bumpers choose the hand; A engages, B is the gripper.";
 
+/** @param {KeyboardEvent} event */
 const isModified = ({ ctrlKey, metaKey, altKey, key }) => ctrlKey || metaKey || altKey || MODIFIERS.includes(key);
 
-// q after a turn by a small rotation vector, in the room's axes; x y z w.
+/**
+ * A quaternion x y z w after a turn by a small rotation vector, in the room's axes.
+ * @param {number[]} quaternion
+ * @param {number[]} vector
+ */
 function turned([x, y, z, w], [a, b, c]) {
   const [p, q, r] = [a / 2, b / 2, c / 2];
   const next = [x + p * w + q * z - r * y, y + q * w + r * x - p * z, z + r * w + p * y - q * x, w - p * x - q * y - r * z];
@@ -34,21 +44,32 @@ function turned([x, y, z, w], [a, b, c]) {
 export class Flying {
   constructor() {
     this.hand = "left"; // that moves
+    this.device = "keys"; // or a gamepad: what was used last
+    this.slow = false;
+    /** @type {Map<string, number>} */
     this.until = new Map(); // keys that are held -> when they count no more [ms]
-    this.poses = Object.fromEntries(Object.entries(START).map(([hand, place]) => [hand, [...place, 0, 0, 0, 1]]));
+    /** @type {Record<string, Seven>} */
+    this.poses = structuredClone(START);
     this.then = performance.now();
     this.listening = new AbortController();
     const { signal } = this.listening;
     addEventListener("keydown", (event) => this.press(event), { signal });
     addEventListener("keyup", (event) => this.release(event), { signal });
     addEventListener("blur", () => this.until.clear(), { signal });
-    for (const type of ["keydown", "keyup"]) addEventListener(type, (event) => (this.slow = event.shiftKey), { signal });
+    /** @param {KeyboardEvent} event */
+    const noticeShift = (event) => {
+      this.slow = event.shiftKey;
+    };
+    addEventListener("keydown", noticeShift, { signal });
+    addEventListener("keyup", noticeShift, { signal });
   }
 
+  /** @param {KeyboardEvent} event */
   press(event) {
     // Such a press is the browser's: its dialogs keep the page from hearing that keys are up, and so does Cmd on a Mac.
     if (isModified(event)) return this.until.clear();
     if (!(event.code in KEYS || event.code in HANDS || BUTTONS.includes(event.code))) return;
+    this.device = "keys";
     event.preventDefault(); // Space would press the button that began this
     if (event.repeat && !this.holds(event.code)) return; // what has ended begins with a new press only
     const until = performance.now() + (event.repeat ? REPEATED : PRESSED);
@@ -58,21 +79,28 @@ export class Flying {
     this.hand = HANDS[event.code] ?? this.hand;
   }
 
+  /** @param {KeyboardEvent} event */
   release(event) {
     if (isModified(event)) this.until.clear();
     this.until.delete(event.code);
   }
 
+  /** @param {string} code */
   holds(code) {
-    return this.until.get(code) > performance.now();
+    return (this.until.get(code) ?? 0) > performance.now();
   }
 
-  // Both hands, of which one has moved since the last frame.
+  /**
+   * Both hands, of which one has moved since the last frame.
+   * @returns {Record<string, HeadsetHand>}
+   */
   read() {
     const now = performance.now();
     const dt = Math.min((now - this.then) / 1000, LONGEST);
     this.then = now;
     const pad = [...navigator.getGamepads()].find((one) => one?.mapping === "standard");
+    if (pad?.buttons.some((button) => button.pressed)) this.device = "gamepad";
+    /** @param {number} button */
     const pressed = (button) => Boolean(pad?.buttons[button].pressed);
     for (const [hand, bumper] of Object.entries(PAD.bumpers)) if (pressed(bumper)) this.hand = hand;
     const rates = [0, 0, 0, 0, 0, 0];
@@ -83,20 +111,29 @@ export class Flying {
     const step = rates.map((rate, axis) => (this.slow ? SLOWLY : 1) * dt * (axis < 3 ? SPEED : TURNING) * rate);
     const pose = this.poses[this.hand];
     const place = pose.slice(0, 3).map((value, axis) => value + step[axis]);
-    this.poses[this.hand] = [...place, ...turned(pose.slice(3), step.slice(3))];
+    this.poses[this.hand] = /** @type {Seven} */ ([...place, ...turned(pose.slice(3), step.slice(3))]);
+    /** @type {[boolean, boolean, boolean]} */
     const buttons = [this.holds(UPPER) || pressed(PAD.b), this.holds(LOWER) || pressed(PAD.a), false];
+    /** @type {[boolean, boolean, boolean]} */
     const none = [false, false, false];
     return Object.fromEntries(
       Object.entries(this.poses).map(([hand, pose]) => [hand, { pose, buttons: hand === this.hand ? buttons : none }]),
     );
   }
 
+  /**
+   * @param {Gamepad | null | undefined} pad
+   * @param {number} index
+   */
   stick(pad, index) {
     const value = pad?.axes[index] ?? 0;
     return Math.abs(value) < DEAD ? 0 : value;
   }
 
-  // Both hands as untracked.
+  /**
+   * Both hands as untracked.
+   * @returns {Record<string, HeadsetHand>}
+   */
   lost() {
     return { left: { pose: null }, right: { pose: null } };
   }

@@ -5,51 +5,77 @@ import { Flying, HELP } from "./fly.js";
 import { Hands } from "./hands.js";
 import { Link } from "./link.js";
 import { Panel } from "./panel.js";
+import { nextOf, worded } from "./words.js";
 
 const MOVED = 300; // a frame that moved is told for this long, twice the time that pauses an arm [ms]
+/** @type {XRSessionMode[]} */
 const MODES = ["immersive-ar", "immersive-vr"];
 
-const element = (id) => document.getElementById(id);
-const drawing = new Drawing(element("scene"));
+/** @param {string} id */
+const element = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
+/** @param {string} id */
+const button = (id) => /** @type {HTMLButtonElement} */ (document.getElementById(id));
+const drawing = new Drawing(/** @type {HTMLCanvasElement} */ (document.getElementById("scene")));
 const panel = new Panel();
 let hands = new Hands();
+/** @type {XRSession | null} */
 let session = null;
+/** @type {Flying | null} */
 let flying = null; // hands that keys or a gamepad move
+/** @type {ShownState | null} */
 let state = null; // of the run, as it came last
 let movedUntil = 0;
 
 const link = new Link({
-  scene: (scene) => drawing.setScene(scene),
-  state: (newest) => (state = newest),
+  scene: (scene) => {
+    drawing.setScene(scene);
+    element("name").textContent = scene.name;
+    document.title = `${scene.name}: drive the arms`;
+  },
+  state: (newest) => {
+    state = newest;
+  },
   vibration: (vibration) => hands.vibrate(vibration),
   picture: async (jpeg) => {
     const picture = await createImageBitmap(jpeg);
     panel.picture?.close();
     panel.picture = picture;
   },
-  closed: () => (state = null),
+  closed: () => {
+    state = null;
+  },
+  drives: () => session !== null || flying !== null,
 });
 
-// Where the operator stands and looks when the session begins: origin and forward of the hands.
+/**
+ * Where the operator stands and looks when the session begins: origin and forward of the hands.
+ * @param {XRFrame} frame
+ * @param {XRReferenceSpace} floor
+ */
 function facing(frame, floor) {
   const pose = frame.getViewerPose(floor);
   if (!pose) return null;
-  const [m, { x, z }] = [pose.transform.matrix, pose.transform.position];
+  const m = pose.transform.matrix;
+  const { x, z } = pose.transform.position;
   const turn = Math.atan2(m[8], m[10]) / 2; // of the way that the operator looks, about y
   const orientation = { x: 0, y: Math.sin(turn), z: 0, w: Math.cos(turn) };
   return floor.getOffsetReferenceSpace(new XRRigidTransform({ x, y: 0, z }, orientation));
 }
 
+/** @param {XRSessionMode} mode */
 async function enter(mode) {
   land();
-  const entered = await navigator.xr.requestSession(mode, {
+  const xr = /** @type {XRSystem} */ (navigator.xr);
+  const entered = await xr.requestSession(mode, {
     requiredFeatures: ["local-floor"],
     optionalFeatures: ["hand-tracking"],
   });
   session = entered;
+  link.drive();
   hands = new Hands();
   await drawing.bind(entered);
   const floor = await entered.requestReferenceSpace("local-floor");
+  /** @type {XRReferenceSpace | null} */
   let space = null;
   floor.onreset = () => {
     movedUntil = performance.now() + MOVED;
@@ -63,30 +89,36 @@ async function enter(mode) {
     session = null;
     show();
   };
-  const onFrame = (now, frame) => {
+  /** @type {XRFrameRequestCallback} */
+  const onFrame = (_, frame) => {
     entered.requestAnimationFrame(onFrame);
     space ??= facing(frame, floor);
     if (space === null || entered.visibilityState !== "visible") return;
     link.send(hands.read(frame, space, performance.now() < movedUntil));
-    panel.draw(state, link);
-    drawing.draw(entered.renderState.baseLayer.framebuffer, eyesOf(frame, space), state, panel, mode === "immersive-ar");
+    panel.draw(state, link, hands.bare);
+    const layer = /** @type {XRWebGLLayer} */ (entered.renderState.baseLayer);
+    drawing.lookFrom(frame.getViewerPose(space)?.transform.matrix);
+    drawing.draw(layer.framebuffer, eyesOf(frame, space), state, panel, hands.places, mode === "immersive-ar");
   };
   entered.requestAnimationFrame(onFrame);
   show();
 }
 
 function fly() {
-  if (flying) return land();
-  const begun = (flying = new Flying());
+  if (flying) {
+    land();
+    return;
+  }
+  const begun = new Flying();
+  flying = begun;
+  link.drive();
   element("fly").blur();
   element("advice").textContent = HELP;
-  document.body.classList.add("flying"); // which leaves the arms to be seen
   const onFrame = () => {
     if (flying !== begun) return;
     requestAnimationFrame(onFrame);
     link.send(begun.read(), true);
-    panel.draw(state, link);
-    drawing.drawOnPage(state, panel);
+    drawing.drawOnPage(state);
   };
   requestAnimationFrame(onFrame);
 }
@@ -97,44 +129,73 @@ function land() {
   link.sendLost(flying.lost(), true);
   flying.end();
   flying = null;
-  document.body.classList.remove("flying");
   element("advice").textContent = "";
+}
+
+/**
+ * A row of the table: an arm's state in its colour, why, and what to do next.
+ * @param {string} name
+ * @param {ShownArm} arm
+ */
+function rowOf(name, arm) {
+  const row = document.createElement("tr");
+  row.insertCell().textContent = name;
+  const words = row.insertCell();
+  const said = document.createElement("span");
+  said.className = "state";
+  said.style.background = `rgb(${arm.colour})`;
+  said.textContent = arm.state;
+  const next = document.createElement("div");
+  next.className = "next";
+  next.textContent = nextOf(arm, { flying, inSession: session !== null, bare: hands.bare, watching: link.watching });
+  words.append(said, ` ${worded(arm.why, flying?.device ?? (hands.bare ? "fingers" : arm.hand))}`, next);
+  return row;
 }
 
 function show() {
   const age = Number.isFinite(link.age) ? `, ${link.age.toFixed(0)} ms` : "";
-  element("link").textContent = `${link.text}${age}, ${(100 * link.loss).toFixed(0)} % left out`;
+  const lost = link.open && !link.watching ? `${age}, ${(100 * link.loss).toFixed(0)} % left out` : "";
+  element("link").textContent = `${link.text}${lost}`;
   element("leave").hidden = session === null;
   element("fly").hidden = session !== null;
-  element("stand").hidden = flying !== null;
+  element("stand").hidden = flying !== null || link.watching;
   element("fly").textContent = flying ? `Land; the ${flying.hand} hand moves` : "Fly by keyboard or gamepad";
-  const rows = Object.entries(state?.arms ?? {}).map(([name, arm]) => {
-    const row = document.createElement("tr");
-    for (const text of [name, arm.state, arm.why, arm.next]) row.insertCell().textContent = text;
-    return row;
-  });
-  element("arms").replaceChildren(...rows);
+  button("stop").disabled = !link.open;
+  button("home").disabled = !link.open || link.watching;
+  element("arms").replaceChildren(...Object.entries(state?.arms ?? {}).map(([name, arm]) => rowOf(name, arm)));
   element("recording").textContent = state?.recording ?? "";
+  if (session === null && flying === null) drawing.drawOnPage(state);
 }
 
 async function offer() {
-  if (!navigator.xr) {
+  const { xr } = navigator;
+  if (!xr) {
     element("advice").textContent = isSecureContext
       ? "This browser has no WebXR."
       : "A browser offers WebXR only over https, or on localhost.";
     return;
   }
-  const supported = await Promise.all(MODES.map((mode) => navigator.xr.isSessionSupported(mode).catch(() => false)));
+  const supported = await Promise.all(MODES.map((mode) => xr.isSessionSupported(mode).catch(() => false)));
   MODES.forEach((mode, index) => {
-    const button = element(mode);
-    button.hidden = !supported[index];
-    button.onclick = () => enter(mode).catch((error) => (element("advice").textContent = String(error)));
+    button(mode).hidden = !supported[index];
+    button(mode).onclick = () =>
+      enter(mode).catch((error) => {
+        element("advice").textContent = String(error);
+      });
   });
   if (!supported.includes(true)) element("advice").textContent = "This device offers no immersive session.";
 }
 
-element("leave").onclick = () => session?.end();
-element("fly").onclick = fly;
-document.addEventListener("visibilitychange", () => document.hidden && land());
+button("leave").onclick = () => session?.end();
+button("fly").onclick = fly;
+/** @type {HeadsetRequest[]} */ (["stop", "home"]).forEach((request) => {
+  button(request).onclick = () => {
+    button(request).blur(); // or Space, which engages, would press it again
+    link.ask(request);
+  };
+});
+document.addEventListener("visibilitychange", () => {
+  if (document.hidden) land();
+});
 setInterval(show, 200);
 offer();

@@ -1,0 +1,55 @@
+// Where the board is: above what the operator looks at. It stays while the head moves a little, and then glides after.
+
+export const [BOARD_WIDTH, BOARD_DISTANCE] = [1.3, 1.5]; // [m]
+const ABOVE = 0.35; // of the way that the operator looks [rad]
+const [LOWEST, HIGHEST] = [-0.3, 0.8]; // of the board [rad]
+const [FAR, NEAR] = [0.35, 0.03]; // when it begins to glide, and when it has arrived [rad]
+const SHARE = 0.08; // of the way that is left, in a frame
+
+/** @param {number} angle */
+const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
+
+export class Board {
+  constructor() {
+    this.known = false; // where the head is
+    this.yaw = 0;
+    this.pitch = 0;
+    this.glides = false;
+    /** @type {number[]} */
+    this.eye = [0, 0, 0];
+  }
+
+  /** @param {ArrayLike<number>} head matrix of the operator's head */
+  lookFrom(head) {
+    this.eye = [head[12], head[13], head[14]];
+    const yaw = Math.atan2(-head[8], head[10]);
+    const pitch = Math.min(Math.max(Math.asin(Math.max(Math.min(-head[9], 1), -1)) + ABOVE, LOWEST), HIGHEST);
+    const [right, up] = [wrapped(yaw - this.yaw), pitch - this.pitch];
+    const away = Math.hypot(right, up);
+    if (!this.known) [this.yaw, this.pitch, this.known] = [yaw, pitch, true];
+    else if (away > FAR) this.glides = true;
+    if (away < NEAR) this.glides = false;
+    if (this.glides) {
+      this.yaw = wrapped(this.yaw + SHARE * right);
+      this.pitch += SHARE * up;
+    }
+  }
+
+  /**
+   * The matrix of a square from -1 to 1, for a picture so many times as high as wide. It faces the operator.
+   * @param {number} aspect
+   */
+  place(aspect) {
+    const [sin, cos] = [Math.sin(this.yaw), Math.cos(this.yaw)];
+    const [rise, level] = [Math.sin(this.pitch), Math.cos(this.pitch)];
+    const way = [level * sin, rise, -level * cos];
+    const half = BOARD_WIDTH / 2;
+    const high = half * aspect;
+    return new Float32Array([
+      half * cos, 0, half * sin, 0,
+      -high * rise * sin, high * level, high * rise * cos, 0,
+      -way[0], -way[1], -way[2], 0,
+      ...way.map((value, axis) => this.eye[axis] + BOARD_DISTANCE * value), 1,
+    ]);
+  }
+}

@@ -1,0 +1,41 @@
+// Shapes as vertices and the triangles between them.
+
+const [CELLS, CELL] = [12, 0.5]; // of the floor's grid, and its width [m]
+
+/**
+ * A box from `low` to `high`.
+ * @param {number[]} low
+ * @param {number[]} high
+ */
+export function boxOf(low, high) {
+  /** @type {number[]} */
+  const vertices = [];
+  for (let corner = 0; corner < 8; corner++)
+    for (let axis = 0; axis < 3; axis++) vertices.push((corner >> axis) & 1 ? high[axis] : low[axis]);
+  const faces = [0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4, 2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5];
+  return { vertices, faces };
+}
+
+/**
+ * Lines on the floor, as thin boxes.
+ * @param {number} floor height [m]
+ */
+export function gridOf(floor) {
+  const [half, thin, top] = [(CELLS * CELL) / 2, 0.002, floor + 0.002];
+  /** @type {number[]} */
+  const vertices = [];
+  /** @type {number[]} */
+  const faces = [];
+  for (let line = 0; line <= CELLS; line++) {
+    const at = line * CELL - half;
+    for (const [low, high] of [
+      [[at - thin, -half, top - thin], [at + thin, half, top]],
+      [[-half, at - thin, top - thin], [half, at + thin, top]],
+    ]) {
+      const box = boxOf(low, high);
+      faces.push(...box.faces.map((corner) => corner + vertices.length / 3));
+      vertices.push(...box.vertices);
+    }
+  }
+  return { vertices, faces };
+}

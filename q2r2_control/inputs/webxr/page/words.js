@@ -1,0 +1,39 @@
+// The run says `{lower}` where an operator has to press a control. Here it gets the word of the device in hand.
+
+/** @type {Record<string, string>} */
+const STICKS = {
+  trigger: "the trigger", grip: "the grip", stick_up: "the stick forward", stick_down: "the stick back",
+  stick_left: "the stick to the left", stick_right: "the stick to the right",
+};
+/** @type {Record<string, Record<string, string>>} */
+const WORDS = {
+  left: { lower: "X", upper: "Y", ...STICKS },
+  right: { lower: "A", upper: "B", ...STICKS },
+  fingers: { pinch: "the pinch" },
+  keys: { lower: "Space", upper: "G" },
+  gamepad: { lower: "A", upper: "B" },
+};
+
+/**
+ * @param {string} text of the run
+ * @param {string} device in hand: left or right (a controller), fingers, keys, gamepad
+ */
+export function worded(text, device) {
+  return text.replace(/\{(\w+)\}/g, (_, control) => WORDS[device]?.[control] ?? `${control} (not on this device)`);
+}
+
+/**
+ * What an operator can do next with an arm.
+ * @param {ShownArm} arm
+ * @param {{ flying: { hand: string, device: string } | null, inSession: boolean, bare: boolean, watching: boolean }} way
+ */
+export function nextOf(arm, { flying, inSession, bare, watching }) {
+  if (watching) return "";
+  if (flying) {
+    const chosen = flying.hand === arm.hand;
+    const choose = flying.device === "keys" ? `press ${arm.hand === "left" ? 1 : 2}` : `press the ${arm.hand} bumper`;
+    return chosen ? worded(arm.next, flying.device) : `${choose} to move this one`;
+  }
+  if (inSession) return worded(arm.next, bare ? "fingers" : arm.hand);
+  return "enter VR, or fly by keyboard, to move it";
+}

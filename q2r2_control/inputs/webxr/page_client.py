@@ -1,0 +1,74 @@
+"""A page that is connected, and what the process that serves it sends to it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import suppress
+from typing import Any
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from q2r2_control.inputs.listener import Peer, RateLimit
+from q2r2_control.inputs.webxr.exchange import Display
+from q2r2_control.inputs.webxr.page_messages import PageMessage
+from q2r2_control.inputs.webxr.shown import FromRun, ShownVibration
+from q2r2_control.types import HapticFeedback
+
+MAX_MESSAGES_PER_SECOND = 300  # headsets send up to 120
+_REQUESTS = 0.1  # between two requests of a page that count, but a stop, which always does [s]
+_LONGEST_REASON = 120  # of a closed socket [bytes]
+
+
+class PageClient(Peer):
+    """A page that is connected."""
+
+    def __init__(self, connection: ServerConnection, host: str, peer: str, page: str, now: float) -> None:
+        # A page keeps its number when it is reloaded, as the app repeats its registrations.
+        super().__init__(peer, host, since=now, last_frame=now, registrations=({"page": page} if page else {}, {}))
+        self.connection = connection
+        self.newest: PageMessage | None = None  # that is not passed on yet
+        self.acknowledged = -1  # number of the newest message
+        self.refused_hosts: set[str] = set()
+        self.due = asyncio.Event()
+        self.vibrations: dict[str, HapticFeedback] = {}  # the newest of each hand
+        self.shown: Any = None
+        self.picture: bytes | None = None
+        self.driver: str | None = None  # that a page which watches has not been told yet
+        self.rate, self.requests = RateLimit(MAX_MESSAGES_PER_SECOND), RateLimit(1, _REQUESTS)
+        self.reason = ""  # why this side has ended it
+        self.closing: asyncio.Future[None] | None = None
+
+    def end(self, code: int, reason: str) -> None:
+        """Close the socket, which takes as long as the page likes."""
+        self.reason = reason
+        shown = reason.encode()[:_LONGEST_REASON].decode(errors="ignore")
+        self.closing = asyncio.ensure_future(self.connection.close(code, shown))
+
+    async def send_newest(self, scene: str | None, display: Display | None) -> None:
+        """Send the ``scene`` and then the newest only, whenever the page has taken what was sent before."""
+        connection = self.connection
+        with suppress(ConnectionClosed):
+            if scene is not None:
+                await connection.send(scene)
+            while True:
+                await self.due.wait()
+                self.due.clear()
+                vibrations, self.vibrations = self.vibrations, {}
+                driver, self.driver = self.driver, None
+                shown, self.shown = self.shown, None
+                if driver is not None:
+                    await self._tell({"driver": driver})
+                for vibration in vibrations.values():
+                    hand, frequency, amplitude = vibration.hand, vibration.frequency, vibration.amplitude
+                    shown_vibration = ShownVibration(hand=hand, frequency=frequency, amplitude=amplitude)
+                    await self._tell({"vibration": shown_vibration})
+                if shown is not None and display is not None:
+                    await self._tell({"state": display.message(shown), "acknowledged": self.acknowledged})
+                if self.picture is not None and not connection.transport.get_write_buffer_size():
+                    picture, self.picture = self.picture, None
+                    await connection.send(picture)
+
+    async def _tell(self, message: FromRun) -> None:
+        await self.connection.send(json.dumps(message))

@@ -1,0 +1,131 @@
+"""Sentences on the arms of a run: why each is where it is, and what its operator can do next."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.config.bindings import MEANINGS, Action, BindingSettings
+from q2r2_control.device_words import NO_WORDS, DeviceWords
+from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.arm_states import ArmState, is_refusal
+from q2r2_control.types import ActiveLimit, LimitKind
+from q2r2_control.wording import sentence
+
+# A tool nearer to its target than this follows; what holds it back beyond that is said [m], [rad].
+_FOLLOWS, _TURNED = 0.005, 0.05
+_HELD_BY = {LimitKind.POSITION: "at its limit", LimitKind.VELOCITY: "as fast as it may turn"}
+_FOLLOWS_WHAT = {str(ArmState.CARRIED): "goes with the other arm", str(ArmState.POLICY): "follows the policy"}
+
+
+class Told(NamedTuple):
+    """The events of an arm that say why it is in its state."""
+
+    change: Event | None = None  # of its state
+    refusal: Event | None = None  # the newest one since
+
+    def after(self, event: Event) -> Told:
+        """The events that are told after one more ``event``. News that change nothing hide no reason."""
+        if event.source != event.destination:
+            return Told(event)
+        return Told(self.change, event) if is_refusal(event) else self
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        return tuple(event for event in self if event is not None)
+
+
+def told_after(told: Mapping[str, Told], events: Iterable[Event]) -> dict[str, Told]:
+    """The events of each arm that are told after ``events``."""
+    newest = dict(told)
+    for event in events:
+        newest[event.arm] = newest.get(event.arm, Told()).after(event)
+    return newest
+
+
+class ArmWords:
+    """Makes sentences on the arms of one run, in the words of the device that drives them."""
+
+    def __init__(
+        self, joints: Mapping[str, Collection[str]], bindings: BindingSettings, device: DeviceWords = NO_WORDS
+    ) -> None:
+        """``joints``: names of those that move each arm; ``bindings``: what the device's controls do."""
+        self._joints, self._bindings, self._device = joints, bindings, device
+        self.told: Mapping[str, Told] = {}  # of each arm
+
+    def follow(self, events: Iterable[Event]) -> None:
+        """Keep what ``events`` tell."""
+        self.told = told_after(self.told, events)
+
+    def controls(self) -> dict[str, str]:
+        """In words what each control of a hand does that does something."""
+        bound = {self._device.noun(binding.words): MEANINGS[binding.action] for binding in self._bindings.bound()}
+        both = [self._device.noun(control) for control in ("lower", "upper") if control in self._device.nouns]
+        chord = {} if len(both) < 2 else {" and ".join(both): "the headset's alignment: stops both arms until let go"}
+        return bound | chord
+
+    def why(self, tick: Tick, arm: str, binding: Collection[ActiveLimit]) -> str:
+        """Why ``arm`` is where it is. ``binding``: limits and pairs that held the last steps back, as in a report."""
+        if not tick.following:
+            return "the run ends"
+        if tick.states[arm] in (ArmState.ALIGNING, ArmState.HOMING):
+            return tick.states[arm]
+        if not tick.engaged[arm]:
+            told = self.told.get(arm, Told()).events
+            return "; ".join(self._sentence(event.reason) for event in told) or "not engaged yet"
+        distance, angle = tick.tracking_error(arm)
+        if not (distance > _FOLLOWS or angle > _TURNED):
+            return _FOLLOWS_WHAT.get(tick.states[arm], "follows the hand")
+        held_by = _held_by(tick, arm, self._joints[arm], binding)
+        return held_by or ("catches up" if np.isfinite(distance) else "holds")
+
+    def _sentence(self, reason: Reason) -> str:
+        if reason.kind is ReasonKind.DEAD_MAN_RELEASED and (control := self._bindings.words_of(Action.DEAD_MAN)):
+            return f"{self._device.noun(control)} let go"
+        return sentence(reason, self._device)
+
+    def next_press(self, tick: Tick, arm: str) -> str:
+        """Instructions for the operator of an arm, with their effects."""
+        state, device, bindings = tick.states[arm], self._device, self._bindings
+        if device.nobody:
+            return f"nothing: {device.nobody}"
+        if not tick.connected and device.absent:
+            return device.absent
+        if state == ArmState.ALIGNING:
+            return "release both buttons to go on"
+        if state == ArmState.HOMING:
+            return "any press stops the way home"
+        if state == ArmState.CARRIED and (control := bindings.words_of(Action.CARRY)):
+            return f"{device.press(control)} of either hand to end it, or pause"
+        if state == ArmState.STOPPED and (control := bindings.words_of(Action.STOP)):
+            return f"{device.press(control)} to go on"
+        moves = state in (ArmState.ENGAGED, ArmState.PAUSING)
+        steps = []
+        if control := bindings.words_of(Action.PAUSE_TOGGLE):
+            steps.append(f"{device.press(control)} to {'pause' if moves else 'engage'}")
+        if control := bindings.words_of(Action.DEAD_MAN):
+            steps.append(f"let go of {device.noun(control)} to pause" if moves else f"{device.hold(control)} to engage")
+        if control := bindings.words_of(Action.GRIPPER_TOGGLE):
+            closed = tick.targets[arm].gripper < 0.5
+            steps.append(f"{device.press(control)} to {'open' if closed else 'close'} the gripper")
+        return ", ".join(steps)
+
+
+def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[ActiveLimit]) -> str | None:
+    """The pair or limit of an arm that is nearest to what moves the tool, if any is at work."""
+    report = tick.reference.report
+    pairs = [limit.names for limit in binding if limit.kind is LimitKind.SEPARATION]
+    pairs = [pair for pair in pairs if any(body.startswith(f"{arm}_") for body in pair)]
+    if report.tightest_pair in pairs:
+        return f"held by {' | '.join(report.tightest_pair)}, {1e3 * report.margin:.0f} mm to spare"
+    if pairs:
+        return f"held by {' | '.join(pairs[0])}"
+    if any(limit.kind is LimitKind.TOOL_SPEED and limit.names == (arm,) for limit in binding):
+        return "its tool is as fast as it may be"
+    for kind, words in _HELD_BY.items():
+        if mine := [limit.names[0] for limit in binding if limit.kind is kind and limit.names[0] in joints]:
+            return f"{mine[0]} {words}"
+    return None

@@ -1,0 +1,83 @@
+"""The run's side of its display on a headset: hands ticks to the input's process, and does what its buttons ask for."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from q2r2_control.events import ReasonKind
+from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.webxr.exchange import Display
+from q2r2_control.inputs.webxr.page_messages import HeadsetRequest
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.summary.tick import Tick
+from q2r2_control.types import ActiveLimit
+from q2r2_control.viewer.arm_words import Told, told_after
+from q2r2_control.viewer.headset_display import RunDisplay, ShownTick
+from q2r2_control.viewer.loose_parts import places_of_parts
+from q2r2_control.viewer.shown_robot import ShownRobot
+
+_PERIOD = 1.0 / 30.0  # between messages [s]
+_EPISODE_OVER = (
+    ReasonKind.EPISODE_ENDS,
+    ReasonKind.EPISODE_SUCCEEDED,
+    ReasonKind.EPISODE_FAILED,
+    ReasonKind.EPISODE_DISCARDED,
+)
+
+
+@runtime_checkable
+class DisplayInput(Input, Protocol):
+    """An input whose device shows the run, as a headset does."""
+
+    def show_on(self, display: Display, requests: Mapping[HeadsetRequest, Callable[[], None]]) -> None:
+        """Show a run by ``display``; its buttons call ``requests``, in any thread. Before ``start``."""
+
+    def show(self, content: Any) -> bool:
+        """Show the newest state; False where the last one still waits. Never waits."""
+
+    def show_picture(self, jpeg: bytes) -> bool:
+        """Show the newest picture of a camera, as :meth:`show`; from any thread."""
+
+
+class HeadsetView:
+    """A listener of one run. A tick stores references, 30 times a second the input's process gets them."""
+
+    def __init__(self, source: DisplayInput, pipeline: Pipeline, recorded: bool) -> None:
+        self._source, self._recorded = source, recorded
+        self._due = 0.0  # of the next message, by the clock on the wall [s]
+        self._binding: dict[ActiveLimit, None] = {}
+        self._told: dict[str, Told] = {}
+        self._episodes, self._open = 0, False
+        self._hand_of = pipeline.teleop.hand_of
+        self._plant = pipeline.plant if isinstance(pipeline.plant, MujocoPlant) else None
+        robot, parts = pipeline.robot, places_of_parts(pipeline.plant, pipeline.config)
+        display = RunDisplay(ShownRobot.of(robot, pipeline.config), robot.model, robot.collision_model, parts)
+        source.show_on(display, {HeadsetRequest.STOP: pipeline.stop, HeadsetRequest.HOME: pipeline.go_home})
+        pipeline.listeners.append(self)
+
+    def __call__(self, tick: Tick) -> None:
+        if tick.events:
+            self._told = told_after(self._told, tick.events)
+        for event in tick.events:
+            if event.kind is ReasonKind.EPISODE_BEGINS:
+                self._episodes, self._open = self._episodes + (not self._open), True
+            elif event.kind in _EPISODE_OVER:
+                self._open = False
+        if tick.reference.report.binding:
+            self._binding.update(dict.fromkeys(tick.reference.report.binding))
+        now = time.monotonic()
+        if now < self._due:
+            return
+        hands = {arm: self._hand_of(arm) for arm in tick.tools}
+        moved = None if self._plant is None else self._plant.observed_qpos
+        if self._source.show(ShownTick(tick, tuple(self._binding), self._told, hands, moved, self._recording())):
+            self._due = now + _PERIOD
+            self._binding = {}
+
+    def _recording(self) -> str:
+        if not self._recorded:
+            return ""
+        return f"records episode {self._episodes}" if self._open else f"records; {self._episodes} episodes so far"

@@ -1,0 +1,40 @@
+"""The file of viser's page, with the name of the cell and a layout for the screen of a phone."""
+
+from __future__ import annotations
+
+import gzip
+from html import escape
+
+from websockets.http11 import Response
+
+_TITLE = b"<title>Viser</title>"
+# On a phone, viser's panel is a sheet over the scene. Here it has the lower half of the screen, and the scene the rest.
+_SHEET = '.mantine-Paper-root[style*="position: fixed"][style*="bottom: 0"]'
+_PHONE = (
+    f"<style>@media (max-width: 576px) {{{_SHEET} {{width: 100% !important; max-height: 50vh !important}} "
+    f"{_SHEET} .mantine-ScrollArea-content > div {{width: 100% !important}} "
+    'div[style*="flex-grow: 1; height: 100%"]:has(canvas) '
+    "{height: 50vh !important; flex: none !important; width: 100vw !important}}</style>"
+)
+
+
+class PageFile:
+    """Changes viser's page for one cell."""
+
+    def __init__(self, name: str) -> None:
+        self._head = f"<title>{escape(name)}</title>{_PHONE}".encode()
+        self._made: dict[bytes, bytes] = {}  # of the one file that viser serves, plain and compressed
+
+    def change(self, response: Response) -> None:
+        """Put the cell's page into ``response``, if it brings viser's."""
+        if response.status_code != 200:
+            return
+        is_compressed = response.headers.get("Content-Encoding") == "gzip"
+        body = bytes(response.body)
+        if body not in self._made:
+            plain = gzip.decompress(body) if is_compressed else body
+            plain = plain.replace(_TITLE, self._head, 1)
+            self._made[body] = gzip.compress(plain) if is_compressed else plain
+        response.body = self._made[body]
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))

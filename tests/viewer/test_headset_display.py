@@ -1,0 +1,82 @@
+"""The messages of a run to the page that headsets open, in the shapes for which its scripts are checked."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+
+pytest.importorskip("trimesh")
+
+from q2r2_control.device_words import DeviceWords
+from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.inputs.webxr.shown import ShownScene, ShownState
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.viewer.arm_words import Told
+from q2r2_control.viewer.headset_display import RunDisplay, ShownTick
+from q2r2_control.viewer.loose_parts import places_of_parts
+from q2r2_control.viewer.shown_robot import ShownRobot
+from tests.support.processes import cell
+from tests.viewer.conftest import tick_at
+
+HANDS = {"left": "left", "right": "right"}
+
+
+@pytest.fixture(scope="module")
+def plant() -> Iterator[MujocoPlant]:
+    config = cell()
+    with closing(MujocoPlant.from_config(Robot.from_config(config), config)) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def display(plant: MujocoPlant) -> RunDisplay:
+    config = cell()
+    robot = Robot.from_config(config)
+    parts = places_of_parts(plant, config)
+    return RunDisplay(ShownRobot.of(robot, config), robot.model, robot.collision_model, parts)
+
+
+def test_the_scene_has_the_parts_of_the_task_and_what_goes_with_each_tool(display: RunDisplay) -> None:
+    scene = TypeAdapter(ShownScene).validate_python(display.scene())
+    assert scene["name"] == cell().name
+    assert set(scene["parts"]) == set(cell().mujoco.objects)
+    for joints in scene["hands"].values():
+        assert len(joints) >= 3  # the last joint, and the fingers that it carries
+    assert not set(scene["hands"]["left"]) & set(scene["hands"]["right"])
+
+
+def test_a_moment_has_parts_where_they_lie_leashes_and_the_tightest_pair(
+    display: RunDisplay, plant: MujocoPlant, robot: Robot
+) -> None:
+    display.scene()
+    tick = tick_at(robot, 1.0, engaged=False)
+    pressed = Told(Event(0.5, "left", "pausing", "paused", Reason.of(ReasonKind.PRESSED, control="lower button")))
+    shown = ShownTick(tick, (), {"left": pressed}, HANDS, plant.observed_qpos, "")
+    state = TypeAdapter(ShownState).validate_python(display.message(shown))
+    for name, part in cell().mujoco.objects.items():
+        assert np.allclose(state["parts"][name][:3], part.position, atol=0.01)
+        assert np.linalg.norm(state["parts"][name][3:]) == pytest.approx(1.0, abs=1e-3)
+    assert state["pair"] is not None
+    ends = np.array(state["pair"]["ends"])
+    assert np.linalg.norm(ends[0] - ends[1]) > 0.0
+    # The page puts the words of the device in hand in.
+    assert state["arms"]["left"]["why"] == "{lower}"
+    assert "{lower} to engage" in state["arms"]["left"]["next"]
+
+
+def test_the_processes_that_draw_load_no_simulator() -> None:
+    modules = "q2r2_control.viewer.headset_display, q2r2_control.viewer.web.exchange"
+    check = f"import sys, {modules}; sys.exit('mujoco' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
+
+
+def test_without_a_simulation_there_are_no_parts(robot: Robot) -> None:
+    assert places_of_parts(object(), cell()) == {}
+    assert DeviceWords().noun("lower button") == "lower button"
