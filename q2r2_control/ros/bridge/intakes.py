@@ -1,4 +1,4 @@
-"""Inputs of the built-in controller: targets, one topic for each arm, and joint states, merged by joint name."""
+"""The inputs of the built-in controller: targets on one topic for each arm, and joint states merged by joint name."""
 
 from __future__ import annotations
 
@@ -39,16 +39,17 @@ from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import ArmTiming, Array, RobotState
 from q2r2_control.wording import sentence
 
-_SHARED = "joint_states"  # where no other topic is asked for
-_LATEST = 0.02  # that a target is received, later than others after the time of its stamp, for that to say anything [s]
-_OLD = 0.5  # a target that is older than the one before it, by so much, was made before its sender stood still [s]
-_LONGEST_PERIOD, _PERIOD_SHARE = 0.02, 0.05  # of joint states that may tell arms apart in time [s], and of its mean
-COMMAND_TIME = 0.01  # that a command takes to its driver and arm, where drivers do not tell [s]
-_PARTS = 64  # kinds of messages that are remembered
-_LAG_NOISE = 0.01  # of a lag that is found in joint states [s]
-_WARNING_TIME = 1.0  # refused targets are reported for this long [s]
-# Takes an arm's target in the world frame, or None if it is no pose, the time [s], the message's number, and when the
-# target is due [s], or None.
+_SHARED = "joint_states"  # The topic if no other one is asked for.
+_LATEST = 0.02  # By how much later than usual a target may arrive, so that its stamp still tells when it is due [s].
+_OLD = 0.5  # A target that is older than the one before by this much was made before its sender stood still [s].
+# Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period.
+_LONGEST_PERIOD, _PERIOD_SHARE = 0.02, 0.05
+COMMAND_TIME = 0.01  # Time of a command to its driver and arm, if drivers do not report it [s].
+_PARTS = 64  # Number of kinds of messages that are remembered.
+_LAG_NOISE = 0.01  # Noise of a lag that is estimated from joint states [s].
+_WARNING_TIME = 1.0  # Time for which refused targets are reported [s].
+# Takes the target of an arm in the world frame, or None if it is not a pose; the time [s]; the number of the message;
+# and the time at which the target is due [s], or None.
 Take = Callable[[str, pin.SE3 | None, float, int | None, float | None], Reason | None]
 TakeState = Callable[[RobotState | Reason, float], None]
 Look = Callable[[JointNumbers], None]
@@ -62,7 +63,7 @@ class TargetFrame(NamedTuple):
 
 
 class TargetIntake:
-    """Subscribes to the targets of all arms. Calls ``changed`` when :meth:`faults` has something new."""
+    """Subscribes to the targets of all arms. It calls ``changed`` when :meth:`faults` has something new."""
 
     def __init__(self, node: BaseNode, robot: Robot, changed: Callable[[], None]) -> None:
         self._node, self._changed = node, changed
@@ -76,9 +77,10 @@ class TargetIntake:
             self.topics[arm] = topic
         self.publishers = Publishers(node, self.topics.values())
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
-        self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # the delays since targets were made
-        self._newest = dict.fromkeys(robot.arms, (0, 0.0))  # the last target's stamp [ns], and how old it was [s]
-        self._refused: dict[str, tuple[Reason, float]] = {}  # why an arm's last target was not used, and when [s]
+        self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # The delays since targets were made.
+        self._newest = dict.fromkeys(robot.arms, (0, 0.0))  # Stamp of the last target [ns], and its age [s].
+        # By arm, why its last target was not used, and the time of that [s].
+        self._refused: dict[str, tuple[Reason, float]] = {}
         self.rejected = dict.fromkeys(robot.arms, 0)
 
     def subscribe(self, take: Take, release: Callable[[str], None]) -> None:
@@ -93,7 +95,7 @@ class TargetIntake:
         return self.publishers.source(self.topics[arm])
 
     def faults(self) -> dict[str, Reason]:
-        """Why the targets of each arm were refused lately; only arms of which some were."""
+        """Return why targets were refused lately, for each arm with refused targets."""
         now = self._node.now
         self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _WARNING_TIME}
         return {arm: refusal for arm, (refusal, _) in self._refused.items()}
@@ -101,7 +103,7 @@ class TargetIntake:
     def _on_target(self, take: Take, arm: str, message: bytes | PoseStamped, info: Mapping[str, int | None]) -> None:
         try:
             made, frame_id, numbers = read_pose(message)
-        except SerdeError as error:  # which is its sender's fault
+        except SerdeError as error:  # The sender is at fault.
             self._node.drop(self.topics[arm], str(error))
             return
         frame, now = self.frames[arm], self._node.now
@@ -123,22 +125,22 @@ class TargetIntake:
             self._refused.pop(arm, None)
 
     def _due(self, arm: str, made: int, received: float) -> float | None:
-        """When a target is due that was received then [s], by its stamp [ns]; None where the stamp does not say."""
+        """Return when a target is due [s], by its stamp [ns]; None if the stamp does not tell."""
         stamp, stamps = 1e-9 * made, self._stamps[arm]
         known = stamp > 0.0 and stamps.take(received - stamp, received) == 0.0
         return stamp + stamps.usual if known else None
 
     def _stood_still(self, arm: str, made: int, received: float) -> float:
-        """For how long a target's sender did [s] between making it and sending it, by the stamp; 0 for a moment.
+        """Return for how long the sender stood still between making and sending a target [s]; 0 if only for a moment.
 
-        Only the stamp tells, where it was frozen just before its middleware noted the time of sending.
+        Only the stamp tells this if the sender was frozen just before its middleware noted the time of sending.
         """
         (before, usual), self._newest[arm] = self._newest[arm], (made, received - 1e-9 * made)
         late = received - 1e-9 * made - usual
         return late if 0 < before < made and late > _OLD else 0.0
 
     def _refuse(self, arm: str, refusal: Reason) -> None:
-        """Log why targets are not used: once for each kind of fault, until a target is used again or none comes."""
+        """Log once for each kind of fault why targets are not used, until a target is used again or none comes."""
         self.rejected[arm] += 1
         before = self._refused.get(arm)
         self._refused[arm] = (refusal, self._node.now)
@@ -148,7 +150,7 @@ class TargetIntake:
 
 
 def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
-    """An arm's frame of targets. Raises :class:`ConfigError` for a link that moves."""
+    """Return the frame of an arm's targets; raises :class:`ConfigError` for a link that moves."""
     what = "frame_id that targets have to have: a link that does not move, or any other name for the cell's world"
     name, model = node.parameter(f"{arm}.target_frame_id", WORLD, what), robot.model
     if name == WORLD or not model.existFrame(name, pin.FrameType.BODY):
@@ -160,7 +162,7 @@ def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
 
 
 class JointIntake:
-    """Makes one state of all arms from joint states on one topic or several; it is as old as its oldest part."""
+    """Merges joint states of one topic or several into one state of all arms, which is as old as its oldest part."""
 
     def __init__(
         self, node: BaseNode, robot: Robot, needs_external_torque: bool = False, told_by_drivers: bool = False

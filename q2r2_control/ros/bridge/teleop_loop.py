@@ -1,4 +1,4 @@
-"""One tick of teleoperation for the arm nodes of a process, which share one :class:`Teleop`."""
+"""Run the ticks of teleoperation for the arm nodes of a process, which share one :class:`Teleop`."""
 
 from __future__ import annotations
 
@@ -25,26 +25,33 @@ if TYPE_CHECKING:
     from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
 
 
-_TIME_PERIOD = 0.05  # of looking whether time stands still [s]
-_PATIENCE = 2.0  # with an answer, with a controller that is to go home, with a recorder that says nothing [s]
+_TIME_PERIOD = 0.05  # Time between two looks whether time stands still [s].
+_PATIENCE = 2.0  # Time to wait for an answer, for a controller to go home, and for a report of the recorder [s].
 
 
 class HomeClient:
-    """Calls ``~/home`` and ``~/hold`` of the controller as the teleop layer's state says; never waits."""
+    """Calls ``~/home`` and ``~/hold`` of the controller by the state of the teleop layer. It never waits."""
 
     def __init__(self, node: Node, controller: str | None) -> None:
-        """``controller``: the built-in one's name; None: the arms' controller has no way home."""
+        """``controller`` is the name of the built-in controller; None if the arms' controller has no way home."""
         self._name = controller
         self._home: Any = None if controller is None else node.create_client(Trigger, f"{controller}/home")
         self._hold: Any = None if controller is None else node.create_client(Trigger, f"{controller}/hold")
-        self._answer: Any = None  # future; None: the service was not called
-        self._since: float | None = None  # of a way home: asked for, or accepted [s]; None: there is none
-        self._said = self._seen = False  # that it goes home, now and on this way
+        self._answer: Any = None  # The future of a call; None if no service was called.
+        self._since: float | None = None  # When a way home was asked for, or accepted [s]; None if there is none.
+        self._said = self._seen = False  # Whether the controller reports that it goes home: now, and on this way.
 
     def update(self, teleop: Teleop, said: bool, outcome: Reason | None, now: float) -> None:
-        """Once a tick; ``said``: whether the controller says that it goes home, ``outcome``: how the last way ended."""
+        """Advance by one tick.
+
+        Args:
+            teleop: The teleop layer.
+            said: Whether the controller reports that it goes home.
+            outcome: How the last way home ended.
+            now: The time [s].
+        """
         asked, begins, self._said = teleop.homing, said and not self._said, said
-        if self._since is None and begins and not asked:  # whoever has called the service
+        if self._since is None and begins and not asked:  # Somebody else has called the service.
             teleop.home(now)
             if teleop.homing:
                 self._answer, self._since, self._seen = None, now, True
@@ -59,7 +66,7 @@ class HomeClient:
             self._watch(teleop, outcome, now)
 
     def _watch(self, teleop: Teleop, outcome: Reason | None, now: float) -> None:
-        """End the way home if it is over, or the controller does not go."""
+        """End the way home if it is over, or if the controller does not begin."""
         self._seen |= self._said
         accepted = self._answer is None or (self._answer.done() and self._answer.result().success)
         late = self._since is not None and now - self._since > _PATIENCE
@@ -97,19 +104,19 @@ class HomeClient:
 
 
 class RecorderLink:
-    """The report of the recorder's node: whether it records, and whether an episode is open, whoever began it."""
+    """The report of the recorder's node: whether it records, and whether an episode is open."""
 
     def __init__(self, node: BaseNode) -> None:
         self._node = node
-        self._state: tuple[bool, bool, bool] | None = None  # the newest marks that have not been used
-        self._heard = 0.0  # [s] of steady time
-        self._served: int | None = None  # services that it has answered
+        self._state: tuple[bool, bool, bool] | None = None  # The newest marks that have not been used.
+        self._heard = 0.0  # Steady time of the newest report [s].
+        self._served: int | None = None  # Number of service calls that the node has answered.
         self._reasons: list[Reason] = []
         self._topic = f"{node.name_in_set(RECORDER)}/state"
         node.create_subscription(String, self._topic, self._on_state, 10)
 
     def update(self, marks: EpisodeMarks) -> list[Reason]:
-        """Once a tick, before the teleoperation; returns the reasons of new events of its services."""
+        """Update the marks before the teleoperation of a tick; returns the reasons of new events of its services."""
         if self._state is not None:
             (marks.recorded, marks.open, marks.any), self._state = self._state, None
         if marks.recorded and time.monotonic() - self._heard > _PATIENCE:
@@ -129,23 +136,23 @@ class RecorderLink:
 
 
 class TickInputs(NamedTuple):
-    """An arm and its controller in one tick; poses are in the world frame."""
+    """An arm and its controller in one tick. Poses are in the world frame."""
 
-    tool: pin.SE3 | None  # measured
-    commanded: pin.SE3 | None  # by the controller's reference, or what is known instead
-    reference: int | None  # the stamp of that reference by the controller's clock [ns]; None: there is none
-    obstacle: Reason | None  # why the arm may not be engaged
+    tool: pin.SE3 | None  # The measured tool.
+    commanded: pin.SE3 | None  # The tool in the controller's reference, or the best substitute that is known.
+    reference: int | None  # Stamp of that reference by the controller's clock [ns]; None if there is none.
+    obstacle: Reason | None  # Why the arm may not be engaged.
 
 
 class TeleopLoop:
-    """Ticks the node of one arm, or of both, for which one :class:`Teleop` decides at one moment."""
+    """Ticks the node of one arm, or of both arms. One :class:`Teleop` then decides for both at one moment."""
 
     def __init__(self) -> None:
         self.nodes: list[BaseArmController] = []
         self.teleop: Teleop
 
     def join(self, node: BaseArmController) -> None:
-        """Before the first tick: teleoperate this node's arm too. Raises :class:`ConfigError` where nodes differ."""
+        """Teleoperate this node's arm as well, before the first tick; raises :class:`ConfigError` if nodes differ."""
         ours, first = node.parameters, (self.nodes or [node])[0]
         theirs = first.parameters
         for name in ("teleop", "rate", "mode", "builtin_node"):
@@ -156,7 +163,7 @@ class TeleopLoop:
         self.teleop = Teleop(theirs.teleop, [one.arm_name for one in self.nodes])
 
     def connect(self, node: BaseArmController) -> None:
-        """After the node's publishers and subscriptions were made."""
+        """Connect a node, after its publishers and subscriptions were made."""
         if node is not self.nodes[0]:
             return
         if node.parameters.mode is Mode.RAW and node.parameters.preset is not BUILTIN:
@@ -166,18 +173,18 @@ class TeleopLoop:
         self._ticked = node.now
         self._without_time: Reason | None = None
         node.create_tick(1.0 / node.parameters.rate, self.tick)
-        # Without time there are no ticks, and so nothing else that would pause the arms.
+        # While time stands still there are no ticks, and nothing else would pause the arms.
         node.create_tick(_TIME_PERIOD, self._watch_time, clock=STEADY)
 
     def tick(self) -> None:
-        """Process what arrived, and publish where the tools should go."""
+        """Process the messages that have arrived, and publish the targets of the tools."""
         decided, now, nodes, teleop = time.monotonic(), self.nodes[0].now, self.nodes, self.teleop
         for reason in self._recorder.update(teleop.marks):
             for node in nodes:
                 node.feedback.haptics.start_pulse(Event(now, node.arm_name, node.state, node.state, reason))
         faults = {node.arm_name: node.begin_tick(now) for node in nodes}
-        # Read after the nodes were judged: the process may have been frozen in the middle of this tick. A gap in the
-        # node's own ticks comes first, since it makes others look silent.
+        # The time is read after the nodes were judged, because the process may have been frozen in the middle of this
+        # tick. A gap in the node's own ticks is looked at first, because it makes others look silent.
         gap, self._ticked = nodes[0].now - self._ticked, now
         if gap > teleop.settings.gate.timeout:
             self._pause(now, Reason.of(ReasonKind.NODE_STALLED, duration=gap))
@@ -185,7 +192,7 @@ class TeleopLoop:
             if fault is not None:
                 teleop.pause(now, fault, arm)
         inputs = {node.arm_name: node.inputs for node in nodes}
-        # Presses made while time stood still are processed only now. They may stop an arm, and never engage one.
+        # Presses made while time stood still are processed only now. They may stop an arm, but never engage one.
         stood, self._without_time = self._without_time, None
         obstacles = {arm: why for arm, one in inputs.items() if (why := one.obstacle or stood) is not None}
         references = {one.reference for one in inputs.values()}
@@ -213,7 +220,7 @@ class TeleopLoop:
             self.teleop.pause(now, reason)
 
     def _watch_time(self) -> None:
-        """Pause where simulated time stands still: the hands go on, and must not be followed later."""
+        """Pause the arms if simulated time stands still. The hands go on, and must not be followed later."""
         timeout = self.teleop.settings.gate.timeout
         if (problem := self.nodes[0].clock_problem(timeout)) is None:
             return

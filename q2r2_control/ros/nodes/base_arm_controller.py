@@ -1,4 +1,4 @@
-"""Teleoperation of one arm as a node. Another robot is a subclass with its names, see left_arm_controller."""
+"""Teleoperate one arm as a ROS node. Another robot is a subclass with its own names, see arm_controllers.py."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ from q2r2_control.teleop.hand_motion import MAX_OFFSET
 from q2r2_control.types import SIDES, ArmTarget
 from q2r2_control.wording import sentence
 
-_WITHOUT_HAND = ArmState.CARRIED, ArmState.HOMING  # where the arm's hand need not be there
+_WITHOUT_HAND = ArmState.CARRIED, ArmState.HOMING  # States in which the arm does not need its hand.
 
 
 class BaseArmController(BaseNode):
-    """One arm follows one hand: hand topics in, target pose, gripper goals, markers and vibrations out.
+    """A node by which one arm follows one hand.
 
-    The node is ``<arm_name>_<robot_name>_arm_controller``; the other arguments are the defaults of parameters of that
-    name. ``preset`` names the terms of the controller that is driven: topic, rate, speeds, what it needs in pauses.
+    It takes the topics of the hand, and publishes the target pose, gripper goals, markers and vibrations. Its name is
+    ``<arm_name>_<robot_name>_arm_controller``. The other arguments are the defaults of the parameters with their names.
+    ``preset`` names the terms of the controller that is driven: topic, rate, speeds, and what it needs in pauses.
     ``filter_window_size``, in samples of a 75 Hz headset, sets ``teleop.filter.smoothing_delay``. ``partner`` is the
     node of the other arm in this process, see ``run_arms`` of :mod:`arm_controllers`: both arms then are one
     teleoperation, as in ``q2r2 run``. Without it a fault pauses this node's own arm only.
@@ -85,13 +86,13 @@ class BaseArmController(BaseNode):
             self.setup_state()
             self.setup_interfaces()
         except BaseException:
-            self.destroy_node()  # a node that is never returned could keep the process from ending
+            self.destroy_node()  # A node that is never returned could keep the process from ending.
             raise
-        # For the origin of a process's first line rclpy looks through all modules, some 60 ms: not at the first press.
+        # At the first log line rclpy searches all modules for its origin, for some 60 ms. This must not be at a press.
         self.get_logger().info(f"the {self.hand} hand moves the target on {self.outputs.first.topic}")
 
     def setup_parameters(self) -> ArmParameters:
-        """Declare the parameters; returns what they say."""
+        """Declare the parameters, and return their values."""
         return arm_parameters(self, self.defaults)
 
     def setup_state(self) -> None:
@@ -100,7 +101,7 @@ class BaseArmController(BaseNode):
         self.loop.join(self)
         self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
         self._target = ArmTarget(None, OPEN)
-        # Until the first tick, which where time stands still never comes.
+        # These values count until the first tick, which never comes if time stands still.
         not_begun = Reason(ReasonKind.NO_TOOL_POSE, cause=Reason(ReasonKind.NODE_BEGINS))
         self._refusal: tuple[bytes, Reason] | None = WARN, not_begun
         self.inputs = TickInputs(None, None, None, None)
@@ -134,7 +135,7 @@ class BaseArmController(BaseNode):
         self.loop.connect(self)
 
     def current_pose(self) -> pin.SE3 | None:
-        """The tool's pose in the world frame; None where it is not known."""
+        """Return the tool's pose in the world frame; None if it is not known."""
         return self._tool.at(self.now)
 
     def pose_callback(self, message: PoseStamped) -> None:
@@ -146,11 +147,11 @@ class BaseArmController(BaseNode):
         self.intake.put_inputs(message)
 
     def toggle_gripper(self) -> None:
-        """The upper button was pressed."""
+        """Open or close the gripper, because the upper button was pressed."""
         self.gripper.toggle(self.now)
 
     def begin_tick(self, now: float) -> Reason | None:
-        """Renew :attr:`inputs` at ``now`` [s]; returns why the arm has to hold, its hand aside, or None."""
+        """Update :attr:`inputs` at ``now`` [s]; returns why the arm has to hold, apart from its hand, or None."""
         tool, base, controlled = self.current_pose(), self._base(), self._safe_target.at(now)
         obstacle = self._obstacle(tool, base, controlled)
         silence = None if self.state in _WITHOUT_HAND else self.intake.silence(now)
@@ -164,12 +165,15 @@ class BaseArmController(BaseNode):
         return None if self.state in HOLDING else fault
 
     def follow(self, target: ArmTarget, now: float, decided: float) -> Reason | None:
-        """Publish the ``target`` that was ``decided`` on then [s], command the gripper; why the arm has to hold."""
+        """Publish the target and command the gripper; returns why the arm has to hold, or None.
+
+        ``decided`` is the time at which the target was decided on [s].
+        """
         if self.intake.hand != self.hand:
             self.intake.follow(self.hand)
         toggled, self._target = target.gripper != self._target.gripper, target
         tool, base = self.inputs.tool, self._base_pose
-        # If this process was frozen meanwhile, the target is out of date: it is not sent, and the next tick pauses.
+        # If this process was frozen meanwhile, the target is too old. It is not sent, and the next tick pauses the arm.
         sent = self.outputs.step(target.command, tool, base, now, decided, self.state)
         fault = self.outputs.relay(self.engaged, tool, base, now, decided)
         if self._has_analog_gripper:
@@ -181,7 +185,7 @@ class BaseArmController(BaseNode):
         return fault
 
     def refuse(self, problem: Reason) -> None:
-        """The arm may not be engaged until the next tick."""
+        """Let nobody engage the arm until the next tick."""
         self._refusal = ERROR, problem
 
     @property
@@ -238,7 +242,7 @@ class BaseArmController(BaseNode):
     def _obstacle(
         self, tool: pin.SE3 | None, base: pin.SE3 | None, controlled: pin.SE3 | None
     ) -> tuple[bytes, Reason] | None:
-        """Why the arm may not be engaged now, its hand aside, with the level of the diagnostics."""
+        """Return why the arm may not be engaged now, apart from its hand, and the level for the diagnostics."""
         values = self.parameters
         if (conflict := self._conflict()) is not None:
             return ERROR, conflict
@@ -248,7 +252,7 @@ class BaseArmController(BaseNode):
         if base is None:
             return WARN, Reason.of(ReasonKind.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         unready = self.outputs.unready
-        # An arm that follows may lag. One that holds would be engaged and lost at every press.
+        # An arm that follows may lag. An arm that holds would be engaged and lost at every press.
         if self.outputs.builtin and self.state in HOLDING and (away := self.outputs.away(controlled, tool)):
             unready = unready or Reason(ReasonKind.CONTROLLER_REFUSES, cause=away)
             if self.state is ArmState.IDLE:
@@ -256,11 +260,11 @@ class BaseArmController(BaseNode):
         return None if unready is None else (WARN, unready)
 
     def _conflict(self) -> Reason | None:
-        """Two nodes that say different things where the arm follows one."""
+        """Return a reason if two nodes publish different things of which the arm can follow only one, else None."""
         return self.outputs.conflict or self.intake.conflict or self._frames.conflict(self.parameters.tool_frame)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
-        """For the leash and for anchors. Another controller's is not known: then the tool's, or the last target's."""
+        """Return the commanded tool for leash and anchors; with another controller the tool or the last target."""
         if self.engaged:
             return self._target.command_for(tool) if reference is None else reference
         reference = reference or self.outputs.first.last_sent
@@ -275,7 +279,7 @@ class BaseArmController(BaseNode):
         return None if problem is None else sentence(problem)
 
     def _share_parameters(self, parameters: Sequence[Parameter]) -> None:
-        """The nodes of one teleoperation have one value of its parameters."""
+        """Give changed parameters to the other node of the same teleoperation."""
         shared = [one for one in parameters if is_of_teleop(one.name)]
         for node in [node for node in self.loop.nodes if node is not self]:
             changed = [one for one in shared if node.get_parameter(one.name).value != one.value]
@@ -283,7 +287,7 @@ class BaseArmController(BaseNode):
                 node.set_parameters_atomically(changed)
 
     def _on_engage(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Press for the hand, with all that a press needs and does; an arm that follows already is left alone."""
+        """Press for the hand, with the same conditions. An arm that follows already is left alone."""
         response.success = not self.engaged
         response.message = f"{self.arm_name} follows its hand already" if self.engaged else f"{self.arm_name}: pressed"
         if not self.engaged:
@@ -296,7 +300,7 @@ class BaseArmController(BaseNode):
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Drop all that was received, the held target and a stop of the operator's; a press engages again."""
+        """Forget everything received, the held target and a stop of the operator. A press engages the arm again."""
         self.loop.teleop.reset(self.now, self.arm_name, Reason(ReasonKind.RESET_SERVICE))
         self.outputs.forget(self.now)
         response.success, response.message = True, f"{self.arm_name} is reset"

@@ -1,9 +1,10 @@
-"""``cartesian_controller``: the built-in controller for all arms of a cell, between target poses and joint commands.
+"""``cartesian_controller``: the built-in controller for all arms of a cell. It turns target poses into joint commands.
 
-Every topic is one of all arms or one an arm, as the robot's layout asks for. Targets are on ``/q2r2/left/target_frame``
-or ``left.target_topic``, joint states on ``joint_states`` or ``left.joint_states_topic``, commands on ``output_topic``
-or ``left.output_topic``. Moving obstacles are on ``~/obstacles``. With output ``none`` another controller moves the
-arms, for which ``~/safe_target/left`` is published. The rules for targets: :mod:`supervisor`.
+Each kind of topic exists once for all arms or once for each arm, as the robot needs it. Targets are on
+``/q2r2/left/target_frame`` or ``left.target_topic``, joint states on ``joint_states`` or ``left.joint_states_topic``,
+and commands on ``output_topic`` or ``left.output_topic``. Moving obstacles are on ``~/obstacles``. With the output
+``none`` another controller moves the arms, and follows ``~/safe_target/left``. :mod:`supervisor` has the rules for
+targets.
 """
 
 from __future__ import annotations
@@ -43,16 +44,16 @@ from q2r2_control.types import LONGEST_DT, Reference
 from q2r2_control.wording import sentence
 
 _LONGEST_STOP = 3.0  # [s]
-_QUIET = 0.3  # nobody else commands the arms for so long before this node does [s]
-_LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
-_SAFE_TARGET_PERIOD = 0.02  # of arms that only listen [s]
+_QUIET = 0.3  # Other commanders must be silent for this long first [s].
+_LONGEST_ACTIVATION = 2.0  # In addition to the settle time [s].
+_SAFE_TARGET_PERIOD = 0.02  # For arms that only listen [s].
 
 
 class CartesianControllerNode(ManagedNode):
-    """Feeds a :class:`ControlLoop` from its topics and publishes its commands."""
+    """Passes messages of its topics to a :class:`ControlLoop`, and publishes its commands."""
 
     ticks = True
-    priority = 40  # nothing may delay a joint command; below drivers, which ros2_control runs at 50
+    priority = 40  # No other program may delay a joint command. ros2_control runs drivers at 50.
 
     def __init__(self) -> None:
         super().__init__("cartesian_controller")
@@ -77,7 +78,7 @@ class CartesianControllerNode(ManagedNode):
             self._output.withheld = told.withheld
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
-        # A message with a bad number among good ones is another publisher's: no reason to bridge it.
+        # A message with a bad number among good ones comes from another publisher, and is not bridged.
         watch.unusable_time = 0.0
         make_watching_live(self, streams, watch, external)
         self._watch = watch
@@ -101,25 +102,25 @@ class CartesianControllerNode(ManagedNode):
             standstill=self._standstill(output),
         )
         self._supervisor = self._loop.supervisor
-        # Another controller's arms are judged with fingers all of their way.
+        # Arms of another controller are judged with fingers that count as their whole way.
         asking = {} if self._only_leads else self._targets.topics
         self._grippers = GripperLimits(self, config, self._loop, asking)
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
-        self._commanding, self._advances = False, 0  # ticks that have gone by some time
-        # Another controller follows every safe target; arms that listen need the newest to know where the arm is.
+        self._commanding, self._advances = False, 0  # The second is the number of ticks in which time has passed.
+        # Another controller follows every safe target. Nodes that only listen need the newest one.
         every = 1 if self._only_leads else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._last_tick = self.now
         self._deactivated = Reason.of(ReasonKind.CONTROLLER_DEACTIVATED, controller=self.get_fully_qualified_name())
         self._others = self._output.watch(self)
-        self._other: Reason | None = None  # who else commands the arms
+        self._other: Reason | None = None  # Another node that commands the arms.
         self._connect()
         self.start_active()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
     def _standstill(self, output: str) -> StandstillLimits | None:
-        """An arm that yields may be held, and then stands still by design."""
+        """Return the limits for a driver that stands still; None for compliant arms, which a person may hold."""
         if output == NONE:
             return LAGGING_JOINTS
         return None if self._output.drive.yields else JOINTS
@@ -139,12 +140,12 @@ class CartesianControllerNode(ManagedNode):
     def _tick(self) -> None:
         decided = time.monotonic()
         if self._output.waits():
-            return  # this tick is a missed one, and the next a late one
+            return  # This tick is missed, and the next one is late.
         now = self._clock_of_ticks.at(self.now)
-        # A late tick is no jump; a clock that was set back moves nothing.
+        # A late tick makes no jump, and a clock that was set back moves nothing.
         gap = now - self._last_tick
         dt = self._loop.pace(gap)
-        if gap > max(LONGEST_DT, self._watch.timeout):  # as long without a tick as arms may be without joint states
+        if gap > max(LONGEST_DT, self._watch.timeout):  # Without ticks for as long as arms may be without states.
             self._supervisor.stalled(gap, now)
         self._last_tick = now
         self.ticked += 1
@@ -154,7 +155,7 @@ class CartesianControllerNode(ManagedNode):
 
     def _advance(self, now: float, dt: float, decided: float) -> None:
         self._advances += 1
-        if not self._only_leads:  # another controller's arms are judged by where they are measured
+        if not self._only_leads:  # Arms of another controller are judged by their measured posture.
             self._loop.watch_skew(self._joints.timings(now), self._period + COMMAND_TIME, now)
         inactive = self._supervisor.phase is Phase.INACTIVE
         self._other = self._others.intruder() if self._commanding else self._others.commander()
@@ -162,7 +163,7 @@ class CartesianControllerNode(ManagedNode):
             return
         if self._other is not None and self._supervisor.phase is Phase.ACTIVE:
             self._supervisor.stop(self._other)
-        # Commands that the arms do not follow are not for a receiver that has just come.
+        # A receiver that has just come must not get commands that the arms do not follow.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
             self._supervisor.let_go(fault, now)
         state, openings = self._joints.state, self._grippers.openings(now)
@@ -193,7 +194,7 @@ class CartesianControllerNode(ManagedNode):
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._supervisor.pause(request.data)
-        self.report_health()  # arms that listen must not wait for the next time
+        self.report_health()  # Nodes that listen must not wait for the next report.
         return _answer(response, None)
 
     def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
@@ -251,7 +252,7 @@ class CartesianControllerNode(ManagedNode):
         return WARN if refused else OK, "; ".join([*doing, *map(sentence, ended.values())]), values
 
     def begin(self) -> str | None:
-        """Take over where the arms stand, if they do and nobody else commands them."""
+        """Begin to command the arms where they stand; returns why not, if they move or another node commands them."""
         self._tick_until(lambda: False, _QUIET)
         if (other := self._others.commander(_QUIET)) is not None:
             return sentence(other)
@@ -260,7 +261,7 @@ class CartesianControllerNode(ManagedNode):
         settle = float(self.get_parameter("settle_time").value)
         active = self._tick_until(lambda: self._supervisor.phase is Phase.ACTIVE, settle + _LONGEST_ACTIVATION)
         problem = None if active else self._supervisor.fault or Reason(ReasonKind.ARMS_MOVE)
-        # Nothing was commanded yet: that begins with the next tick.
+        # Commands begin with the next tick.
         if (problem := self._others.commander(_QUIET) or problem) is not None:
             self._supervisor.let_go(problem, self.now)
             self._supervisor.stop(self._deactivated)
@@ -269,7 +270,7 @@ class CartesianControllerNode(ManagedNode):
         return None
 
     def end(self) -> str | None:
-        """Bring the arms to rest along the certified stop; then nothing is commanded, and another node may."""
+        """Bring the arms to rest along the certified stop. After that another node may command them."""
         self._come_to_rest(self._deactivated, self._tick_on)
         self._others.begin()
         return None
@@ -290,7 +291,7 @@ class CartesianControllerNode(ManagedNode):
         advances = self._advances
         try:
             while self._supervisor.phase is Phase.BRAKING and (now := time.monotonic()) < deadline:
-                # Joint states still have to come in; ticks do the rest, unless simulated time has ended already.
+                # Joint states still have to come in. Ticks do the rest, unless simulated time has ended already.
                 go_on()
                 if self._advances != advances:
                     advances, last = self._advances, now
@@ -303,7 +304,7 @@ class CartesianControllerNode(ManagedNode):
             self._others.rest()
 
     def _tick_on(self) -> None:
-        """One tick in the middle of a service, which the executor waits for."""
+        """Take one tick in the middle of a service, for which the executor waits."""
         time.sleep(self._period)
         if isinstance(self.executor, TickExecutor):
             self.executor.take_messages()

@@ -1,9 +1,9 @@
-"""``recorder``: keeps what the nodes of a cell publish in one MCAP file a run. It only listens.
+"""``recorder``: writes what the nodes of a cell publish into one MCAP file for each run. It only listens.
 
-It listens to no topic that commands, where it would count as a receiver. An arm without a controller could be engaged
-then, and arms that are off their reference would be stopped. The nodes of arms publish their targets once more for it,
-and the controller the reference that joint commands are made of. Streams reach it by best effort, so no sender waits
-for it.
+It does not listen to topics with commands, because it would count as a receiver there. An arm without a controller
+could then be engaged, and arms that are off their reference would be stopped. Instead, the nodes of arms publish their
+targets a second time, and the controller publishes the reference of its commands. Streams arrive by best effort, so
+that no sender waits for the recorder.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _SERVICES = {
     "failure": ReasonKind.EPISODE_FAILED,
     "mark": ReasonKind.MARK,
 }
-HANDOVER_PERIOD = 0.02  # between two looks at what has arrived; a message waits for two of them at most [s]
+HANDOVER_PERIOD = 0.02  # Time between two looks at new messages. A message waits for two of them at most [s].
 _STREAM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -135,13 +135,14 @@ class RecorderNode(BaseNode):
             self.report_health()
 
     def _day(self) -> int:
-        """The time of day [ns], which goes on evenly when the computer's clock is set."""
+        """Return the time of day [ns]. It goes on evenly if the computer's clock is set."""
         return self._epoch + time.monotonic_ns() - self._begun
 
     def _write(self) -> None:
-        """Pass on, in the order of their receipt, the messages that were there when this was last called.
+        """Pass on, in the order of receipt, the messages that were there at the last call.
 
-        Topics are taken one after the other: of what came since, an older message may not have been taken yet.
+        Topics are read one after the other. An older message of another topic may therefore arrive after a newer one,
+        until the next call.
         """
         until, self._looked = self._looked, self._day()
         self._recorder.record([one for one in self._waiting if one.time <= until])
@@ -165,7 +166,7 @@ class RecorderNode(BaseNode):
         return Event(self._day() * 1e-9, "", "", "", reason)
 
     def _tell(self, reason: Reason) -> None:
-        """Let the recording, and through the arms' nodes both hands, know of an event that no hand told."""
+        """Record an event that comes from no hand, and tell both hands of it through the arms' nodes."""
         self._served, self._served_last = self._served + 1, reason
         self._events.publish(String(data=json.dumps(self._event(reason).as_json())))
         self.report_health()

@@ -1,6 +1,6 @@
-"""``web_page``: shows in browsers what the nodes of a cell publish. It listens as the recorder does, to no command.
+"""``web_page``: shows in browsers what the nodes of a cell publish. As the recorder, it listens to no commands.
 
-Its buttons call services that anybody may call.
+Its buttons call services that every node may call.
 """
 
 from __future__ import annotations
@@ -55,16 +55,16 @@ from q2r2_control.types import SIDES, ArmTarget, Command, CommandMode, Reference
 from q2r2_control.viewer.web.exchange import Frame, PageRequest
 from q2r2_control.viewer.web.page import Page
 
-_PERIOD = 1.0 / 30.0  # between frames [s]
-_LOOK_PERIOD = 0.5  # between two looks at which nodes there are [s]
-_STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # ticks of a frame, and far more
+_PERIOD = 1.0 / 30.0  # Time between two frames [s].
+_LOOK_PERIOD = 0.5  # Time between two looks for nodes [s].
+_STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # Deep enough for the ticks of a frame.
 _PICTURE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-_PICTURE_PERIOD = 0.2  # between two pictures of a camera [s]
+_PICTURE_PERIOD = 0.2  # Time between two pictures of a camera [s].
 _UNREADABLE = SerdeError, ValueError, KeyError, IndexError, TypeError
 
 
 class WebPage(BaseNode):
-    """Draws what it has heard, and passes on what the page's buttons ask for."""
+    """Draws what it has heard, and passes on the requests of the page's buttons."""
 
     ticks = True
 
@@ -137,7 +137,7 @@ class WebPage(BaseNode):
                 self._obstacles[marker.ns] = obstacle, now
 
     def _look(self) -> None:
-        """Find the nodes, and their services before a button needs them."""
+        """Look for nodes, and for their services before a button needs them."""
         self._states.look()
         names = {name for request in self._requests for name in self._services_of(request)}
         if PageRequest.RECORD in self._requests:
@@ -177,7 +177,7 @@ class WebPage(BaseNode):
             self._notice = f"{name}: {future.result().message}"
 
     def _show(self) -> None:
-        """Serve what was asked for, and draw the newest tick."""
+        """Do what the page's users have asked for, and draw the newest tick."""
         while not self._asked.empty():
             self._serve(self._asked.get())
         waiting, self._waiting = self._waiting, []
