@@ -74,7 +74,7 @@ class CellCheck:
     contacts: tuple[ContactPair, ...]  # that may touch, in torque mode
     nearest: list[KeptPair]  # nearest first
     faults: tuple[str, ...]
-    remedies: list[str]  # lines to paste for pairs among these, with lines that say where
+    remedies: list[str]  # Lines to paste into the YAML for these pairs, with comments that say where.
     stop_torques: tuple[StopTorque, ...]  # by arm
     driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
     controls: dict[str, str]  # what those of each hand do

@@ -105,7 +105,7 @@ class HeadsetConfig(StrictModel):
 
     @property
     def networks(self) -> tuple[Network, ...] | None:
-        """The networks that ``allow`` names."""
+        """The IP networks that the key ``allow`` lists."""
         return None if self.allow is None else tuple(map(network_of, self.allow))
 
 

@@ -24,7 +24,7 @@ class StepProblem:
     def __init__(
         self, robot: Robot, settings: ControllerSettings, tasks: Sequence[Task], constraints: Sequence[Constraint]
     ) -> None:
-        """Raises :class:`ConfigError` as :class:`ExternalTasks` and :class:`OwnConstraints` do."""
+        """Raises :class:`ConfigError` if one of the tasks or constraints is not usable at home."""
         self._longest = settings.max_substep
         self._external = ExternalTasks(robot, settings.tasks, tasks)
         self.constraints = OwnConstraints(robot, constraints)

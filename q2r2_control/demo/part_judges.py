@@ -68,7 +68,7 @@ class TouchWatch:
         self.forbidden: dict[tuple[str, str], float] = {}  # names of two bodies -> when they touched first [s]
 
     def look(self, t: float) -> dict[str, PartState]:
-        """Every part at ``t`` [s], as of the last physics step."""
+        """Take the pose of every part at ``t`` [s], as it was after the last physics step."""
         touched, force = dict.fromkeys(self._body, 0), dict.fromkeys(self._body, 0.0)
         kinds, body = self._kinds, self._body
         for contact, (first, second) in enumerate(self._data.contact.geom.tolist()):

@@ -104,7 +104,7 @@ def holding_command(q: Array, grippers: Openings) -> Command:
     return Command(CommandMode.POSITION, q, zero, zero, grippers)
 
 
-# Gain of the position feedback [1/s]. A plant with a delay T is stable below about 1 / T, here 100 ms.
+# Gain of the position feedback [1/s]. With a plant of the delay T, here 100 ms, gains below about 1 / T are stable.
 FEEDBACK_GAIN = 10.0
 _FRESH_TICKS = 3  # A measurement that has not changed for more ticks is old, because the arm has moved since.
 _STILL = 1e-2  # An arm on its spring stands still if its joints are slower than this [rad/s].

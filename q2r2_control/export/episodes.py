@@ -222,7 +222,7 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
                 with path.open("rb") as stream:
                     os.fsync(stream.fileno())  # no half of it is kept where power fails
         unfinished.replace(target)
-    except RecordingError as error:  # pictures are read while they are written
+    except RecordingError as error:  # Pictures are read from the recording only while they are written to the dataset.
         return None, _reason(error, job)
     except OSError as error:
         raise ConfigError(f"--output {target.parent}: {error.strerror or error}") from error

@@ -198,7 +198,7 @@ class PolicyInput:
             self._chunks.append(self._fault(str(error)))
         except BaseException as error:  # whatever a policy does, the loop goes on
             if not isinstance(error, Exception) and threading.current_thread() is threading.main_thread():
-                raise  # of a signal's handler, which ends the program
+                raise  # The exception comes from a signal handler, and ends the program.
             self._errors.show(error)
             self._chunks.append(self._fault(f"the policy raised {type(error).__name__}: {error}".removesuffix(": ")))
         self._due = observation.time + max(count // 2, 1) * self.period - 1e-9

@@ -97,7 +97,7 @@ class TimingFigures:
     """Of all ticks, the end of the run included; None: there are none."""
 
     ticks: int  # that are in the file
-    lost_ticks: int  # that are not, between the first and the last
+    lost_ticks: int  # Number of ticks between the first and the last one that the recording lacks.
     lost_share: float | None
     longest_lost_s: float  # of which no tick is in the file
     late_ticks: int  # more than 1.5 periods after the one before

@@ -114,7 +114,7 @@ def delays(episode: Episode, hand: str) -> list[float | None]:
         return [None, None]
     motion = RelativeMotion(episode.config.teleop.stance, axes=episode.config.teleop.axes)
     motion.anchor(pin.SE3.Identity(), pin.SE3.Identity())
-    axes = np.array([motion.target(pin.SE3(np.eye(3), axis)).translation for axis in np.eye(3)])  # M, transposed
+    axes = np.array([motion.target(pin.SE3(np.eye(3), axis)).translation for axis in np.eye(3)])  # M'
     position = samples.position[usable][first] @ axes
     t = episode.frame_t
     times = [

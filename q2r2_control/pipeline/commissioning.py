@@ -20,7 +20,7 @@ _REACHED, _BEHIND = 0.2, 0.8  # how far a measured joint may be from the command
 _SPREAD = np.array([0.0, 0.1, 0.2, 0.25, 0.4, 0.5, 0.5])
 _TRIES = 40
 LED = 2.0  # upwards before the hand lets go [s]
-_LATENCY = 0.15  # from letting go until the measured arm brakes, as the gate grants a hand that is silent [s]
+_LATENCY = 0.15  # Longest time from when a hand lets go until the arm brakes: the time-out of a silent hand [s].
 LEAST_SPEED = 0.01  # of the tool, to be stopped from [m/s]
 _STANDS = 1e-3  # joints that are nearer to where they come to rest [rad]
 

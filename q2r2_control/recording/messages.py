@@ -95,7 +95,7 @@ def _numbered(types: dict[str, str], labels: dict[str, tuple[str, ...]]) -> dict
 
 
 def tick_fields(arms: Sequence[str]) -> tuple[str, ...]:
-    """The numbers of :data:`CONTROLLER_TICK`, in their order."""
+    """Return the names of the numbers in :data:`CONTROLLER_TICK`, in the order of the message."""
     return (*TICK_FIELDS, *(f"rejected_{arm}" for arm in arms))
 
 

@@ -170,7 +170,7 @@ def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]
 
 
 def _check_apart(urdf: ET.Element) -> None:
-    """Names of a robot without prefix could be those that a tool has with one."""
+    """Check that no name occurs twice: a robot's name without a prefix may equal a tool's name with its prefix."""
     for tag in ("link", "joint"):
         names = [element.get("name", "") for element in urdf.findall(tag)]
         if twice := sorted(name for name in set(names) if names.count(name) > 1):

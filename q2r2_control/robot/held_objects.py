@@ -99,7 +99,7 @@ class _Pairs:
         self._solids[held.link] = self._add(f"{held.link}_solid", held.joint, shape, held.placement)
 
     def watch(self, holders: Iterable[str], first: str, second: str) -> None:
-        """The pairs of two solids, which count while all ``holders`` hold."""
+        """Watch the pairs of two solids. They count while all grippers in ``holders`` hold their object."""
         pairs = [(self._solids[first], self._solids[second])]
         if self._is_box(first) and self._is_box(second):
             pairs = [(edge, self._solids[second]) for edge in self._edges_of(first)]

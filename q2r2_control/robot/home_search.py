@@ -33,7 +33,7 @@ _BELOW = 0.16  # the same between the tool and the floor, as far as scripted han
 _NEEDED = 0.005  # [m]
 _MIRROR = np.array([1.0, -1.0, 1.0])
 _ALONG_X, _ALONG_Z = np.diag([0.01, 0.0, 0.01])[[0, 2]]  # in the tool's frame [m]
-_FAULTY = 100.0  # cost of what is needed and missing
+_FAULTY = 100.0  # Cost of each requirement that a posture does not meet.
 
 
 def find_home(

@@ -191,7 +191,7 @@ def capsule_fits(description: Description, several: Collection[str]) -> list[Cap
 
 
 def _volume_of(capsules: Sequence[Capsule]) -> float:
-    """Of capsules together [m^3], by random points that are always the same."""
+    """Return the volume of the union of capsules [m^3], estimated by random points from a fixed seed."""
     ends = np.array([[start, end] for _, start, end in capsules])
     radii = np.array([radius for radius, _, _ in capsules])[:, None, None]
     low, high = (ends - radii).min(axis=(0, 1)), (ends + radii).max(axis=(0, 1))

@@ -317,7 +317,11 @@ class Robot:
 
 
 def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[str, float]:
-    """Position of every joint. Raises :class:`RobotError` that begins with ``where`` for a wrong one of ``given``."""
+    """Return the home position of every joint, from ``given`` where it has one.
+
+    Raises:
+        RobotError: With a text that begins with ``where``, if a value of ``given`` is not allowed.
+    """
     check_kind(f"{where}: home", given, Mapping, "positions by joint [rad or m]", RobotError)
     joints = {joint.get("name", ""): joint for joint in urdf.findall("joint") if joint.get("type") != "fixed"}
     for name, position in given.items():

@@ -85,7 +85,10 @@ class TurningBody:
     joints: tuple[FingerJoint, ...]  # from the hand outwards
 
     def curvatures(self) -> Array:
-        """Bound on the second derivative by two joints' positions (j, j) [m]; 0 for those of two drivers."""
+        """Return a bound (j, j) [m] on the second derivatives of a shape's points by the positions of two joints.
+
+        It is 0 if the two joints have different drivers.
+        """
         bounds = np.zeros((len(self.joints), len(self.joints)))
         farthest, beyond = 0.0, self.ends  # from a point on the joint's axis to the ends, at most [m]
         for k, outer in reversed(list(enumerate(self.joints))):
@@ -169,7 +172,7 @@ class TurningSweeps:
         return Capsules(starts[rows, best], ends[rows, best], radius[rows, best])
 
     def ends_at(self, opening: float) -> Array:
-        """Both ends of each shape's segment with all driven joints at an ``opening`` (b, 2, 3) [m]."""
+        """Return both ends of the segment of each of b shapes (b, 2, 3) [m], with all driven joints at ``opening``."""
         closed, opened = self._stroke
         points = self._ends[None]
         for j in reversed(range(len(self._home))):

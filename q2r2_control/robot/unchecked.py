@@ -75,9 +75,10 @@ def moving_links(robot: Robot) -> list[MovingLink]:
 
 
 def unchecked_faults(robot: Robot, in_cell: bool = True) -> list[str]:
-    """One line for each link, and each arm, that no distance is kept from and that the robot's maker did not name.
+    """Return one line for each link or arm that nothing is kept apart from, unless ``unchecked_links`` names it.
 
-    ``in_cell``: the lines name keys of a cell's YAML as remedies, and else arguments of :meth:`Robot.from_urdf`.
+    With ``in_cell`` the lines name keys of the cell's YAML as remedies, and without it arguments of
+    :meth:`Robot.from_urdf`.
     """
     named, moving = set(robot.unchecked_links), moving_links(robot)
     faults, told = [], set[str]()

@@ -50,7 +50,8 @@ class DelayWatch:
         return delay - usual
 
 
-# No publisher sends faster, and no message is delivered later. Numbers that grow faster are another publisher's.
+# No publisher sends more often than this, and no message arrives later than this. If sequence numbers grow faster, they
+# come from another publisher.
 _MAX_RATE_HZ, _MAX_DELIVERY_S = 2000.0, 0.1
 _ALONE = 1.0  # Time after the last break, after which a single publisher is assumed again [s].
 

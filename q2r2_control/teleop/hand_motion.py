@@ -39,7 +39,7 @@ class HandMotion:
         self._motion, self._unslipped = RelativeMotion.of(settings), RelativeMotion.of(settings)
         self._shares: Shares = (1.0, 1.0)
         self.filtered: Pose | None = None  # The filtered pose of the hand from which the last target was computed.
-        # The newest pose of the hand, and the target for it if nothing had slipped.
+        # The newest pose of the hand, and its target if leash and workspace had never held the target back.
         self._newest: tuple[Pose, Pose] | None = None
         self._bound_one_tool()
 

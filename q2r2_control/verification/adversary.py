@@ -50,12 +50,12 @@ class Adversary:
         self._data = robot.model.createData()
 
     def stream(self, name: str) -> Stream:
-        """A new stream of the kind ``name``."""
+        """Return a new stream of targets of the kind ``name``."""
         made: Stream = getattr(self, f"_{name}")()
         return made
 
     def pose(self) -> pin.SE3:
-        """A tool pose anywhere around the cell."""
+        """Draw a pose of a tool anywhere around the cell."""
         return pin.SE3(pin.exp3(self._random.normal(size=3) * 1.5), self._random.uniform(*_WORKSPACE))
 
     def _constant(self, targets: dict[str, Any]) -> Stream:
@@ -75,11 +75,11 @@ class Adversary:
         return self._constant(dict(self._home))
 
     def _teleport(self) -> Stream:
-        """A new pose every so many ticks, the same number each time."""
+        """Return a stream with a new pose at regular intervals."""
         return self._renewed(int(self._random.integers(5, 800)), self._poses)
 
     def _postures(self) -> Stream:
-        """Where the tools are in random postures, many of them at joint limits."""
+        """Return a stream of the tools' poses in random postures, many of them at joint limits."""
 
         def poses() -> dict[str, Any]:
             q = self._random.uniform(self._robot.position_lower, self._robot.position_upper)
@@ -101,7 +101,7 @@ class Adversary:
         return stream
 
     def _crossing(self) -> Stream:
-        """The target of each tool is where another one started."""
+        """Return a stream that sends each tool to the place where another tool started."""
         return self._constant({arm: self._home[self._others[arm]] for arm in self._arms})
 
     def _same_point(self) -> Stream:
@@ -109,7 +109,7 @@ class Adversary:
         return self._constant({arm: pin.SE3(pose.rotation, place) for arm, pose in self._home.items()})
 
     def _unreachable(self) -> Stream:
-        """Metres away, or astronomically far."""
+        """Return a stream of targets that are metres away, or astronomically far."""
         size = 10.0 ** self._random.uniform(0.3, 200.0 if self._random.random() < 0.2 else 2.0)
         return self._constant(self._moved(lambda: self._random.normal(size=3) * size))
 
@@ -118,7 +118,7 @@ class Adversary:
         return self._constant(self._moved(lambda: np.array([*self._random.uniform(-0.3, 0.3, size=2), -depth])))
 
     def _random_walk(self) -> Stream:
-        """Faster than an arm can move; drawn back towards home."""
+        """Return a random walk that is faster than an arm can move, and is drawn back towards home."""
         speed, turn = self._random.uniform(0.001, 0.05), self._random.uniform(0.0, 0.1)
         poses = {arm: pose.copy() for arm, pose in self._home.items()}
 
@@ -132,7 +132,7 @@ class Adversary:
         return stream
 
     def _garbage(self) -> Stream:
-        """Unusable targets for some arms, and targets for an arm that does not exist."""
+        """Return a stream of unusable targets for some arms, and of targets for an arm that does not exist."""
 
         def stream(tick: int, q: Array) -> Request:
             targets: dict[str, Any] = self._poses()
@@ -163,7 +163,7 @@ class Adversary:
         return pose
 
     def _missing_arms(self) -> Stream:
-        """Each arm has a target in some ticks and none in others."""
+        """Return a stream in which each arm has a target in some ticks and none in others."""
         poses = self._poses()
 
         def stream(tick: int, q: Array) -> Request:
@@ -173,7 +173,7 @@ class Adversary:
         return stream
 
     def _elbow(self) -> Stream:
-        """One tool reaches for the elbow or wrist of another arm, which moves elsewhere."""
+        """Return a stream in which one tool reaches for the elbow or wrist of another arm, which moves elsewhere."""
         chaser = str(self._random.choice(self._arms))
         joint = int(self._robot.arms[self._others[chaser]].joints[3 if self._random.random() < 0.5 else 5]) + 1
         request = Request({})
@@ -190,12 +190,12 @@ class Adversary:
         return stream
 
     def _chatter(self) -> Stream:
-        """Back and forth at every tick."""
+        """Return a stream of targets that jump to and fro at every tick."""
         pair = [Request(self._poses()) for _ in range(2)]
         return lambda tick, q: pair[tick % 2]
 
     def _shaking(self) -> Stream:
-        """Oscillates at up to more than the tool's speed, mainly towards the other arm."""
+        """Return an oscillation that may be faster than the tool's limit, mainly towards the other arm."""
         size, rate = self._random.uniform(0.05, 0.6), self._random.uniform(0.005, 0.1)
         along = self._random.normal(size=3) * [0.3, 1.0, 0.3]
 
@@ -206,7 +206,7 @@ class Adversary:
         return stream
 
     def _work(self) -> Stream:
-        """A work motion of two arms, from anywhere in it on, at up to three times its speed."""
+        """Return a work motion of two arms, from a random time in it on, at up to three times its speed."""
         if self._arms != ARMS:
             return self._shaking()
         motion = tuple(WORK_MOTIONS.values())[int(self._random.integers(len(WORK_MOTIONS)))]
@@ -214,7 +214,7 @@ class Adversary:
         return lambda tick, q: Request(dict(motion.targets(begins + speed * tick, self._home)))
 
     def _pressing(self) -> Stream:
-        """Down onto the table, or hand against hand, sliding about meanwhile."""
+        """Return a stream that presses a tool onto the table, or both tools against each other, and slides about."""
         down, rate = self._random.random() < 0.5, self._random.uniform(0.001, 0.02)
         place, depth = self._random.uniform([0.3, -0.2, 0.3], [0.7, 0.2, 0.6]), self._random.uniform(0.0, 0.1)
 
@@ -230,7 +230,7 @@ class Adversary:
 
 
 class HostileChanges:
-    """Draws what changes in mid-motion: openings of grippers, grasps, and settings. Each draw may be None: nothing."""
+    """Draws changes during motion: openings of grippers, grasps, and settings. A draw may be None, for no change."""
 
     def __init__(self, controller: CartesianController, seed: int) -> None:
         self._settings = controller.settings
@@ -238,7 +238,7 @@ class HostileChanges:
         self._openings, self._grasps, self._changes = (np.random.default_rng([seed, stream]) for stream in (3, 4, 5))
 
     def opening(self) -> tuple[str, Interval] | None:
-        """An arm and the interval of its opening; most follow each other closely, so that many are to grow."""
+        """Draw an arm and an interval of its opening. Most of them are near the last one, so that many have to grow."""
         random = self._openings
         if random.random() > 0.05:
             return None
@@ -247,13 +247,13 @@ class HostileChanges:
         return arm, (ALL_OF_THE_WAY, (0.0, 0.0), (first, second), (0.0, second))[kind]
 
     def grasp(self) -> tuple[str, bool] | None:
-        """An arm and whether it holds its object from this tick on: at any speed, for a moment or for long."""
+        """Draw an arm and whether it holds its object from this tick on, at any speed, for a short or a long time."""
         if not self._with_object or self._grasps.random() > 0.02:
             return None
         return str(self._grasps.choice(self._with_object)), bool(self._grasps.random() < 0.7)
 
     def settings(self) -> dict[str, float] | None:
-        """Settings by name: distances up and down by any amount, and gains."""
+        """Draw new settings by name: greater or smaller distances, and other gains."""
         random = self._changes
         if random.random() > 0.01:
             return None

@@ -81,7 +81,7 @@ class Contract:
         margins = self._measured.margins(q)
         self._from_rest = not v.any()
         self._apart = (margins >= -ROUNDING) & self._from_rest
-        # Whether a certificate has to be known from now on. A start at rest with all apart is its own.
+        # Whether a certificate must be known from now on. A start at rest with all pairs apart is certified by itself.
         self._certain = self._from_rest and bool(self._apart.all())
         self._least = float(margins.min(initial=np.inf)) if self._certain else -np.inf
         self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # duration [s], duration times |a|^2

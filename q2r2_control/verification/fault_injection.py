@@ -156,7 +156,7 @@ class Segment:
 
 
 def segments(robot: Robot, kept: Array, random: np.random.Generator) -> Iterator[Segment]:
-    """Endless; the first one starts at home. ``kept`` (p,) is how far each pair stays apart [m]."""
+    """Yield segments without end. The first one starts at home. ``kept`` (p,) are the distances that pairs keep [m]."""
     adversary, starts = Adversary(robot, random), Starts(robot, kept, random)
     start: Start | None = starts.draw("home")
     while True:
@@ -203,7 +203,7 @@ class Starts:
         self._robot, self._kept, self._random = robot, kept, random
 
     def draw(self, name: str) -> Start:
-        """A start of one of the kinds; at rest but for "moving" and "too fast"."""
+        """Draw a start of the kind ``name``. The arms are at rest, except for the kinds "moving" and "too fast"."""
         robot, random, nv = self._robot, self._random, self._robot.model.nv
         kinds = {"home": robot.home.copy, "anywhere": self._posture, "in penetration": self._in_penetration}
         q, v = kinds.get(name, self._apart)(), np.zeros(nv)

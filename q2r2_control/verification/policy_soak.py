@@ -33,7 +33,7 @@ COUNTED = {
 }
 STREAMS = ("walk", "limits", "other_arm", "oscillate", "random", "broken", "late", "stall")
 _MOST, _LONGEST = 8, 0.4  # actions in a chunk, and what lies between them [s]
-_STOPS = 1.0  # from the last action that counts until all rests [s]
+_STOPS = 1.0  # Time from the last action that counts until all arms are at rest [s].
 _PERIODS = (0.02, 0.1)  # between two actions [s]
 _TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # [m]
 

@@ -194,7 +194,7 @@ class AnswerTimes:
         before = standing if heard < first or newest is None else self._heard(heard)
         lag = (wanted - before.time) / self._period - 1.0  # The lag as a number of answers.
         ramp = CATCH_UP_RAMP * self._period
-        # The greatest additional rate from which the ramp comes back to 0 together with the lag.
+        # The greatest additional rate from which CATCH_UP_RAMP comes back to 0 at the moment when the lag does.
         excess = math.copysign(math.sqrt(2.0 * ramp * abs(lag) + 0.25 * ramp * ramp) - 0.5 * ramp, lag)
         excess = min(max(excess, -CATCH_UP), CATCH_UP)
         rate = min(max(1.0 + excess, before.rate - ramp), before.rate + ramp)

@@ -165,7 +165,10 @@ class Cabinet:
         self._overlay = True
 
     def stop(self, trip: Trip = Trip.STOPPED) -> None:
-        """End the client's command: the arm holds. The application has to start the overlay again."""
+        """End the command of the FRI client, so that the arm holds its position.
+
+        The robot application has to start the overlay again before the client can command.
+        """
         if self.session >= Session.COMMANDING_WAIT:
             self.trips.append(trip)
             self.session = Session.MONITORING_READY

@@ -240,7 +240,8 @@ class CabinetServer:
         for late in self._ways(self._network.duplicate):
             self._after(late, due, lambda: _sent(opened, datagram, client))
         self._sent_at[arm] = now = time.monotonic() - self._began
-        # The period stays on its grid: messages of a moment in which this process was late follow one another sooner.
+        # Messages are due on a fixed grid of time. After a moment in which this process was late, the late messages
+        # follow each other at shorter intervals, until they are on the grid again.
         following = max(due + cabinet.settings.period, now - (_LONGEST_STALL if commands else 0.0))
         self._at(following, lambda: self._send(arm, following, tick))
         tick(due)

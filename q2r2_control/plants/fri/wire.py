@@ -178,7 +178,7 @@ def read_monitoring(datagram: bytes) -> Monitoring:
 
 
 def write_monitoring(monitoring: Monitoring) -> bytes:
-    """The datagram of a cabinet's message, for one that stands in for a cabinet."""
+    """Return the datagram of a cabinet's message, for a program that simulates a cabinet."""
     message = MonitoringMessage()
     _set_header(message, _MONITORING, monitoring.counter, monitoring.reflected)
     message.robot.joints, message.robot.control = JOINTS, _CONTROL_MODES.get(monitoring.command, _POSITION_CONTROL)

@@ -106,7 +106,10 @@ class ArmOutputs:
 
     @property
     def gripper_held(self) -> str | None:
-        """The pair that keeps the gripper, as the built-in controller says, from the opening that was asked for."""
+        """Return the pair of bodies that stops the gripper short of its requested opening, or None.
+
+        The built-in controller reports it.
+        """
         why = "" if self._follows is None else self._follows.gripper_held
         return f"the gripper goes no farther: {why}" if why else None
 

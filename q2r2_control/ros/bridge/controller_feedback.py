@@ -98,7 +98,7 @@ class ControllerFeedback:
                 self._distances.publish(_distance_marker(points, self._node.now))
 
     def _record(self, reference: Reference, now: float, step: float, decided: float) -> None:
-        """The reference and how it came about."""
+        """Return the message with the reference of a tick and the report of the step."""
         passed = now - self._last if self._ticks > 1 else step
         point = JointTrajectoryPoint(
             positions=reference.q.tolist(), velocities=reference.v.tolist(), accelerations=reference.a.tolist()

@@ -126,7 +126,7 @@ class GripperClient:
             self._ask(opening, now)
 
     def _ask(self, opening: float, now: float) -> None:
-        """Ask for an opening; without a server ``problem`` says so, and nothing is kept for later."""
+        """Request an opening from the gripper. Without an action server ``problem`` says so, and nothing is kept."""
         self._closes = opening < self._asked or (opening == self._asked and self._closes)
         self.holds = self.holds and self._closes
         self.problem, self._asked, self._sent, self._waits = None, opening, now, False

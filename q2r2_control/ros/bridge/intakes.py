@@ -131,9 +131,10 @@ class TargetIntake:
         return stamp + stamps.usual if known else None
 
     def _stood_still(self, arm: str, made: int, received: float) -> float:
-        """Return for how long the sender stood still between making and sending a target [s]; 0 if only for a moment.
+        """Return for how long the sending process was frozen between making and sending a target [s]; 0 if shortly.
 
-        Only the stamp tells this if the sender was frozen just before its middleware noted the time of sending.
+        Only the stamp of the target tells this, if the process froze just before its middleware took the time of
+        sending.
         """
         (before, usual), self._newest[arm] = self._newest[arm], (made, received - 1e-9 * made)
         late = received - 1e-9 * made - usual
@@ -179,7 +180,7 @@ class JointIntake:
         self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
         self._others = {topic: tuple(set(robot.arms).difference(its)) for topic, its in self._topics.items()}
         self._stamps = np.full(len(robot.joint_names), -math.inf)  # when each joint was measured, (nv,) [s]
-        # By a topic and the names in its message: those of our joints among them, and their indices.
+        # For each topic and list of names in a message, the names of our joints in it, and their indices.
         self._parts: dict[tuple[str, tuple[str, ...]], tuple[list[str], list[int]]] = {}
         self._periods = dict.fromkeys(self._topics, _LONGEST_PERIOD)  # between messages, as a rule [s]
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
@@ -288,7 +289,7 @@ class JointIntake:
         return part
 
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
-        """The sender's names of an arm's joints, where they can be known; told once."""
+        """Return the sender's own names of an arm's joints, if they can be known. They are logged once."""
         names = self._names[topic]
         # Any robot may publish on the usual topic, and one that has sent the arm's own names means no others.
         if topic == _SHARED or len(self._topics[topic]) > 1 or topic in self._own_names:

@@ -172,7 +172,10 @@ class TargetOutput:
         return self.preset.hold is Hold.REPEAT or pausing
 
     def _ask_graph(self, now: float) -> None:
-        """Notice a controller that has appeared, or is gone: others that listen may acknowledge in its place."""
+        """Ask the graph whether the controller has appeared or gone.
+
+        Acknowledgements do not tell this, because other subscribers of the topic acknowledge as well.
+        """
         found = [(node_of(info), info) for info in self._node.get_subscriptions_info_by_topic(self.topic)]
         self._unknown = len(found) < self._listeners or any(name is None for name, _ in found)
         endpoints = {bytes(info.endpoint_gid) for name, info in found if name == self._controller}

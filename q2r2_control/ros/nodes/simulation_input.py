@@ -1,4 +1,4 @@
-"""``SimulationInput`` publishes a headset's messages from a script free of tremor, ``hand_input`` from any input."""
+"""Publish the messages of a headset: ``SimulationInput`` from a scripted motion, ``hand_input`` from any input."""
 
 from __future__ import annotations
 
