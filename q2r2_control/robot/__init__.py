@@ -1,1 +1,1 @@
-"""Robots and cells: found, joined to one URDF, checked, and made a Pinocchio model with the pairs that are watched."""
+"""Robots and cells: find models, join them into one URDF, check it, and build Pinocchio's model and monitored pairs."""

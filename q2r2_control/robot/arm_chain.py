@@ -1,7 +1,7 @@
-"""Which joints and which link of a model make up an arm, where the configuration leaves it to the model.
+"""Find the joints and the tip of an arm in a model, if the configuration does not name them.
 
-From the base, the arm follows the movable joints one by one and ends before a gripper's. Its tip is the end of what is
-fixed to the last of them. Where a model could be read in more than one way, the user is asked instead.
+From the base, the arm follows the movable joints one by one, and ends before the joints of a gripper. Its tip is the
+outermost link that is fixed to the last joint. If a model can be read in more than one way, the user has to decide.
 """
 
 from __future__ import annotations
@@ -18,24 +18,25 @@ from q2r2_control.robot.description import LinkTree, joint_end
 from q2r2_control.robot.pinocchio_models import joint_origin
 
 _GRIPPER_JOINT = re.compile(r"gripper|finger|jaw|thumb|knuckle", re.IGNORECASE)
-# A wrist that turns the gripper is the arm's, such as gripper_roll_joint.
+# A wrist joint that turns the gripper, such as gripper_roll_joint, belongs to the arm.
 _WRIST_JOINT = re.compile(r"gripper_?(roll|rotat|twist|yaw|pitch|swivel)", re.IGNORECASE)
-# Links beside the tool. A sensor may carry the tool.
+# Names of links that are not the tool. A sensor may carry the tool.
 _SIDE_BRANCH = re.compile(r"finger|jaw|thumb|knuckle|camera|antenna|imu", re.IGNORECASE)
 _SENSOR = re.compile(r"sensor|accelerometer|_range", re.IGNORECASE)
-# Names of tool frames, the most telling first.
+# Names of tool frames. The first one that exists is taken.
 _TOOL_FRAMES = [
     re.compile(pattern, re.IGNORECASE)
     for pattern in (r"tcp", r"tool", r"(^|_)eef?(_|$)|end_?effector|endpoint", r"grasp|gripper_?frame", r"flange")
 ]
 _SAME_PLACE = 1e-3  # [m]
-_LEAST_JOINTS = 4  # of an arm among other chains, such as wheels and heads
+_LEAST_JOINTS = 4  # Least number of joints of an arm. Chains of wheels and heads have fewer.
 
 
 def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str) -> str:
-    """The link at the end of the one chain of movable joints that ``tree`` has.
+    """Return the link at the end of the only chain of movable joints in ``tree``.
 
-    Raises :class:`ConfigError` that begins with ``key`` and names the candidates where there are several.
+    Raises:
+        ConfigError: With a text that begins with ``key`` and names the candidates, if there are several chains.
     """
     link = tree.root
     while onwards := _onwards(tree, link, gripper_joints):
@@ -47,9 +48,9 @@ def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str) -> st
 
 
 def arm_ends(tree: LinkTree) -> list[str]:
-    """The link that the last joint of each chain carries which is long enough for an arm."""
+    """Return the last link of each chain that is long enough for an arm."""
     ends, links = [], [tree.root]
-    for link in links:  # grows meanwhile
+    for link in links:  # The list grows in the loop.
         onwards = [joint_end(joint, "child") for joint in _onwards(tree, link, ())]
         links += onwards
         ends += [link] if not onwards and len(tree.chain(link)) >= _LEAST_JOINTS else []
@@ -57,7 +58,7 @@ def arm_ends(tree: LinkTree) -> list[str]:
 
 
 def _onwards(tree: LinkTree, link: str, gripper_joints: Collection[str]) -> list[ET.Element]:
-    """Joints that go on from what is fixed to ``link``; none where a hand begins."""
+    """Return the joints that continue the chain from the links fixed to ``link``; none if a hand begins there."""
     body, depth = tree.fixed_to(link), len(tree.chain(link))
     onwards = [
         joint
@@ -68,18 +69,19 @@ def _onwards(tree: LinkTree, link: str, gripper_joints: Collection[str]) -> list
         ends = {joint_end(joint, "child") for joint in onwards}
         longest = max(len(tree.chain(end)) - depth for end in tree.joint_to if ends & set(tree.path(end)))
         if depth >= longest > 0:
-            return []  # the fingers of a hand, whatever they are called
+            return []  # These are the fingers of a hand.
     return onwards
 
 
 def end_of(tree: LinkTree, link: str, key: str) -> str:
-    """The outermost link that is fixed to ``link``, side branches such as fingers and cameras aside.
+    """Return the outermost link that is fixed to ``link``. Side branches such as cameras do not count.
 
-    Raises :class:`ConfigError` that begins with ``key`` where several could be meant.
+    Raises:
+        ConfigError: With a text that begins with ``key``, if several links could be meant.
     """
 
     def is_side_branch(end: str) -> bool:
-        # A fixed joint that mimics one is a gripper's, out of use.
+        # A fixed joint with a <mimic> belongs to a gripper that is not used.
         beyond = tree.path(end)[len(tree.path(link)) :]
         return any(_SIDE_BRANCH.search(name) or tree.joint_to[name].find("mimic") is not None for name in beyond)
 
@@ -98,9 +100,10 @@ def end_of(tree: LinkTree, link: str, key: str) -> str:
 
 
 def named_joints(tree: LinkTree, tip: str, names: Sequence[str], key: str) -> list[ET.Element]:
-    """The joints ``names`` of the chain to ``tip``; all of that chain without any names.
+    """Return the joints ``names`` of the chain to ``tip``, or all joints of the chain if no names are given.
 
-    Raises :class:`ConfigError` unless they are movable joints of that chain, in the order from base to tip.
+    Raises:
+        ConfigError: If they are not movable joints of this chain, in the order from base to tip.
     """
     chain = tree.chain(tip)
     order = [joint.get("name", "") for joint in chain]
@@ -123,7 +126,7 @@ def _is_gripper_joint(tree: LinkTree, joint: ET.Element) -> bool:
 
 
 def _place_in(tree: LinkTree, link: str, end: str) -> np.ndarray:
-    """Origin of ``end`` in the frame of ``link``, to which it is fixed [m]."""
+    """Return the origin of ``end`` in the frame of ``link``, to which it is fixed [m]."""
     place = pin.SE3.Identity()
     for name in tree.path(end)[len(tree.path(link)) :]:
         place = place * joint_origin(tree.joint_to[name])

@@ -1,4 +1,4 @@
-"""The models that a cell is made of, and each arm's part in them."""
+"""The models of which a cell is made, and the parts of them that belong to each arm."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, renamed, renamed_e
 
 
 def cylinder_flange(thickness: float, radius: float, mass: float) -> Description:
-    """A cylinder [m, m, kg] that stands on the arm's last link along z, and a link at its far end."""
+    """Return the model of a flange: a cylinder on the arm's last link along z, with a link at its far end.
+
+    Args:
+        thickness: Of the cylinder [m].
+        radius: Of the cylinder [m].
+        mass: Of the cylinder [kg].
+    """
     across, along = mass * (3.0 * radius**2 + thickness**2) / 12.0, mass * radius**2 / 2.0
     moments = f'ixx="{across}" iyy="{across}" izz="{along}" ixy="0" ixz="0" iyz="0"'
     middle = f'<origin xyz="0 0 {thickness / 2}"/>'
@@ -36,7 +42,7 @@ def cylinder_flange(thickness: float, radius: float, mass: float) -> Description
 
 
 class Model:
-    """One model of the cell, whose names get a prefix."""
+    """One model in the cell. Its names get a prefix."""
 
     def __init__(self, description: Description, prefix: str) -> None:
         self.description = description
@@ -48,11 +54,11 @@ class Model:
         self.exclusions = [] if description.srdf is None else [*description.srdf]
 
     def name_in_cell(self, name: str) -> str:
-        # The cell has a link of this name already: a model's own root.
+        # The cell already has a link with this name, the root of the model.
         return f"robot_{name}" if not self.prefix and name == WORLD else self.prefix + name
 
     def urdf(self, mount: PoseConfig) -> list[ET.Element]:
-        """The parts of the cell."""
+        """Return the links and joints of the model for the cell."""
         joint = fixed_joint(f"{self.prefix or 'robot_'}mount", WORLD, self.name_in_cell(self.tree.root), mount)
         return [joint, *(renamed(part, self.name_in_cell) for part in self.parts)]
 
@@ -61,12 +67,12 @@ class Mounted(NamedTuple):
     """A flange or a tool on an arm."""
 
     model: Model
-    joint: ET.Element  # to what carries it
-    is_flat: bool  # on the end of what carries it, and there is a file that can speak of the two
+    joint: ET.Element  # The joint to the part that carries it.
+    is_flat: bool  # Whether it sits flat on the end of that part, so that a file may exclude pairs of both.
 
 
 class ArmAssembly:
-    """One arm of a model with flange and tool, and which joints and links of them are the arm's."""
+    """One arm of a model with flange and tool, with the joints and links that belong to it."""
 
     def __init__(self, config: ArmConfig, model: Model, packages: Mapping[str, str], side: str) -> None:
         self.config, self.model, self.key = config, model, f"arms.{side}"
@@ -97,7 +103,7 @@ class ArmAssembly:
         self.joints = named_joints(self.tree, self.frame, config.joints, self.key)
 
     def _mount(self, part: Model, what: str, mount: PoseConfig, is_flat: bool, frame: str | None = None) -> None:
-        """Put a flange or a tool on the arm as it is by now, whose end from then on is ``frame`` or the part's own."""
+        """Put a flange or a tool on the end of the arm. The new end is ``frame``, or the part's own end."""
         key = f"{self.key}.{what}"
         for other in (self.model, *(mounted.model for mounted in self.mounted)):
             for tag in ("link", "joint"):
@@ -119,17 +125,17 @@ class ArmAssembly:
         return self.model.name_in_cell(name)
 
     def finger_names(self) -> tuple[str, ...]:
-        """The joints that the gripper drives, as they are called in the cell."""
+        """The joints that the gripper drives, with their names in the cell."""
         return tuple(map(self.name_in_cell, self.config.gripper.joints))
 
     def tool_links(self) -> tuple[str, ...]:
-        """The links of the tool, or else of the hand that carries the gripper's joints, as they are in the cell."""
+        """The links of the tool, or of the hand that carries the gripper's joints, with their names in the cell."""
         has_tool = self.config.tool.model is not None
         links = self.mounted[-1].model.links if has_tool else hand_links(self.tree, self.config.gripper.joints)
         return tuple(sorted(map(self.name_in_cell, links)))
 
     def leave_joints_of(self, others: Sequence[ArmAssembly]) -> None:
-        """Give up joints that carry another arm of the model too, such as a torso's, unless ``joints`` names them."""
+        """Remove joints that also carry another arm, such as those of a torso, unless ``joints`` names them."""
         if self.config.joints:
             return
         for other in others:
@@ -140,11 +146,11 @@ class ArmAssembly:
                 raise ConfigError(f"{self.key}: {shared}; name another tip")
 
     def mounted_urdf(self) -> list[ET.Element]:
-        """The parts that flange and tool add to the cell."""
+        """Return the links and joints of flange and tool for the cell."""
         return [renamed(part, self.name_in_cell) for item in self.mounted for part in [item.joint, *item.model.parts]]
 
     def mounted_exclusions(self) -> list[ET.Element]:
-        """Pairs of the flange's links, of the tool's, and of those of each with what it sits on flat."""
+        """Return the excluded pairs of flange and tool, each with its own links and with the part below it."""
         parts, carriers = [], [self.model.description]
         for mounted in self.mounted:
             part = mounted.model.description
@@ -156,7 +162,7 @@ class ArmAssembly:
         return renamed_exclusions(parts, self.name_in_cell)
 
     def acceleration_limits(self) -> dict[str, float]:
-        """Limits [rad/s^2] that the file gives joints of the arm, by their names in the cell."""
+        """Return the acceleration limits in the model's files by the joints' names in the cell [rad/s^2]."""
         limits, names = self.config.acceleration_limit, [joint.get("name", "") for joint in self.joints]
         for name in limits:
             if name not in names:
@@ -165,7 +171,7 @@ class ArmAssembly:
         return {self.name_in_cell(name): value for name, value in limits.items()}
 
     def posture(self) -> dict[str, float]:
-        """Position of each joint of arm and gripper: the arm at home, the gripper open."""
+        """Return the position of each joint, with the arm at home and the gripper open."""
         config, names = self.config, [joint.get("name", "") for joint in self.joints]
         if len(config.home) != len(names):
             others = [name for name in self._beyond() if name not in names]
@@ -189,7 +195,7 @@ class ArmAssembly:
         return dict.fromkeys(gripper.joints, gripper.open_position)
 
     def _carrier(self) -> str:
-        """The arm's last link, of those of its model."""
+        """Return the last link of the arm in its own model."""
         config, tree = self.config, self.model.tree
         if (named := config.named_tip) is not None:
             _check_link(named, self.model, f"{self.key}.{'tip' if config.tip else 'tool.link'}")
@@ -205,7 +211,7 @@ class ArmAssembly:
         return default_tip(tree, config.gripper.joints, f"{self.key}.tip")
 
     def _beyond(self) -> list[str]:
-        """Movable joints that the arm's last one carries."""
+        """Return the movable joints beyond the last joint of the arm."""
         last = joint_end(self.chain[-1], "child")
         found = self.tree.movable().items()
         return [name for name, joint in found if last in self.tree.path(joint_end(joint, "parent"))]
@@ -214,7 +220,7 @@ class ArmAssembly:
 def load_model(
     config: ArmConfig | RobotConfig | FlangeConfig | ToolConfig, packages: Mapping[str, str], key: str
 ) -> Description:
-    """The description that the block ``key`` names. Raises :class:`ConfigError` that begins with it."""
+    """Return the description that the block ``key`` names; raises :class:`ConfigError` that begins with ``key``."""
     model = config.model or ""
     try:
         return load_description(model, config.xacro_args, packages)
@@ -223,25 +229,25 @@ def load_model(
 
 
 def load_flange(config: FlangeConfig, packages: Mapping[str, str], key: str) -> Description | None:
-    """The flange that the block ``key`` describes, if any. Raises :class:`ConfigError` that begins with ``key``."""
+    """Return the flange of the block ``key``, if any; raises :class:`ConfigError` that begins with ``key``."""
     if config.thickness is not None and config.radius is not None:
         return cylinder_flange(config.thickness, config.radius, config.mass)
     return None if config.model is None else load_model(config, packages, key)
 
 
 def name_of_stack(parts: Sequence[Description]) -> str:
-    """Name, without .srdf, of the file about pairs of the outermost of ``parts`` with the others, the arm first."""
+    """Return the name, without .srdf, of the file with the excluded pairs of stacked ``parts``. The arm comes first."""
     return "_on_".join(part.stem for part in reversed(parts))
 
 
 def check_position(joint: ET.Element, position: float, key: str) -> None:
-    """Raise :class:`ConfigError` that begins with ``key`` where ``position`` is outside the joint's limits."""
+    """Raise :class:`ConfigError` that begins with ``key`` if ``position`` is outside the joint's limits."""
     lower, upper = joint_limits(joint)
     if lower <= position <= upper:
         return
     unit = "m" if joint.get("type") == "prismatic" else "rad"
     radians = math.radians(position)
-    # Beyond half a turn, and within the limits once converted: most likely degrees.
+    # A position beyond half a turn that is within the limits after conversion is most likely in degrees.
     hint = f"; {position:g} degrees are {radians:.4g} rad" if unit == "rad" and abs(position) > math.pi else ""
     hint = hint if lower <= radians <= upper else ""
     raise ConfigError(f"{key} = {position:g}: joint {joint.get('name')} allows {lower:g} .. {upper:g} {unit}{hint}")

@@ -1,4 +1,4 @@
-"""Distances of all pairs of a geometry model as Coal measures them, for checks that do not trust the kernels."""
+"""Measure the distances of all pairs of a geometry model by Coal, for checks that do not use our kernels."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ class CoalDistances:
         self.model, self.geometry = model, geometry
         self.data: pin.Data = model.createData()
         self.geometry_data: pin.GeometryData = geometry.createData()
-        # They stay where they are, and to look each of them up again would take longer than to measure.
+        # These objects stay the same, and to look each of them up again would take longer than to measure.
         self._results = list(self.geometry_data.distanceResults)
 
     def at(self, q: Array) -> Array:
-        """Distances (pairs,) [m] at ``q`` (nv,); negative where the shapes of a pair overlap."""
+        """Return the distances (pairs,) [m] at ``q`` (nv,); negative if the shapes of a pair overlap."""
         pin.computeDistances(self.model, self.data, self.geometry, self.geometry_data, q)
         return self.measured()
 
     def measured(self) -> Array:
-        """Distances (pairs,) [m] that Coal measured last with ``geometry_data``."""
+        """Return the distances (pairs,) [m] that Coal measured last with ``geometry_data``."""
         return np.array([result.min_distance for result in self._results], dtype=np.float64)

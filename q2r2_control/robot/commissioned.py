@@ -1,4 +1,4 @@
-"""The sign-off of a cell's commissioning, a file beside the cell, and whether it is still of that cell."""
+"""The sign-off of a cell's commissioning: a file beside the cell, which counts as long as the cell is the same."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.control import LIVE
 from q2r2_control.robot.compose import compose
 
-FIRST_SPEED = 0.1  # until the operator says otherwise, of what the cell allows
+FIRST_SPEED = 0.1  # Share of the cell's speed that is allowed at first.
 
 
 def sign_off_file(cell: Path) -> Path:
-    """Where the sign-off of the ``cell``'s file is kept."""
+    """Return the path of the sign-off for the file ``cell``."""
     return cell.with_suffix(".commissioned.json")
 
 
 def fingerprint(config: Config) -> str:
-    """Of all that a commissioning has looked at: addresses, mounts, tools, limits; not of obstacles and gains."""
+    """Return a hash of everything that a commissioning checks: addresses, mounts, tools and limits."""
     arms = compose(config.model_copy(update={"obstacles": {}, "floor": None})).urdf
     control = config.control.model_dump(mode="json", exclude=set(LIVE) - {"min_distance"})
     fri = {arm: cabinet.model_dump(mode="json") for arm, cabinet in config.fri.items()}
@@ -29,18 +29,18 @@ def fingerprint(config: Config) -> str:
 
 
 def has_real_cabinets(config: Config) -> bool:
-    """Whether a cabinet is not on this computer, where it stands in for a real one."""
+    """Return whether a cabinet is not on this computer. Simulated cabinets run on this computer."""
     return not all(ip_address(cabinet.address).is_loopback for cabinet in config.fri.values())
 
 
 def slowed(config: Config) -> Config:
-    """The same cell at a tenth of its joints' speed."""
+    """Return the same cell with a tenth of the joints' speeds."""
     scale = FIRST_SPEED * config.control.velocity_scale
     return config.model_copy(update={"control": config.control.model_copy(update={"velocity_scale": scale})})
 
 
 def not_commissioned(config: Config, cell: Path) -> str | None:
-    """Why the real arms of ``config``, read from the file ``cell``, may not be driven yet; None: they may."""
+    """Return why the real arms of ``config``, from the file ``cell``, may not be driven yet; None if they may."""
     if not has_real_cabinets(config):
         return None
     file = sign_off_file(cell)

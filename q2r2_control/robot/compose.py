@@ -1,7 +1,7 @@
-"""Joins arms, mounts, tools, obstacles and the floor into one URDF and one SRDF under the root link ``world``.
+"""Join arms, mounts, tools, obstacles and the floor into one URDF and one SRDF with the root link ``world``.
 
-Names of an arm's own model and of its tool get the prefix ``left_`` or ``right_``. Names of a ``robot`` that the arms
-are parts of, and of obstacles, stay. Joints that neither an arm nor a gripper moves are fixed.
+Names in an arm's own model and in its tool get the prefix ``left_`` or ``right_``. Names of obstacles, and of a
+``robot`` of which the arms are parts, do not change. Joints that belong to no arm and no gripper are fixed.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ _RESERVED_NAME = re.compile(rf"({WORLD}|universe|({'|'.join(SIDES)})_)")
 
 @dataclass(frozen=True, slots=True)
 class ComposedCell:
-    """One cell as text, and what its parts are called in it. Arms by side, in the order of ``Config.arms``."""
+    """One cell as text, and the names of its parts. Arms are in the order of ``Config.arms``."""
 
     name: str
     urdf: str
     srdf: str
-    tool_frames: dict[str, str]  # link that the operator moves
-    home: dict[str, float]  # every movable joint's position: arms at home, grippers open
-    obstacles: tuple[str, ...]  # link names
-    parts: KnownParts  # what its links are
+    tool_frames: dict[str, str]  # By arm, the link that the operator moves.
+    home: dict[str, float]  # Position of every movable joint, with arms at home and grippers open.
+    obstacles: tuple[str, ...]  # Names of links.
+    parts: KnownParts  # The roles of links.
 
     def arm_lengths(self) -> dict[str, float]:
-        """Of each arm, the way along its joints from the first to the last [m]."""
+        """Return the length of each arm along its joints, from the first to the last [m]."""
         tree = LinkTree(ET.fromstring(self.urdf), self.name)
         lengths = {}
         for side, frame in self.tool_frames.items():
@@ -64,8 +64,9 @@ class ComposedCell:
 def compose(config: Config) -> ComposedCell:
     """Build the cell of ``config``.
 
-    Raises :class:`ConfigError` that names key, value and the allowed values. Faults are a model or link that does not
-    exist, a home posture of the wrong length or outside the limits, and clashing or reserved names.
+    Raises:
+        ConfigError: If a model or link does not exist, if a home posture has the wrong length or is outside the limits,
+            or if names clash or are reserved. The text names the key, the value and the allowed values.
     """
     if not config.name.isprintable():
         raise ConfigError(f"name = {config.name!r:.60}: allowed: printable characters")
@@ -124,7 +125,7 @@ def compose(config: Config) -> ComposedCell:
 
 
 def _arms(config: Config) -> dict[str, ArmAssembly]:
-    """Every arm of the cell with the joints that are its own."""
+    """Return every arm of the cell with its own joints."""
     robot = None if config.robot is None else Model(load_model(config.robot, config.packages, "robot"), "")
     arms: dict[str, ArmAssembly] = {}
     for side in (side for side in SIDES if side in config.arms):
@@ -137,7 +138,7 @@ def _arms(config: Config) -> dict[str, ArmAssembly]:
 
 
 def _home(urdf: ET.Element, arms: Mapping[str, ArmAssembly]) -> dict[str, float]:
-    """Position of every joint that an arm or a gripper moves, those that mimic a finger included."""
+    """Return the position of every joint that an arm or a gripper moves, with joints that mimic a finger."""
     home: dict[str, float] = {}
     owner: dict[str, str] = {}
     fingers: set[str] = set()
@@ -162,7 +163,7 @@ def _check_resting(urdf: ET.Element, resting: Mapping[str, float], home: Mapping
 
 
 def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]:
-    """Position of every joint: as ``given``, as its mimic says, or as near 0 as allowed."""
+    """Return the position of every joint: as ``given``, by its ``<mimic>``, or as near to 0 as its limits allow."""
     joints = urdf.findall("joint")
     followers = followers_of(joints, driven=given)
     resting = {name: resting_position(joint) for joint in joints if (name := joint.get("name", "")) not in followers}

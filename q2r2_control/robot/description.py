@@ -1,6 +1,7 @@
-"""A robot description from outside: found, parsed, its meshes resolved.
+"""Find and parse a robot description, and resolve its meshes.
 
-Checked for all that follows: one tree, unique names, finite numbers, meshes that exist.
+The description is checked here, so that later code can rely on it: one tree, unique names, finite numbers, and meshes
+that exist.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from q2r2_control.robot.urdf_parts import ATTRIBUTES
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
 MJCF_ENDS = (".xml", ".mjcf")
 
-# Range given to a joint without limits: two turns each way.
+# Range of a joint without limits: two turns each way.
 CONTINUOUS_RANGE = 4 * math.pi
 
 _JOINT_TYPES = ("fixed", "revolute", "prismatic", "continuous", "planar", "floating")
 _SHAPES = ("box", "cylinder", "sphere", "mesh")
 
-# Text that urdfdom and Python both read as the same number; urdfdom skips what it cannot read without saying so.
+# Text that urdfdom and Python read as the same number. urdfdom silently ignores text that it cannot read.
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
-_LARGEST = 1e20  # squares of it are still finite
+_LARGEST = 1e20  # The square of this number is still finite.
 _SHORTEST_AXIS = 1e-6
 _VECTORS = ("xyz", "rpy", "size", "scale")
 _POSITIVE = ("radius", "length", "size")
@@ -48,12 +49,12 @@ _SCALARS = {
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """One robot model: URDF tree (meshes absolute), SRDF tree if it has one, and where it came from."""
+    """One robot model: its URDF tree with absolute paths of meshes, its SRDF tree if it has one, and its origin."""
 
     urdf: ET.Element
     srdf: ET.Element | None
     file: Path
-    notes: tuple[str, ...] = ()  # of what was written, each for a user to look at
+    notes: tuple[str, ...] = ()  # Notes on the text, which the user should read.
 
     @property
     def name(self) -> str:
@@ -62,7 +63,7 @@ class Description:
 
     @property
     def stem(self) -> str:
-        """The file's name without its endings."""
+        """The name of the file without its extensions."""
         return self.file.name.removesuffix(".xacro").removesuffix(".urdf")
 
 
@@ -71,9 +72,12 @@ def load_description(
 ) -> Description:
     """Find and parse ``model``: a file of robots/ without .urdf, ``example-robot-data:NAME``, or a path to a .urdf.
 
-    A path may be ``package://NAME/...``, where ``packages`` has folders by name, and end in ``.xacro``, which is
-    expanded with ``xacro_args``. An SRDF of the same name beside the file belongs to it. Raises :class:`ConfigError`
-    where there is no such model and :class:`RobotError` where its files cannot be used.
+    A path may be ``package://NAME/...``, where ``packages`` has folders by name. A file that ends in ``.xacro`` is
+    expanded with ``xacro_args``. An SRDF with the same name beside the file belongs to it.
+
+    Raises:
+        ConfigError: If there is no such model.
+        RobotError: If its files cannot be used.
     """
     packages = packages or {}
     if model.startswith(EXAMPLE_ROBOT_DATA):
@@ -99,7 +103,7 @@ def load_description(
 
 
 def _shipped_model(model: str) -> Path:
-    """The file of a name. Raises :class:`ConfigError` for no such file, and for a path of another kind of file."""
+    """Return the file of a model's name; raises :class:`ConfigError` if there is none, or it is of another kind."""
     try:
         return find_resource(f"robots/{model}.urdf")
     except ConfigError:
@@ -117,15 +121,22 @@ def parse_urdf(
 ) -> ET.Element:
     """Parse a URDF, check that it is one tree with unique names and finite numbers, and make mesh paths absolute.
 
-    Continuous joints become revolute ones with :data:`CONTINUOUS_RANGE` each way, since the controller's guarantees
-    need a bound. Joints that others follow go as far as these may follow. ``where`` names the text in errors,
-    ``folder`` is what relative mesh paths start from, ``packages`` has folders of ``package://`` by name. Raises
-    :class:`RobotError`.
+    Continuous joints become revolute joints with :data:`CONTINUOUS_RANGE` each way, because the controller's guarantees
+    need a bound. The limits of a joint that others mimic are narrowed to what these may do.
+
+    Args:
+        text: The URDF.
+        where: Names the text in errors.
+        folder: Relative paths of meshes start here.
+        packages: Folders of ``package://`` by name.
+
+    Raises:
+        RobotError: If the text cannot be used.
     """
-    root = parse_srdf(text, where)  # both begin alike
+    root = parse_srdf(text, where)  # URDF and SRDF begin in the same way.
     _check_numbers(root, where)
     unify(root, where)
-    # A shape that a reader skips would be a body that nobody watches.
+    # A shape that a reader ignores would be a body that nothing keeps apart from others.
     for link in root.findall("link"):
         for collision in link.findall("collision"):
             shapes = [shape.tag for shape in collision.findall("geometry/*")]
@@ -150,7 +161,7 @@ def parse_urdf(
 
 
 def parse_srdf(text: str | bytes, where: str) -> ET.Element:
-    """Parse an SRDF. Raises :class:`RobotError` that begins with ``where``."""
+    """Parse an SRDF; raises :class:`RobotError` with a text that begins with ``where``."""
     try:
         root = ET.fromstring(text)
     except (ET.ParseError, ValueError) as error:
@@ -161,11 +172,11 @@ def parse_srdf(text: str | bytes, where: str) -> ET.Element:
 
 
 class LinkTree:
-    """Who hangs on whom. Building one raises :class:`RobotError` unless the links form exactly one tree."""
+    """The tree of links and joints; raises :class:`RobotError` if the links do not form exactly one tree."""
 
     def __init__(self, robot: ET.Element, where: str) -> None:
         links = [link.get("name", "") for link in robot.findall("link")]
-        self.joint_to: dict[str, ET.Element] = {}  # child link -> the joint that carries it
+        self.joint_to: dict[str, ET.Element] = {}  # By child link, the joint that carries it.
         for joint in robot.findall("joint"):
             child = joint_end(joint, "child")
             if child in self.joint_to:
@@ -180,20 +191,20 @@ class LinkTree:
                 raise RobotError(f"{where}: link {link} is part of a loop; a robot has to be one tree")
 
     def path(self, link: str) -> list[str]:
-        """Links from the root to ``link``, both included."""
+        """Return the links from the root to ``link``, with both of them."""
         path = [link]
         while path[-1] in self.joint_to and len(path) <= len(self.joint_to) + 1:
             path.append(joint_end(self.joint_to[path[-1]], "parent"))
         return path[::-1]
 
     def movable(self) -> dict[str, ET.Element]:
-        """All joints that are not fixed, by name."""
+        """Return all joints that are not fixed, by name."""
         return {joint.get("name", ""): joint for joint in self.joint_to.values() if joint.get("type") != "fixed"}
 
     def fixed_to(self, link: str) -> list[str]:
-        """``link``, and all that fixed joints carry from there on."""
+        """Return ``link`` and all links that are fixed to it."""
         found = [link]
-        for carrier in found:  # grows meanwhile
+        for carrier in found:  # The list grows in the loop.
             found += [
                 child
                 for child, joint in self.joint_to.items()
@@ -202,19 +213,19 @@ class LinkTree:
         return found
 
     def chain(self, link: str) -> list[ET.Element]:
-        """Movable joints from the root to ``link``."""
+        """Return the movable joints from the root to ``link``."""
         joints = [self.joint_to[name] for name in self.path(link)[1:]]
         return [joint for joint in joints if joint.get("type") != "fixed"]
 
 
 def joint_end(joint: ET.Element, end: str) -> str:
-    """Name of the joint's ``parent`` or ``child`` link; empty where it has none."""
+    """Return the name of the joint's ``parent`` or ``child`` link; "" if it has none."""
     element = joint.find(end)
     return "" if element is None else element.get("link", "")
 
 
 def joint_limits(joint: ET.Element) -> tuple[float, float]:
-    """Position limits of a joint, as written."""
+    """Return the position limits of a joint, as they are written."""
     limit = joint.find("limit")
     return (0.0, 0.0) if limit is None else (float(limit.get("lower", "0")), float(limit.get("upper", "0")))
 
@@ -280,7 +291,7 @@ def _example_robot(name: str) -> tuple[Path, Path | None]:
 
 
 def _read(file: Path) -> bytes:
-    """The bytes of an XML file, whose first line may name their encoding."""
+    """Return the bytes of an XML file. Its first line may name an encoding."""
     try:
         return file.read_bytes()
     except OSError as error:

@@ -1,13 +1,13 @@
-"""Collision shapes as the distance kernels want them.
+"""Enclose collision shapes by the shapes that the distance kernels can measure.
 
-Capsules, spheres and boxes fixed in the world stay; everything else is enclosed. A box that moves becomes a capsule
-too: a pair of two boxes has no short closed form.
+Capsules, spheres and boxes that are fixed in the world stay. Every other shape is enclosed. A moving box becomes a
+capsule as well, because the distance of two boxes has no short closed form.
 
-A mesh or convex becomes a capsule around its vertices, hence around its triangles, since a capsule is convex. Safety
-rests on its enclosing every vertex only, which its construction gives for any axis and any centre.
+A mesh becomes a capsule around its vertices. The capsule is convex, and so it also encloses the triangles. For safety
+it must enclose every vertex, which the construction guarantees for any axis and any centre.
 
-Several capsules hold a mesh together: parallel planes cut it into slabs. The corners of a triangle's part in a slab are
-its vertices there and where its edges cross the slab's planes, and the slab's capsule is put around all of these.
+Several capsules enclose a mesh together: parallel planes cut it into slabs. The part of a triangle in a slab has its
+corners at vertices and where edges cross the planes of the slab. The capsule of the slab encloses all of these corners.
 """
 
 from __future__ import annotations
@@ -29,20 +29,26 @@ from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import link_of
 from q2r2_control.types import Array
 
-Capsule = tuple[float, Array, Array]  # radius and both ends of the segment (3,) [m]
+Capsule = tuple[float, Array, Array]  # The radius and both ends of the segment (3,) [m].
 
-# Rounding may take something away, which is given back: 1 micrometre on every enclosing radius.
+# One micrometre is added to every enclosing radius, because rounding may make it smaller.
 _ROUNDING = 1e-6
-_SLABS = 12  # of equal height, which the capsules of a mesh share
+_SLABS = 12  # Number of slabs of equal height that the capsules of a mesh share.
 
 
 def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | None = None) -> None:
     """Replace in place every shape that is not a capsule, a sphere or a box fixed in the world; names and pairs stay.
 
-    ``capsules`` has links of whose meshes each becomes that many capsules at most; 1 is for other shapes too. The
-    first one has the mesh's name, the others follow all shapes, as further ones of their link. Raises
-    :class:`RobotError` for a shape without extent or without bounds, and :class:`ConfigError` for a link in
-    ``capsules`` that has no mesh.
+    The first capsule of a mesh has the name of the mesh. The others come after all shapes, as further shapes of their
+    link.
+
+    Args:
+        geometry: The geometry model.
+        capsules: For some links, the greatest number of capsules for each of their meshes; 1 also for other shapes.
+
+    Raises:
+        RobotError: If a shape has no extent or no bounds.
+        ConfigError: If a link in ``capsules`` has no mesh.
     """
     capsules = capsules or {}
     numbers = Counter(link_of(item.name) for item in geometry.geometryObjects)
@@ -76,9 +82,10 @@ def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | No
 
 
 def capsules_around(shape: coal.CollisionGeometry, name: str, count: int) -> list[Capsule]:
-    """Capsules that hold a shape together, in its frame: ``count`` at most for a mesh, one for others.
+    """Return capsules that together enclose a shape, in its frame: at most ``count`` for a mesh, one for others.
 
-    Raises :class:`RobotError` for a shape called ``name`` that has no bounds.
+    Raises:
+        RobotError: If the shape ``name`` has no bounds.
     """
     vertices = _vertices(shape, name)
     if count == 1 or not isinstance(shape, coal.BVHModelBase):
@@ -90,22 +97,22 @@ def capsules_around(shape: coal.CollisionGeometry, name: str, count: int) -> lis
 
 
 def enclosing_capsule(points: Array) -> Capsule:
-    """A small capsule around ``points`` (n, 3): radius and the segment's two ends (3,), same unit and frame.
+    """Return a small capsule around ``points`` (n, 3): the radius and both ends of the segment (3,).
 
-    Starts from the principal axes and minimises the volume over the axis (two angles), its place (two offsets) and the
-    radius beyond the least one. For an axis with radius r, a point at height t and distance rho from it is inside when
-    the segment covers a height within sqrt(r^2 - rho^2) of t.
+    It starts from the principal axes, and minimises the volume over the axis (two angles), its place (two offsets), and
+    the radius. With an axis and a radius r, a point at the height t and the distance rho from the axis is inside if the
+    segment has a height within sqrt(r^2 - rho^2) of t.
     """
     return _cached_capsule(np.array(points, dtype=float, order="C").tobytes())
 
 
 @lru_cache(maxsize=256)
 def _cached_capsule(found: bytes) -> Capsule:
-    """Both arms of a cell usually share their meshes, and a program that builds a robot often builds it again."""
+    """Compute a capsule once for all equal meshes, which both arms usually share."""
     points = _corners(np.frombuffer(found).reshape(-1, 3))
     centre = points.mean(axis=0)
     scale = max(float(np.abs(points - centre).max()), 1e-9)
-    # Full matrices only where fewer points than axes leave some out: of n points they are n x n.
+    # Full matrices are needed only if there are fewer points than axes. For n points they are n x n.
     axes = np.linalg.svd(points - centre, full_matrices=len(points) < 3)[2]
     frame, view = _best_view(points - centre, axes, scale)
     options = {"maxiter": 600, "xatol": 1e-4, "fatol": 1e-5}
@@ -118,7 +125,7 @@ def _cached_capsule(found: bytes) -> Capsule:
 
 @lru_cache(maxsize=64)
 def _cached_capsules(points: bytes, corners: bytes, count: int) -> tuple[Capsule, ...]:
-    """``count`` capsules at most, of neighbouring slabs each, along the principal axis that needs the least volume."""
+    """Return at most ``count`` capsules of neighbouring slabs, along the principal axis with the least volume."""
     vertices = np.frombuffer(points).reshape(-1, 3)
     triangles = np.frombuffer(corners, dtype=np.int64).reshape(-1, 3)
     edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
@@ -135,7 +142,10 @@ def _cached_capsules(points: bytes, corners: bytes, count: int) -> tuple[Capsule
 
 
 def _slabs(vertices: Array, edges: npt.NDArray[np.int64], axis: Array) -> list[Array]:
-    """Points (n, 3) around what triangles with these ``edges`` (m, 2) have in each slab across ``axis`` (3,)."""
+    """Return, for each slab across ``axis`` (3,), the corners (n, 3) of all triangles' parts in it.
+
+    ``edges`` (m, 2) are the edges of the triangles.
+    """
     height = vertices @ axis
     planes = np.linspace(height.min(), height.max(), _SLABS + 1)
     below, above = height[edges].T
@@ -152,14 +162,14 @@ def _slabs(vertices: Array, edges: npt.NDArray[np.int64], axis: Array) -> list[A
 
 
 def _corners(points: Array) -> Array:
-    """Those of the convex hull of ``points`` (n, 3)."""
-    with suppress(QhullError, ValueError):  # of points in a plane, or too few
+    """Return the corners of the convex hull of ``points`` (n, 3)."""
+    with suppress(QhullError, ValueError):  # The points may lie in a plane, or be too few.
         points = points[ConvexHull(points).vertices]
     return points
 
 
 def _best_view(points: Array, axes: Array, scale: float = 1.0) -> tuple[Array, Array]:
-    """The order of ``axes`` (3, 3), the last one along, in which a first capsule is the smallest, and points in it."""
+    """Return the order of ``axes`` (3, 3) whose last one gives the smallest first capsule, and the points in it."""
     frames = [axes[[index - 2, index - 1, index]] for index in range(3)]
     views = [points @ frame.T / scale for frame in frames]
     best = int(np.argmin([_volume(*_fit(view, _start(view))) for view in views]))
@@ -167,7 +177,7 @@ def _best_view(points: Array, axes: Array, scale: float = 1.0) -> tuple[Array, A
 
 
 def _first_volume(points: Array) -> float:
-    """Of the capsule around ``points`` (n, 3) from which a smaller one would be sought; 0 without any."""
+    """Return the volume of the capsule around ``points`` (n, 3) at which the search begins; 0 without points."""
     if not len(points):
         return 0.0
     offsets = points - points.mean(axis=0)
@@ -195,7 +205,7 @@ def _start(local: Array) -> Array:
 
 
 def _fit(local: Array, x: Array) -> tuple[float, Array]:
-    """Radius and segment ends (2, 3) of the capsule around ``local`` whose axis ``x`` tilts and shifts from z."""
+    """Return radius and segment ends (2, 3) of the capsule around ``local`` whose axis is z, moved by ``x``."""
     direction = np.array([x[0], x[1], 1.0])
     direction /= np.linalg.norm(direction)
     place = np.array([x[2], x[3], 0.0])
@@ -205,7 +215,7 @@ def _fit(local: Array, x: Array) -> tuple[float, Array]:
     radius = float(across.max()) * (1 + abs(x[4]))
     reach = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
     top, bottom = float((height - reach).max()), float((height + reach).min())
-    if top < bottom:  # one sphere covers every point: any height between the two will do
+    if top < bottom:  # One sphere encloses every point, at any height between the two.
         top = bottom = (top + bottom) / 2
     return radius, place + np.outer([bottom, top], direction)
 
@@ -215,7 +225,7 @@ def _volume(radius: float, ends: Array) -> float:
 
 
 def _around_cylinder(radius: float, half_length: float, box_allowed: bool) -> coal.CollisionGeometry:
-    """The smallest coaxial capsule, or the box where that is allowed and smaller, as for a round table top."""
+    """Return the smallest coaxial capsule, or the box if that is allowed and smaller, as for a round table top."""
 
     def half_segment(capsule_radius: float) -> float:
         return max(half_length - float(np.sqrt(max(capsule_radius**2 - radius**2, 0.0))), 0.0)
@@ -231,7 +241,7 @@ def _around_cylinder(radius: float, half_length: float, box_allowed: bool) -> co
 
 
 def capsule_between(radius: float, start: Array, end: Array) -> tuple[coal.CollisionGeometry, pin.SE3]:
-    """A capsule from ``start`` to ``end``; Coal's lies along z about its middle and takes the segment's length."""
+    """Return Coal's capsule from ``start`` to ``end``, and its placement. It lies along z about its middle."""
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])
     rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()

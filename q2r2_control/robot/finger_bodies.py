@@ -1,7 +1,8 @@
-"""The bodies of fingers: each is what it sweeps from one end of its joints' travel to the other.
+"""Compute the bodies of fingers. Each body is the volume that a finger sweeps over the travel of its joints.
 
-Distances know arm joints only, so a finger's body is all of its way. While the gripper's opening is known, less of it
-counts. Of fingers that slide it is a part of the segment, of those that turn a capsule of turning_fingers.py.
+Distances depend on the arm's joints only, and so the body of a finger is its whole way. While the opening of the
+gripper is known, less counts: a part of the segment if the finger slides, and a capsule of turning_fingers.py if it
+turns.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class FingerBody:
     ends: tuple[tuple[float, tuple[tuple[float, FingerJoint], ...]], ...]
 
     def part(self, interval: Interval) -> tuple[float, float]:
-        """Which part of the segment, from 0 its start to 1 its end, the fingers are in at openings in ``interval``."""
+        """Return the part of the segment, from 0 to 1, in which the fingers are at openings in ``interval``."""
         if interval == ALL_OF_THE_WAY:
             return 0.0, 1.0
         lowest, highest = [], []
@@ -47,7 +48,7 @@ class FingerBody:
 
 
 def part_of_segment(start: Array, end: Array, part: tuple[float, float]) -> tuple[Array, Array]:
-    """Both ends (3,) of a part of the segment from ``start`` to ``end`` (3,); all of it is exact."""
+    """Return both ends (3,) of a part of the segment from ``start`` to ``end`` (3,). The whole segment is exact."""
     along = end - start
     return start + part[0] * along, end - (1.0 - part[1]) * along
 
@@ -55,7 +56,7 @@ def part_of_segment(start: Array, end: Array, part: tuple[float, float]) -> tupl
 def collision_model_at(
     geometry: pin.GeometryModel, fingers: Iterable[FingerBody | TurningBody], openings: Mapping[str, Interval]
 ) -> pin.GeometryModel:
-    """A copy of ``Robot.collision_model`` with fingers as they are at ``openings`` by arm, others all of their way."""
+    """Return a copy of ``Robot.collision_model`` with fingers at ``openings`` by arm, and others on their whole way."""
     made, bodies = geometry.copy(), list(fingers)
     for arm, interval in openings.items():
         if interval == ALL_OF_THE_WAY:
@@ -67,7 +68,7 @@ def collision_model_at(
                 item = made.geometryObjects[made.getGeometryId(body.name)]
                 start, end = _ends(item)
                 capsules[body.name] = float(item.geometry.radius), *part_of_segment(start, end, body.part(interval))
-        # All of an arm's at once, as the kernels have them: the number of samples depends on all of them.
+        # All fingers of an arm are computed together, as in the kernels, because they share the number of samples.
         if turning := [body for body in of_arm if isinstance(body, TurningBody)]:
             for body, start, end, radius in zip(turning, *TurningSweeps(turning).capsules(interval), strict=True):
                 capsules[body.name] = float(radius), start, end
@@ -78,9 +79,9 @@ def collision_model_at(
 
 
 _ON_ONE_LINE = 1e-9  # [m]
-_KINDS = {"revolute", "prismatic"}  # of joints
+_KINDS = {"revolute", "prismatic"}  # The kinds of joints that move a finger.
 
-# Both ends of a shape as it was drawn (2, 3) [m] and what moves them.
+# Both ends of a shape in the model (2, 3) [m], and the joints that move them.
 _Finger = tuple[Array, tuple[FingerJoint, ...]]
 
 
@@ -89,10 +90,13 @@ def sweep_fingers(
 ) -> tuple[FingerBody | TurningBody, ...]:
     """Replace in place the capsules and spheres of fingers, locked at ``home``, by what they sweep.
 
-    Capsules of two fingers of one gripper that slide on one line and are equally thick become one. It keeps the first
-    one's name, and the space between the fingers is part of it. Returns the bodies of which less counts where the
-    gripper's opening is known: those along whose line the fingers slide, and those that turn. A finger that slides
-    across its body is all of its way always. One that is moved by a joint of more than one axis stays as it is.
+    If two fingers of one gripper slide on one line and are equally thick, their capsules become one. It keeps the name
+    of the first one, and includes the space between the fingers. A finger that slides across its body always counts as
+    its whole way. A finger that is moved by a joint with more than one axis stays as it is.
+
+    Returns:
+        The bodies of which less counts while the gripper's opening is known: those along whose line the fingers slide,
+        and those that turn.
     """
     bodies: list[FingerBody | TurningBody] = []
     for arm, joints in parts.finger_joints.items():
@@ -135,11 +139,11 @@ def _finger_joint(
     driven: Collection[str],
     stroke: tuple[float, float] | None,
 ) -> FingerJoint:
-    """A joint of a finger that is locked at ``home`` in ``model``.
+    """Return a joint of a finger that is locked at ``home`` in ``model``.
 
-    ``driven`` are the joints that the gripper moves from closed to open, which is its ``stroke`` [m or rad]. Without
-    one, any joint that mimics none may be anywhere in its limits. One that mimics is where that puts it, also where
-    the joint that it follows is at the end of its travel.
+    ``driven`` are the joints that the gripper moves from closed to open, by its ``stroke`` [m or rad]. Without a
+    stroke, a joint without a <mimic> may be anywhere in its limits. A joint with a <mimic> follows its driver, also at
+    the end of the driver's travel.
     """
     name = joint.get("name", "")
     followers = followers_of(tree.joint_to.values(), driven if stroke is not None else ())
@@ -164,25 +168,25 @@ def _finger_joint(
 
 
 def _ends(item: pin.GeometryObject) -> Array:
-    """Ends of a capsule's segment, or a sphere's centre twice (2, 3) [m]."""
+    """Return both ends of a capsule's segment, or the centre of a sphere twice (2, 3) [m]."""
     half = item.geometry.halfLength if isinstance(item.geometry, coal.Capsule) else 0.0
     along = half * item.placement.rotation[:, 2]
     return np.array([item.placement.translation - along, item.placement.translation + along])
 
 
 def _sweep(item: pin.GeometryObject, joints: tuple[FingerJoint, ...]) -> bool:
-    """Make a shape what it sweeps; whether all of its segment moves along one line."""
+    """Replace a shape by the volume that it sweeps; returns whether its whole segment moves along one line."""
     ways = [[(end - joint.home) * joint.axis for end in (joint.before, joint.beyond)] for joint in joints]
     points = np.array([end + np.sum(move, axis=0) for move in product(*ways) for end in _ends(item)])
     radius, line = float(item.geometry.radius), _line_of(points)
-    # A capsule is convex: the one around the corners of what the segment sweeps holds all of it.
+    # A capsule is convex. If it encloses the corners of the swept segment, it encloses all of it.
     thicker, start, end = enclosing_capsule(points) if line is None else (0.0, *line)
     item.geometry, item.placement = capsule_between(radius + thicker, start, end)
     return line is not None
 
 
 def _line_of(points: Array) -> Array | None:
-    """Both ends of the segment that all ``points`` (n, 3) lie on (2, 3); None where they do not lie on one."""
+    """Return both ends of the segment on which all ``points`` (n, 3) lie (2, 3); None if they are on no segment."""
     offsets = points - points[0]
     farthest = offsets[int(np.argmax(np.linalg.norm(offsets, axis=1)))]
     length = np.linalg.norm(farthest)
@@ -195,7 +199,7 @@ def _line_of(points: Array) -> Array | None:
 
 
 def _merge(geometry: pin.GeometryModel, swept: dict[str, list[_Finger] | None]) -> dict[str, list[_Finger] | None]:
-    """Join bodies on one line; returns the fingers of those that are left, None where they move across one."""
+    """Join bodies on one line; returns the fingers of the remaining bodies, None for those that move across a line."""
     kept: dict[str, list[_Finger] | None] = {}
     for name, fingers in swept.items():
         item = geometry.geometryObjects[geometry.getGeometryId(name)]

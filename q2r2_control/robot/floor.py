@@ -1,7 +1,8 @@
-"""The floor of a cell: what stands for it in the URDF, and which links need no watching against it.
+"""The floor of a cell: its shape in the URDF, and the links that cannot reach it.
 
-It is a box whose top is at the floor's height, since URDF has no plane. No arm reaches beyond its edges, since no mount
-is farther than 20 m from the origin. Bodies inside are pushed out through the top, since it is thick.
+The floor is a box whose top is at the floor's height, because URDF has no plane. No arm reaches beyond its edges,
+because no mount is farther than 20 m from the origin. The box is thick, so that bodies inside are pushed out through
+the top.
 """
 
 from __future__ import annotations
@@ -18,17 +19,18 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE, keep_pairs, link_of
 from q2r2_control.robot.urdf_parts import fixed_joint
 
-FLOOR = "floor"  # link
+FLOOR = "floor"  # The name of its link.
 
 _SIZE = (100.0, 100.0, 10.0)  # [m]
-_ON = 1e-3  # a box stands on the floor from this height on [m]
+_ON = 1e-3  # A box stands on the floor if its underside is not higher than this [m].
 _UPRIGHT = 1e-9  # sine of the angle to the vertical [-]
 
 
 def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[ET.Element]:
-    """Link ``floor``, whose frame lies in the floor's surface, and the joint that fixes it to ``parent``; no drawing.
+    """Return the link ``floor`` and the joint that fixes it to ``parent``. Its frame lies in the floor's surface.
 
-    Raises :class:`ConfigError` where one of the ``obstacles`` has the name already.
+    Raises:
+        ConfigError: If one of the ``obstacles`` already has this name.
     """
     if FLOOR in obstacles:
         raise ConfigError(
@@ -43,10 +45,11 @@ def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[E
 
 
 def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
-    """Let fixed upright boxes that stand on the floor reach deep into it, so that nothing is pushed out downwards.
+    """Extend fixed upright boxes that stand on the floor deep into it, so that nothing is pushed out downwards.
 
-    A body inside a box is pushed out through the nearest face. The underside of a box on the floor is no way out. A
-    hand deep in it and the wrist above would be pushed apart and stay for ever. Above the floor nothing changes.
+    A body inside a box is pushed out through the nearest face. It cannot leave through the underside of a box on the
+    floor: a hand deep in the box and its wrist above would be pushed apart, and stay there for ever. Above the floor
+    the box does not change.
     """
     floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)
     if floor is None:
@@ -65,10 +68,10 @@ def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
 
 
 def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel) -> None:
-    """Remove pairs of the floor with bodies that cannot come nearer to it than now.
+    """Remove pairs of the floor with bodies that provably cannot come near to it.
 
-    Two kinds, both proven: bodies that turn about vertical axes only, as an arm's first link does, and stay as high as
-    they are. The other kind are bodies too near to the first joint that can tip them to come within :data:`CLEARANCE`.
+    These are bodies that turn about vertical axes only, as the first link of an arm does, and keep their height. They
+    are also bodies that are too close to the first joint that can tip them to come within :data:`CLEARANCE`.
     """
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
@@ -93,18 +96,18 @@ def _is_floor(item: pin.GeometryObject) -> bool:
 
 
 def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float | None:
-    """Height that no point of a capsule or sphere is ever below [m]; None where no joint raises or lowers it.
+    """Return the least height of any point of a capsule or sphere [m]; None if no joint changes its height.
 
-    Joints that turn about vertical axes or slide along level ones leave all heights as they are at zero, for which
-    ``data`` has frames and Jacobians. The first other joint's origin then keeps its height, and the bodies that hang on
-    that joint lie in a ball around it.
+    Joints that turn about vertical axes or slide along level ones do not change heights. The origin of the first other
+    joint therefore keeps its height, and the bodies that this joint carries lie in a ball around it. ``data`` has the
+    frames and Jacobians at zero.
     """
     height, world_axes = None, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     reach = float(np.linalg.norm(item.placement.translation)) + item.geometry.radius
     reach += getattr(item.geometry, "halfLength", 0.0)
     for joint in list(model.supports[item.parentJoint])[1:]:
         index = model.joints[joint].idx_v
-        # Of the joint's origin. Pinocchio's binding drops the column dimension of a model with one joint.
+        # The Jacobian of the joint's origin. Pinocchio's binding drops the column dimension of a model with one joint.
         twist = np.reshape(pin.getJointJacobian(model, data, joint, world_axes), (6, model.nv))[:, index]
         slides = np.linalg.norm(twist[:3]) > 0.5
         if height is None:

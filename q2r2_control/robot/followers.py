@@ -1,4 +1,4 @@
-"""Joints that follow another one, as ``<mimic>`` says: each as a function of the joint that drives it in the end."""
+"""Resolve joints with a ``<mimic>``: each becomes a linear function of the joint that finally drives it."""
 
 from __future__ import annotations
 
@@ -14,20 +14,25 @@ from q2r2_control.robot.urdf_parts import mimic_of
 class Follower:
     """A joint that is at ``multiplier * q + offset`` where its driver is at ``q`` [rad or m]."""
 
-    driver: str  # a joint that follows none
+    driver: str  # A joint without a <mimic>.
     multiplier: float
     offset: float
 
     def at(self, position: float) -> float:
-        """Position of the follower with its driver at ``position``."""
+        """Return the position of the follower if its driver is at ``position``."""
         return self.multiplier * position + self.offset
 
 
 def followers_of(joints: Iterable[ET.Element], driven: Collection[str] = (), where: str = "") -> dict[str, Follower]:
-    """All joints that follow another one, by name. A follower of a follower follows what drives that one.
+    """Return all joints that follow another one, by name. A follower of a follower gets the driver of that one.
 
-    ``driven`` joints have a motor, hence follow none, whatever they mimic. A fixed joint follows none either. Raises
-    :class:`RobotError` that begins with ``where`` for a joint that follows none of ``joints``, or itself in the end.
+    Args:
+        joints: All joints of the model.
+        driven: Joints with a motor. They follow no joint, also with a <mimic>. The same holds for fixed joints.
+        where: Begins the text of an error.
+
+    Raises:
+        RobotError: If a joint follows one that is not in ``joints``, or itself through other joints.
     """
     named = {joint.get("name", ""): joint for joint in joints}
     leads = {
@@ -52,18 +57,20 @@ def followers_of(joints: Iterable[ET.Element], driven: Collection[str] = (), whe
 
 
 def with_followers(positions: Mapping[str, float], followers: Mapping[str, Follower]) -> dict[str, float]:
-    """``positions`` by joint [rad or m], and those of all followers of these joints that it does not have yet."""
+    """Return ``positions`` by joint [rad or m], with the positions of all followers of these joints added."""
     followed = {name: one.at(positions[one.driver]) for name, one in followers.items() if one.driver in positions}
     return followed | dict(positions)
 
 
 def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
-    """Let each joint go only where all its followers may follow it: narrow the limits of drivers in place.
+    """Narrow the limits of drivers in place, so that all followers stay within their own limits.
 
-    A follower without a range of its own, and one that stands still, narrows nothing. One whose range has the wrong
-    sign, as models have it of fingers that mirror each other, gets the range in which it follows. Raises
-    :class:`RobotError` that begins with ``where`` for followers as by :func:`followers_of`, and for one that leaves its
-    driver no range.
+    A follower without limits, and one that does not move, has no effect. A follower whose limits have the wrong sign,
+    as in models of mirrored fingers, gets the range in which it follows.
+
+    Raises:
+        RobotError: With a text that begins with ``where``, as :func:`followers_of`, or if a follower leaves its driver
+            no range.
     """
     limits = {joint.get("name", ""): joint.find("limit") for joint in joints}
     for name, follower in followers_of(joints, where=where).items():
@@ -76,7 +83,7 @@ def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
             continue
         first, last = sorted((end - follower.offset) / follower.multiplier for end in (lower, upper))
         low, high = max(least, first), min(most, last)
-        if not low < high:  # mirrored
+        if not low < high:  # The follower moves the other way.
             first, last = sorted((-end - follower.offset) / follower.multiplier for end in (lower, upper))
             low, high = max(least, first), min(most, last)
             lower, upper = sorted(map(follower.at, (low, high)))

@@ -1,13 +1,14 @@
-"""Held objects: bodies that are fixed to the tools, and the pairs that are watched with them.
+"""Held objects: bodies that are fixed to the tools, and the monitored pairs with them.
 
-They stand in a copy of ``Robot.collision_model`` that ends with them and their pairs. An object is watched against the
-same bodies as its link. Its own hand is left out, and so are the fingers of other hands, which have to be able to take
-it over.
+They are in a copy of ``Robot.collision_model``, after its own bodies and pairs. An object has pairs with the same
+bodies as its link. There are no pairs with its own hand, and none with the fingers of other hands, because these must
+be able to take the object over.
 
-**Boxes against boxes** have no short closed form. Where two convex polyhedra are closest, one of the two points can be
-taken on an edge. If both lie inside of faces, these are parallel, and both points may be moved along them until one
-meets an edge. And two of them cannot begin to overlap but by an edge of one in the other. The distance of two boxes is
-therefore the least one of the twelve edges of each from the other box. Each edge is a capsule without a radius.
+**The distance of two boxes** has no short closed form. One of the two closest points of two convex polyhedra can be
+taken on an edge: if both points lie inside of faces, these faces are parallel, and both points can be moved along
+them until one of them meets an edge. Two polyhedra also begin to overlap only by an edge of one in the other. The
+distance of two boxes is therefore the least distance of the twelve edges of each box from the other box. Each edge is
+a capsule without a radius.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ class HeldObject:
     """The object of one gripper, fixed to the joint that carries the tool."""
 
     arm: str
-    link: str  # that its bodies are named by
-    joint: int  # in ``Robot.model``
-    placement: pin.SE3  # of its centre, in that joint's frame
+    link: str  # The link after which its bodies are named.
+    joint: int  # The joint in ``Robot.model`` that carries it.
+    placement: pin.SE3  # Of its centre, in the frame of that joint.
     config: HeldObjectConfig
 
     def inertia(self, share: float = 1.0) -> pin.Inertia:
-        """Of a uniform box or ball with a share of its mass, in the joint's frame."""
+        """Return the inertia of a uniform box or ball with a share of its mass, in the joint's frame."""
         mass, box = share * self.config.mass, self.config.box
         own = pin.Inertia.FromSphere(mass, self.config.radius) if box is None else pin.Inertia.FromBox(mass, *box)
         return own.se3Action(self.placement)
@@ -47,12 +48,12 @@ class HeldObject:
 class HeldObjects:
     """All objects of a cell."""
 
-    geometry: pin.GeometryModel  # ``Robot.collision_model``, and after its bodies and pairs those of objects
+    geometry: pin.GeometryModel  # ``Robot.collision_model``, followed by the bodies and pairs of objects.
     by_arm: dict[str, HeldObject]
-    holders: tuple[frozenset[str], ...]  # of each of the objects' pairs: arms that have to hold for it to count
+    holders: tuple[frozenset[str], ...]  # For each pair of objects, the arms that have to hold for it to count.
 
     def pair_names(self) -> tuple[tuple[str, str], ...]:
-        """Names of both bodies of each of the objects' pairs."""
+        """Return the names of both bodies of each of the objects' pairs."""
         names = pair_names(self.geometry)
         return names[len(names) - len(self.holders) :]
 
@@ -64,7 +65,7 @@ def held_objects(
     tool_frames: Mapping[str, int],
     configs: Mapping[str, HeldObjectConfig],
 ) -> HeldObjects:
-    """The objects that ``configs`` describe, by arm; ``tool_frames`` are frames of ``model``."""
+    """Return the objects that ``configs`` describe, by arm. ``tool_frames`` are frames of ``model``."""
     by_arm: dict[str, HeldObject] = {}
     for arm, config in configs.items():
         frame = model.frames[tool_frames[arm]]
@@ -84,16 +85,16 @@ def held_objects(
 
 
 class _Pairs:
-    """A geometry model that objects and their pairs are added to."""
+    """A geometry model to which objects and their pairs are added."""
 
     def __init__(self, geometry: pin.GeometryModel) -> None:
         self.geometry = geometry
         self.holders: list[frozenset[str]] = []
         self._solids = {item.name: index for index, item in enumerate(geometry.geometryObjects)}
-        self._edges: dict[str, list[int]] = {}  # of boxes, by the solid's name
+        self._edges: dict[str, list[int]] = {}  # The edges of boxes, by the name of the solid.
 
     def add_object(self, held: HeldObject) -> None:
-        """The box or the ball itself, by the name of its link."""
+        """Add the box or the ball itself, with the name of its link."""
         box = held.config.box
         shape = coal.Sphere(held.config.radius) if box is None else coal.Box(*box)
         self._solids[held.link] = self._add(f"{held.link}_solid", held.joint, shape, held.placement)
@@ -103,7 +104,7 @@ class _Pairs:
         pairs = [(self._solids[first], self._solids[second])]
         if self._is_box(first) and self._is_box(second):
             pairs = [(edge, self._solids[second]) for edge in self._edges_of(first)]
-            if link_of(second) != FLOOR:  # whose edges are out of reach
+            if link_of(second) != FLOOR:  # The edges of the floor are out of reach.
                 pairs += [(edge, self._solids[first]) for edge in self._edges_of(second)]
         for pair in pairs:
             self.geometry.addCollisionPair(pin.CollisionPair(*pair))
@@ -128,9 +129,9 @@ class _Pairs:
 
 
 def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldObject) -> list[str]:
-    """Bodies that those on the object's link are watched against, but for hands that hold, or take, the object."""
+    """Return the bodies with which the object's link has pairs, without hands that hold or may take the object."""
     items = geometry.geometryObjects
-    # Obstacles all, also those that the hand itself cannot reach: an object reaches farther.
+    # All obstacles count, also those that the hand itself cannot reach, because an object reaches farther.
     found = dict.fromkeys(item.name for item in items if roles[link_of(item.name)].part is LinkClass.OBSTACLE)
     for pair in geometry.collisionPairs:
         first, second = items[pair.first], items[pair.second]

@@ -1,8 +1,8 @@
-"""A home that nobody has named: a posture to work from, found by sampling and then improved.
+"""Find a home posture for a cell that names none, by sampling and a local search.
 
-Wanted are joints near their middles, a tool before and below the shoulder that points forwards and down, motion in all
-directions, torques to spare, and room between bodies, most of all below the tool, since work goes down from home. Of
-torques and room a part is needed: where that is missing the cost jumps.
+A good home has joints near the middle of their ranges. The tool is before and below the shoulder, points forwards and
+down, and can move in all directions. The joints have torque to spare, and the bodies have room, most of all below the
+tool, because work goes down from home. A part of the torque and of the room is required. Without it the cost jumps.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from q2r2_control.robot.robot import Arm, Robot
 
 _SAMPLES, _BEST, _STEPS = 2000, 24, 150
-_INSIDE = 0.85  # of the half range that each joint may use
-_HALF = np.pi / 2  # of a joint that turns farther, as if that were half its range [rad]
-_WORK = np.array([0.62, 0.0, 0.05])  # of the tool from the shoulder, in reaches
-_AHEAD = np.array([0.8, 0.0, -0.6])  # where it points
-_LEAST_GAIN = 0.15  # of the weakest direction of motion, in reaches
-_BORNE = 0.7  # of the torque limits, by gravity
-_ROOM = 0.04  # more than a pair keeps; what is needed is a part of it [m]
-_BELOW = 0.16  # the same between the tool and the floor, as far as scripted hands go down and more [m]
-_NEEDED = 0.005  # [m]
+_INSIDE = 0.85  # Share of half its range that each joint may use.
+_HALF = np.pi / 2  # Half range of a joint that turns farther than this [rad].
+_WORK = np.array([0.62, 0.0, 0.05])  # Place of the tool from the shoulder, in reaches of the arm.
+_AHEAD = np.array([0.8, 0.0, -0.6])  # Direction in which the tool points.
+_LEAST_GAIN = 0.15  # Least gain of the weakest direction of motion, in reaches of the arm.
+_BORNE = 0.7  # Share of the torque limits that gravity may need.
+_ROOM = 0.04  # Wanted room in addition to the distance that a pair keeps [m].
+_BELOW = 0.16  # The same between the tool and the floor. Scripted hands go down by less [m].
+_NEEDED = 0.005  # Required room [m].
 _MIRROR = np.array([1.0, -1.0, 1.0])
 _ALONG_X, _ALONG_Z = np.diag([0.01, 0.0, 0.01])[[0, 2]]  # in the tool's frame [m]
 _FAULTY = 100.0  # Cost of each requirement that a posture does not meet.
@@ -39,10 +39,15 @@ _FAULTY = 100.0  # Cost of each requirement that a posture does not meet.
 def find_home(
     robot: Robot, arm: str, q: Array, kept: Array, placed: Collection[str], like: Array | None = None
 ) -> Array:
-    """Positions of the joints of ``arm`` to start from (n,), the others being at ``q`` (nv,) [rad].
+    """Return the best home positions that were found for the joints of ``arm`` (n,) [rad]. They may have faults.
 
-    ``kept`` (pairs,) [m]; pairs with arms that are not ``placed`` yet do not count. Positions ``like`` those of a twin
-    (n,) are taken as they are where they may. The result is the best found, which need not be free of faults.
+    Args:
+        robot: The robot.
+        arm: The arm.
+        q: The positions of all other joints (nv,) [rad].
+        kept: The distance that each pair keeps (pairs,) [m].
+        placed: Arms whose home is known. Pairs with other arms do not count.
+        like: Positions of an equal arm (n,), which are taken if they are allowed.
     """
     search = _HomeSearch(robot, arm, q, kept, placed)
     if like is not None and search.cost(like) < _FAULTY:
@@ -51,10 +56,10 @@ def find_home(
 
 
 def mirrored_home(robot: Robot, arm: str, placed: str, q: Array) -> Array | None:
-    """Positions of ``arm`` (n,) that mirror those of the arm ``placed`` at ``q`` (nv,) in the plane y = 0 [rad].
+    """Return positions of ``arm`` (n,) [rad] that mirror the arm ``placed`` at ``q`` (nv,) in the plane y = 0.
 
-    Joints of mirrored arms differ in their signs only, so the signs are taken that mirror the joints' places best. None
-    for arms of different numbers of joints.
+    Joints of mirrored arms differ in their signs only. The signs that mirror the places of the joints best are taken.
+    None if the arms have different numbers of joints.
     """
     own, other = robot.arms[arm], robot.arms[placed]
     if len(own.joints) != len(other.joints):
@@ -62,7 +67,7 @@ def mirrored_home(robot: Robot, arm: str, placed: str, q: Array) -> Array | None
     data = robot.model.createData()
 
     def points(posture: Array, of: Arm) -> Array:
-        """Places of joints and tool, and those of points a little along the tool's axes (n, 3) [m]."""
+        """Return the places of joints and tool, and of points on the tool's axes (n, 3) [m]."""
         pin.forwardKinematics(robot.model, data, posture)
         tool = pin.updateFramePlacement(robot.model, data, of.frame_id)
         places = [data.oMi[int(joint) + 1].translation.copy() for joint in of.joints]
@@ -121,7 +126,7 @@ class _HomeSearch:
         return self._q
 
     def _lever(self, x: Array) -> Array:
-        """The tool from the shoulder (3,) [m], with the model's data at ``x``."""
+        """Return the tool's place from the shoulder (3,) [m], with the model's data at ``x``."""
         model, data = self._robot.model, self._data
         pin.computeJointJacobians(model, data, self._at(x))
         pin.updateFramePlacements(model, data)
@@ -154,5 +159,5 @@ class _HomeSearch:
 
 
 def _beyond(excess: float, most: float) -> float:
-    """0 up to 0, and a jump at ``most``."""
+    """Return 0 if ``excess`` is not above 0, and a cost that jumps at ``most``."""
     return max(excess, 0.0) / most + (_FAULTY * (1.0 + excess) if excess > most else 0.0)

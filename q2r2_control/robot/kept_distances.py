@@ -1,4 +1,4 @@
-"""How far each monitored pair stays apart: ``min_distance``, ``distances``, ``pairs`` and ``contact_allowed``."""
+"""The distance that each monitored pair keeps: ``min_distance``, ``distances``, ``pairs`` and ``contact_allowed``."""
 
 from __future__ import annotations
 
@@ -20,43 +20,43 @@ _OUTERMOST_FIRST = list(LinkClass)
 
 @dataclass(frozen=True, slots=True)
 class KeptDistances:
-    """By pair, in the order of ``Robot.distances``."""
+    """The distances of all pairs, in the order of ``Robot.distances``."""
 
-    values: Array  # (p,) [m]; of pairs that may touch minus the depth that the reference may have
-    keys: tuple[str, ...]  # what said so, in the block ``control``: min_distance, distances.arm_arm, pairs[0]
-    contact_speed: Array  # (p,) closing speed near contact of pairs that may touch [m/s]; of the others infinite
+    values: Array  # (p,) [m]. For pairs that may touch, minus the depth that the reference may have.
+    keys: tuple[str, ...]  # The key in the block ``control``, such as min_distance, distances.arm_arm or pairs[0].
+    contact_speed: Array  # (p,) Closing speed near contact of pairs that may touch [m/s]; infinite for others.
 
 
 def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
-    """The distance that every monitored pair of ``robot`` has to keep.
+    """Return the distance that every monitored pair of ``robot`` has to keep.
 
-    Raises :class:`ConfigError` for names in ``settings.pairs`` and ``settings.contact_allowed`` that no monitored pair
-    has.
+    Raises:
+        ConfigError: If no monitored pair has a name in ``settings.pairs`` or ``settings.contact_allowed``.
     """
     return _of_all_pairs(robot, settings)[0]
 
 
 def kept_by_objects(robot: Robot, settings: ControllerSettings) -> KeptDistances:
-    """The same of the pairs of ``robot.objects``; raises as :func:`kept_distances` does."""
+    """Return the same for the pairs of ``robot.objects``; raises as :func:`kept_distances` does."""
     return _of_all_pairs(robot, settings)[1]
 
 
 def kept_by_obstacles(robot: Robot, settings: ControllerSettings) -> KeptDistances:
-    """The same of the pairs of moving obstacles; raises as :func:`kept_distances` does."""
+    """Return the same for the pairs of moving obstacles; raises as :func:`kept_distances` does."""
     return _of_all_pairs(robot, settings)[2]
 
 
 def near_at_home(robot: Robot, kept: KeptDistances) -> list[NearPair]:
-    """Pairs that are nearer at home than they have to be, the nearest first."""
+    """Return the pairs that are closer at home than they have to keep, the closest first."""
     pairs = zip(robot.distances(robot.home), kept.values.tolist(), kept.keys, strict=True)
     found = [NearPair((pair.name_a, pair.name_b), pair.distance, least, key) for pair, least, key in pairs]
     return sorted((pair for pair in found if pair.distance < pair.kept), key=lambda pair: pair.distance)
 
 
 def too_close_at_home(robot: Robot, kept: KeptDistances, *, remedies: bool = False) -> list[str]:
-    """A line for each of :func:`near_at_home`.
+    """Return a line for each pair of :func:`near_at_home`.
 
-    ``remedies``: with what to write into the cell's YAML, for which postures are sampled.
+    With ``remedies`` it says what to write into the cell's YAML, for which postures are sampled.
     """
     lines = []
     for pair in near_at_home(robot, kept):
@@ -67,7 +67,7 @@ def too_close_at_home(robot: Robot, kept: KeptDistances, *, remedies: bool = Fal
 
 
 def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDistances, KeptDistances, KeptDistances]:
-    """Of the monitored pairs, of those of objects, and of those of moving obstacles."""
+    """Return the distances of the monitored pairs, of the pairs of objects, and of those of moving obstacles."""
     names = pair_names(with_obstacle_bodies(robot, settings.moving_obstacles))
     roles = roles_with_obstacles(robot, settings.moving_obstacles)
     keys = ["min_distance"] * len(names)
@@ -83,7 +83,7 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDista
     speed = np.full(len(names), np.inf)
     count = len(robot.collision_model.collisionPairs)
     last = count + len(robot.objects.holders)
-    for i, contact in enumerate(settings.contact_allowed):  # objects need none: their classes allow contact
+    for i, contact in enumerate(settings.contact_allowed):  # The classes of objects allow contact anyway.
         for p in _found(f"contact_allowed[{i}]", contact.pair, names[:count]):
             values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed
     parts = slice(0, count), slice(count, last), slice(last, None)
@@ -92,7 +92,7 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDista
 
 
 def pair_class(first: Role, second: Role) -> str:
-    """Key of ``control.distances`` for two links."""
+    """Return the key of ``control.distances`` for two links."""
     parts = sorted((first.part, second.part), key=_OUTERMOST_FIRST.index)
     same_robot = first.arms & second.arms or not (first.arms and second.arms)
     if LinkClass.OBSTACLE not in parts and same_robot:
@@ -101,7 +101,7 @@ def pair_class(first: Role, second: Role) -> str:
 
 
 def _found(key: str, patterns: tuple[str, str], names: tuple[tuple[str, str], ...]) -> list[int]:
-    """Numbers of the pairs that ``patterns`` mean."""
+    """Return the numbers of the pairs that match ``patterns``."""
     one, two = patterns
     found = [p for p, (a, b) in enumerate(names) if (_is(one, a) and _is(two, b)) or (_is(one, b) and _is(two, a))]
     if not found:
@@ -110,7 +110,7 @@ def _found(key: str, patterns: tuple[str, str], names: tuple[tuple[str, str], ..
 
 
 def _is(pattern: str, geometry: str) -> bool:
-    """Whether a pattern means a body: its link, or its own name as reports have it."""
+    """Return whether a pattern is the link of a body, or its own name as in reports."""
     return fnmatchcase(link_of(geometry), pattern) or fnmatchcase(geometry, pattern)
 
 

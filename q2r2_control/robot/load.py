@@ -1,8 +1,9 @@
-"""The mass and centre of mass that an arm carries, from torques that were measured while it rested in many postures.
+"""Identify the mass and the centre of mass that an arm carries, from torques at rest in many postures.
 
-At rest the torques that gravity asks for are linear in the mass m of the last link and in m c, c being its centre of
-mass. Torques that a model does not explain therefore tell by how much m and m c differ from it. Published masses of an
-arm's links differ by up to a factor of two; where they are wrong, no load explains the torques, and it is not judged.
+At rest the torques of gravity are linear in the mass m of the last link and in m c, where c is its centre of mass. The
+difference between measured torques and a model therefore tells by how much m and m c differ from the model. Published
+masses of an arm's links differ by up to a factor of two. If they are wrong, no load explains the torques, and the load
+is not judged.
 """
 
 from __future__ import annotations
@@ -19,31 +20,31 @@ from q2r2_control.types import Array
 
 LEAST_POSTURES = 8
 MODEL, PENDANT = "its tool's model", "the pendant, if its load data are the model's,"
-_LEAST_SPREAD = 0.2  # smallest singular value of the regressor, a posture, relative to g [m]
-_LIGHT = 0.05  # a mass that has no centre worth telling [kg]
-_MASS_BOUND, _CENTRE_BOUND = 0.3, 50.0  # of the identified load to the expected one [kg], [mm]
-_EXPLAINED = 1.0  # residual of a model of the arm that is good enough [Nm]
+_LEAST_SPREAD = 0.2  # Least singular value of the regressor per posture, relative to g [m].
+_LIGHT = 0.05  # The centre of a smaller mass is not reported [kg].
+_MASS_BOUND, _CENTRE_BOUND = 0.3, 50.0  # Greatest difference from the expected load [kg], [mm].
+_EXPLAINED = 1.0  # Greatest residual with which a model of the arm is good enough [Nm].
 
 
 @dataclass(frozen=True, slots=True)
 class LoadReport:
-    """The load that fits an arm's torques, centres in the flange's frame as the pendant has them."""
+    """The load that fits the torques of an arm. Centres are in the flange's frame, as on the pendant."""
 
     arm: str
-    against: str  # whose torques they were compared with: MODEL or PENDANT
+    against: str  # The model with which the torques were compared: MODEL or PENDANT.
     identified_kg: float
     expected_kg: float
     identified_centre_mm: list[float]
     expected_centre_mm: list[float]
-    residual_nm: float  # torque that no load explains, RMS
+    residual_nm: float  # RMS of the torque that no load explains.
 
     @property
     def is_judged(self) -> bool:
-        """Whether the torques are those of a load."""
+        """Whether a load explains the torques."""
         return self.against == PENDANT or self.residual_nm <= _EXPLAINED
 
     def check(self) -> None:
-        """Raises :class:`RobotError` for a load that is judged, and not the expected one."""
+        """Raise :class:`RobotError` if the load is judged and differs from the expected one."""
         away = float(np.linalg.norm(np.subtract(self.identified_centre_mm, self.expected_centre_mm)))
         wrong = abs(self.identified_kg - self.expected_kg) > _MASS_BOUND or away > _CENTRE_BOUND
         if wrong and self.is_judged:
@@ -57,10 +58,17 @@ class LoadReport:
 
 
 def identify_load(robot: Robot, arm: str, postures: Array, missing: Array, against: str) -> LoadReport:
-    """The load of ``arm`` from the torques ``missing`` (n, nv) [Nm] at rest in ``postures`` (n, nv) [rad].
+    """Return the load of ``arm``.
 
-    They are the measured ones less those of the arm and its expected tool, as the robot's model or the cabinet has them
-    (``against``). Raises :class:`RobotError` for fewer than eight postures, and for postures too alike.
+    Args:
+        robot: The robot.
+        arm: The arm.
+        postures: The postures at rest (n, nv) [rad].
+        missing: The measured torques less those of the arm with its expected tool (n, nv) [Nm].
+        against: The model of the latter: the robot's own, or the cabinet's.
+
+    Raises:
+        RobotError: If there are fewer than eight postures, or if they are too similar.
     """
     if len(postures) < LEAST_POSTURES:
         raise RobotError(f"{len(postures)} postures: allowed: {LEAST_POSTURES} or more")

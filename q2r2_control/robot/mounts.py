@@ -1,4 +1,4 @@
-"""Where one arm's base is, from points that the tips of both arms have touched."""
+"""Find the place of one arm's base from points that the tips of both arms have touched."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ import pinocchio as pin
 from q2r2_control.errors import RobotError
 from q2r2_control.types import Array
 
-_LEAST_SPREAD = 0.03  # of the points about the line that fits them best, RMS [m]
+_LEAST_SPREAD = 0.03  # Least RMS distance of the points from the line that fits them best [m].
 
 
 def fit_move(points: Array, touched: Array) -> tuple[pin.SE3, Array]:
-    """The move that brings ``touched`` (n, 3) onto ``points`` (n, 3) [m], and how far each is off then (n,) [m].
+    """Return the rigid motion that brings ``touched`` (n, 3) onto ``points`` (n, 3) [m], and the errors (n,) [m].
 
-    Least squares without a scale: Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point
-    Patterns, 1991. Raises :class:`RobotError` for fewer than three points, and for points on a line.
+    It is the least-squares solution without a scale: Umeyama, Least-Squares Estimation of Transformation Parameters
+    Between Two Point Patterns, 1991.
+
+    Raises:
+        RobotError: If there are fewer than three points, or if they lie on a line.
     """
     if len(points) < 3:
         raise RobotError(f"{len(points)} points: allowed: 3 or more")

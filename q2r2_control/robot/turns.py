@@ -1,7 +1,8 @@
-"""Joints that turn on for ever, whose angle may be reported within one turn, as in (-pi, pi]: their turns are counted.
+"""Count the turns of continuous joints, whose angle may be reported within one turn, as in (-pi, pi].
 
-A jump by a whole turn between two reports is none, as long as the joint cannot have turned by half of one meanwhile.
-Reports that count turns themselves stay as they are. So does the first one, and one after a longer gap.
+If the angle jumps by a whole turn between two reports, the joint has not jumped, as long as it cannot have turned by
+half a turn meanwhile. Reports that count turns themselves do not change. The same holds for the first report, and for a
+report after a longer gap.
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ _TURN = 2.0 * math.pi
 
 
 class TurnCounter:
-    """Counts the turns of a robot's endless joints, from one measured state to the next."""
+    """Counts the turns of a robot's continuous joints from one measured state to the next."""
 
     def __init__(self, robot: Robot) -> None:
         joints = self._joints = np.flatnonzero(robot.endless)
         self._half_turn_s = float((math.pi / robot.velocity_limit[joints]).min(initial=math.inf))
-        self._last: Array | None = None  # of these joints, as counted [rad]
+        self._last: Array | None = None  # The last positions of these joints with their turns [rad].
         self._at = -math.inf
 
     def counted(self, q: Array, now: float) -> Array:
-        """``q`` (nv,) as reported at ``now`` [s], with endless joints near where they were; no copy without a change.
+        """Return the reported positions ``q`` (nv,) [rad] with the turns of continuous joints; ``now`` is the time [s].
 
-        Positions that are not finite are left for others to judge.
+        Without a change ``q`` itself is returned. Positions that are not finite are not changed.
         """
         if not len(self._joints) or not np.isfinite(given := q[self._joints]).all():
             return q
@@ -44,6 +45,6 @@ class TurnCounter:
         return q
 
     def of_state(self, state: RobotState, now: float) -> RobotState:
-        """The state with its positions :meth:`counted`."""
+        """Return the state with the positions of :meth:`counted`."""
         q = self.counted(state.q, now)
         return state if q is state.q else replace(state, q=q)

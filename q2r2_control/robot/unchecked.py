@@ -1,6 +1,6 @@
-"""Links that move with an arm and that no distance is kept from, since no collision shape stands for them.
+"""Find links that move with an arm and have no collision shape, so that nothing keeps them apart from other bodies.
 
-A certificate says nothing about such a link. A robot that has one is refused, unless its cell names the link.
+A certificate says nothing about such a link. A robot with such a link is refused, unless its cell names the link.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from q2r2_control.robot.description import LinkTree
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
-# A lighter link stands for a frame [kg]. Models give frames of sensors and tools 0.1 mg to 10 g, because some programs
-# need a mass; the lightest body that real models have without a shape, a jaw, weighs 20 g.
+# A lighter link counts as a frame [kg]. In models, frames of sensors and tools have 0.1 mg to 10 g, because some
+# programs need a mass. The lightest real body without a shape in known models is a jaw of 20 g.
 LIGHTEST_BODY = 0.015
 
 
@@ -27,24 +27,25 @@ class MovingLink:
     """A link that moves with an arm's joints."""
 
     name: str
-    mass: float | None  # [kg]; None: the model says none
-    drawn: bool  # it has a <visual>
-    shaped: bool  # it has a <collision>
-    follows: str | None  # joint of an arm, which a joint beside the arm mimics; the link is watched where it is at home
-    arms: tuple[str, ...]  # that move it
+    mass: float | None  # [kg]; None if the model has no mass.
+    drawn: bool  # Whether it has a <visual>.
+    shaped: bool  # Whether it has a <collision>.
+    # The joint of an arm that a joint beside the arm mimics, if it moves this link. It is watched only at home.
+    follows: str | None
+    arms: tuple[str, ...]  # The arms that move it.
 
     @property
     def is_body(self) -> bool:
-        """True unless the link is a mere frame: it weighs something, or is drawn and nothing says that it is light."""
+        """Whether the link is a real body and not a frame: it has a mass, or it is drawn and no mass is known."""
         return self.shaped or (self.drawn if self.mass is None else self.mass >= LIGHTEST_BODY)
 
     @property
     def is_unchecked(self) -> bool:
-        """True for a body that is not watched where it is."""
+        """Whether the link is a body that is not watched at its real place."""
         return self.is_body and (not self.shaped or self.follows is not None)
 
     def fault(self, in_cell: bool) -> str:
-        """One line on what is missing, and how to mend it; ``in_cell``: in the YAML of a cell."""
+        """Return one line about what is missing and how to mend it; with ``in_cell`` in the YAML of a cell."""
         named = _named([self.name], in_cell)
         if self.follows is not None:
             moves = f"follows {self.follows} as its joint mimics it, and would be watched where it is at home"
@@ -58,7 +59,7 @@ class MovingLink:
 
 
 def moving_links(robot: Robot) -> list[MovingLink]:
-    """All links that an arm of ``robot`` moves, frames included."""
+    """Return all links that an arm of ``robot`` moves, including frames."""
     urdf = ET.fromstring(robot.urdf)
     tree, found = LinkTree(urdf, robot.name), []
     for link in urdf.findall("link"):
@@ -97,7 +98,7 @@ def unchecked_faults(robot: Robot, in_cell: bool = True) -> list[str]:
 
 
 def unchecked_notes(robot: Robot) -> Iterator[str]:
-    """Lines on what nothing keeps off anything by the maker's own will, or since it is drawn but hardly weighs."""
+    """Yield lines about links that are not watched, because the cell names them or because they are light."""
     if robot.unchecked_links:
         yield f"unchecked_links: nothing keeps {', '.join(robot.unchecked_links)} off anything"
     if frames := [link.name for link in moving_links(robot) if link.drawn and not link.is_body]:
@@ -106,11 +107,11 @@ def unchecked_notes(robot: Robot) -> Iterator[str]:
 
 
 def _lack_of(robot: Robot, arm: str) -> str | None:
-    """What leaves a whole arm without a distance that is kept; None where some are."""
+    """Return why a whole arm has no monitored pair; None if it has one."""
     joints = robot.arms[arm].joints
-    # A joint's index in Pinocchio's model is one more than in the vectors, since the world comes first.
+    # The index of a joint in Pinocchio's model is one more than its index in vectors, because the world comes first.
     of_body = {index: item.parentJoint - 1 for index, item in enumerate(robot.collision_model.geometryObjects)}
-    before_tool = joints[:-1] if len(joints) > 1 else joints  # the last joint moves the tool
+    before_tool = joints[:-1] if len(joints) > 1 else joints  # The last joint moves the tool.
     if not np.isin(before_tool, list(of_body.values())).any():
         return "no link between its base and its tool has a collision shape"
     pairs = robot.collision_model.collisionPairs
