@@ -1,7 +1,7 @@
 """Bimanual VR teleoperation and Cartesian control with a safe QP controller.
 
-These names are the fixed API. Everything else may move between versions. A name is imported when it is first used, so
-that a ROS node that only passes messages on need not wait for the solver and its compiled kernels.
+The names of this module are the fixed API. Everything else may move between versions. A name is imported when it is
+first used, so that a ROS node that only passes messages on need not wait for the solver and its compiled kernels.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from q2r2_control._lazy import lazy_exports
 
-if TYPE_CHECKING:  # "as" says to type checkers that a name is public
+if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.config.cell import Config as Config
     from q2r2_control.config.cell import load_config as load_config
     from q2r2_control.config.control import ControllerSettings as ControllerSettings

@@ -6,8 +6,8 @@ import sys
 
 
 def main() -> None:
-    """Run the command. Until it begins Ctrl-C ends it at once, without a traceback."""
-    # Matrices are small here: threads that wait for each other cost ten times what they do.
+    """Run the command. Until the command begins, Ctrl-C ends the program at once, without a traceback."""
+    # Matrices are small here. Threads that wait for each other take ten times the time of the computation.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     handler = signal.signal(signal.SIGINT, signal.SIG_DFL)
     from q2r2_control.cli.app import app
@@ -15,7 +15,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, handler)
     try:
         app()
-    except KeyboardInterrupt:  # while the command line is read
+    except KeyboardInterrupt:  # Ctrl-C was pressed while the command line was read.
         sys.exit(128 + signal.SIGINT)
 
 

@@ -1,4 +1,4 @@
-"""Names that a package exports without importing their modules before they are used."""
+"""Let a package export names whose modules are imported only when the names are used."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def lazy_exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """The ``__getattr__`` of a ``package``: ``modules`` maps each name to the module in it that has the name."""
+    """Return the ``__getattr__`` of a ``package``. ``modules`` maps each name to the package's module that has it."""
 
     def getattr_of_package(name: str) -> Any:
         if name not in modules:

@@ -1,4 +1,4 @@
-"""The words by which an operator calls the controls of an input device, and what is done with them."""
+"""The operator's words for the controls of an input device, and for their use."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class DeviceWords:
-    """Words of one device. A control without a noun is called by its name, as the cell's bindings do."""
+    """Words of one device. A control without a noun has its name in the cell's bindings."""
 
-    nouns: Mapping[str, str] = field(default_factory=dict, hash=False)  # by control
-    verbs: Mapping[str, str] = field(default_factory=dict, hash=False)  # of controls that are neither pressed nor held
-    absent: str = "nothing: no input is connected"  # while the device is not there; empty if its controls connect it
-    nobody: str = ""  # why no person presses anything; empty if a person does
+    nouns: Mapping[str, str] = field(default_factory=dict, hash=False)  # Nouns by control.
+    verbs: Mapping[str, str] = field(default_factory=dict, hash=False)  # By control, if not "press" and "hold".
+    absent: str = "nothing: no input is connected"  # Said while no device is there. Empty if its controls connect it.
+    nobody: str = ""  # Why no person presses anything; empty if a person does.
 
     def noun(self, control: str) -> str:
-        """The operator's word for ``control``, also where `` held`` or `` button`` follows its name."""
+        """Return the operator's word for ``control``. Its name may be followed by `` held`` or `` button``."""
         return re.sub(r"^(\w+)( button)?", lambda found: self.nouns.get(found[1], found[0]), control)
 
     def press(self, control: str) -> str:
-        """An instruction to use ``control`` once."""
+        """Return an instruction to use ``control`` once."""
         return f"{self.verbs.get(control, 'press')} {self.noun(control)}"
 
     def hold(self, control: str) -> str:
-        """An instruction to keep ``control`` in use."""
+        """Return an instruction to keep ``control`` in use."""
         return f"{self.verbs.get(control, 'hold')} {self.noun(control)}"
 
 
-NO_WORDS = DeviceWords()  # every control is called by its name
+NO_WORDS = DeviceWords()  # Every control has its name.
 QUEST_WORDS = DeviceWords(
     nouns={
         "lower": "A or X",

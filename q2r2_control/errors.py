@@ -13,7 +13,7 @@ class ConfigError(Q2R2Error):
     """A configuration cannot be used. The message names file, key and value, and says what is allowed.
 
     Attributes:
-        faults: A line for each fault, if more than one is known; else the message alone.
+        faults: A line for each fault if they are known; otherwise the message alone.
     """
 
     def __init__(self, message: str, faults: Sequence[str] = ()) -> None:
@@ -45,7 +45,7 @@ class RecordingError(Q2R2Error):
     """A recording cannot be read or replayed. The message names the file, what is wrong, and what is allowed."""
 
 
-NOT_RECORDED = 3  # exit code of a run that ended well, and whose recording did not
+NOT_RECORDED = 3  # Exit code of a run that ended well, but whose recording is not complete.
 
 
 def shown(value: object, length: int = 60) -> str:

@@ -1,4 +1,4 @@
-"""Events of the arms as data: a kind and its details. Code decides by the kind; :mod:`wording` makes sentences."""
+"""Events of the arms as data: a kind and its details. Code decides by the kind, and :mod:`wording` makes sentences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the packages of an extra are installed: the one line that every message about a missing package ends with."""
+"""Make the line that installs the packages of an extra. Every message about a missing package ends with this line."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ _CHECKOUT = Path(__file__).resolve().parents[1]
 
 
 def install_line(extra: str) -> str:
-    """The call of pip that installs an ``extra`` of this package, wherever it is typed.
+    """Return the pip command that installs an ``extra`` of this package, from any working directory.
 
-    The package is on no index of packages, so a checkout is named by its folder.
+    The package is on no package index, so a checkout is named by its folder.
     """
     if (_CHECKOUT / "pyproject.toml").is_file():
         return f"pip install -e '{_CHECKOUT}[{extra}]'"

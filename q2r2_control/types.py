@@ -171,7 +171,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """The view that a policy has of one tick: the state before the command, with the time of the loop's clock."""
+    """The data of one tick for a policy: the state before the command, with the time of the loop's clock."""
 
     time: float  # [s]
     state: RobotState
@@ -270,7 +270,7 @@ class StepReport:
     certified: bool  # Whether a stop is known that keeps all limits and distances.
     fallback: bool
     slack: float  # Largest violation of a row of unit norm [rad/s].
-    solve_time: float  # Time of the solver; 0 if it did not have to be asked [s].
+    solve_time: float  # Time of the solver [s]; 0 if the solver was not needed.
     tightest_pair: tuple[str, str] = ("", "")  # Names of the geometries of the pair with the least margin.
     margin: float = math.inf  # Distance of that pair less the distance that it keeps [m].
     unsolved: int = 0  # Bit i is set if the QP of substep i had no solution in time, so that the stop was executed.
@@ -313,7 +313,7 @@ class ArmTarget:
 
     @property
     def command(self) -> pin.SE3 | None:
-        """The target for the controller that brings the measured tool to ``pose``."""
+        """Return the target for the controller that brings the measured tool to ``pose``."""
         return None if self.pose is None else self.command_for(self.pose)
 
     def command_for(self, tool: pin.SE3) -> pin.SE3:
@@ -332,5 +332,5 @@ class ArmTiming:
 
     @property
     def lag(self) -> float:
-        """The greatest lag of the arm by now. While its next message is missing, the arm may be standing still."""
+        """The greatest possible lag of the arm now. While its next message is missing, the arm may stand still."""
         return (self.behind or 0.0) + max(self.silent - self.period, 0.0)

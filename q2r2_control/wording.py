@@ -20,7 +20,7 @@ _LIMITS = {
 
 
 def sentence(reason: Reason, words: DeviceWords | None = None) -> str:
-    """The sentence of ``reason``; with ``words``, controls are called as an operator of that device calls them."""
+    """Return the sentence of ``reason``. With ``words``, controls have the names of that device's operator."""
     fields: dict[str, Any] = {name: _text(value) for name, value in reason.detail.items()}
     if words is not None and (control := reason.detail.get("control")) is not None:
         fields["control"] = words.noun(control)

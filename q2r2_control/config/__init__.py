@@ -1,1 +1,1 @@
-"""Configuration: the YAML of a cell as checked, immutable settings. It imports nothing of the layers above."""
+"""Configuration: a cell's YAML as checked, immutable settings. This package imports nothing from the layers above."""

@@ -12,7 +12,7 @@ from q2r2_control.config.strict import StrictModel
 from q2r2_control.errors import ConfigError
 
 Side = Literal["left", "right"]
-# The ranges are there to catch millimetres and degrees.
+# The ranges detect values in millimetres or degrees.
 Coordinate = Annotated[float, Field(ge=-20, le=20)]  # [m]
 Extent = Annotated[float, Field(gt=0, le=20)]  # [m]
 Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]  # [rad]
@@ -22,28 +22,28 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Metres3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description="x, y, z [m]")]
 Radians3 = Annotated[tuple[Angle, Angle, Angle], Field(description="roll, pitch, yaw [rad]")]
 Colour = tuple[Share, Share, Share, Share]
-_USUAL_RADIUS = 0.03  # of an object of which nothing is said: more than most grippers open by half [m]
+_USUAL_RADIUS = 0.03  # Default radius of a held object: more than half the opening of most grippers [m].
 
 
 def _beside_the_file(value: str, info: ValidationInfo) -> str:
-    """A relative path as an absolute one where the folder of the YAML has such a file or folder."""
+    """Return a relative path with the folder of the YAML before it, if that folder has such a file or folder."""
     folder: Path | None = (info.context or {}).get("folder")
-    # A model without ending is a name, as in robots/NAME.urdf.
+    # A model without a file ending is the NAME in robots/NAME.urdf.
     path = f"robots/{value}.urdf" if info.field_name == "model" and not Path(value).suffix else value
     try:
         return str(folder / path) if folder is not None and value and (folder / path).exists() else value
-    except (OSError, ValueError):  # a name that no file can have; reading it will say so
+    except (OSError, ValueError):  # No file can have this name. The reader of the file says so.
         return value
 
 
 def _by_joint(value: object) -> object:
-    """Refuses a list or a number, whose kind pydantic would ask for by a name that YAML has not."""
+    """Refuse a list or a number. The message of pydantic would name a type that does not exist in YAML."""
     if not isinstance(value, Mapping):
         raise ValueError("allowed: limits by joint, such as {A2: 5.4}")
     return value
 
 
-# Looked up from the folder of the YAML first, then from the working directory, then among the shipped files.
+# A path is looked up from the folder of the YAML first, then from the working directory, then among the shipped files.
 LocalPath = Annotated[str, AfterValidator(_beside_the_file)]
 XacroArgs = Annotated[dict[str, str | bool | int | float], Field(description="of a .xacro model, by name")]
 
@@ -110,7 +110,7 @@ class HeldObjectConfig(StrictModel):
 
     @property
     def radius(self) -> float:
-        """Of the ball that stands for it where it is no box [m]."""
+        """The radius of the ball that stands for the object if it is not a box [m]."""
         return _USUAL_RADIUS if self.sphere is None else self.sphere
 
 
@@ -177,7 +177,7 @@ class ArmConfig(StrictModel):
 
     @property
     def named_tip(self) -> str | None:
-        """The arm's last link, where the file names it."""
+        """The arm's last link; None if the file does not name it."""
         return self.tip or self.tool.link
 
 

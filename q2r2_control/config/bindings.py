@@ -1,4 +1,4 @@
-"""Actions of a hand's controls: one for each gesture, or nothing."""
+"""Actions of a hand's controls. Each gesture has one action or none."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from q2r2_control.types import QUEST_CONTROLS, DeviceControls
 
 
 class Action(StrEnum):
-    """Actions of a hand's controls: see ``MEANINGS``."""
+    """Actions of a hand's controls. Their meanings are in ``MEANINGS``."""
 
     NONE = "none"
-    # Once, when a control was tapped, or held for a while.
+    # These actions happen once, when a control was tapped or held for a while.
     PAUSE_TOGGLE = "pause_toggle"
     GRIPPER_TOGGLE = "gripper_toggle"
     HOME = "home"
@@ -28,7 +28,7 @@ class Action(StrEnum):
     RECORD_SUCCESS = "record_success"
     RECORD_FAILURE = "record_failure"
     RECORD_MARK = "record_mark"
-    # For as long as a trigger or stick is held.
+    # These actions last for as long as a trigger or stick is held.
     DEAD_MAN = "dead_man"
     PRECISION = "precision"
     ROTATION_LOCK = "rotation_lock"
@@ -42,7 +42,7 @@ LASTING = frozenset(
 
 
 class Gesture(StrEnum):
-    """How a control is used. ``DOWN`` is its beginning, which only stops an arm that it pauses."""
+    """The use of a control. ``DOWN`` is the beginning of a press, which only stops an arm that this control pauses."""
 
     DOWN = "down"
     TAP = "tap"
@@ -72,7 +72,7 @@ BUTTONS = ("lower", "upper")
 TRIGGERS = ("trigger", "grip")
 HELD = (*TRIGGERS, "stick_up", "stick_down", "stick_left", "stick_right")
 CONTROLS = (*BUTTONS, *HELD)
-# The button or axis of a device that each control is, and the way it goes.
+# The button or axis of a device for each control, and the axis's direction.
 DEVICE_NAMES: dict[str, tuple[str, float]] = {
     "lower": ("button_lower", 1.0),
     "upper": ("button_upper", 1.0),
@@ -87,7 +87,7 @@ _SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold"}
 
 
 class Binding(NamedTuple):
-    """One gesture of one control, and what it does."""
+    """One gesture of one control, and its action."""
 
     control: str
     gesture: Gesture
@@ -95,12 +95,12 @@ class Binding(NamedTuple):
 
     @property
     def field(self) -> str:
-        """The setting's name."""
+        """The name of the setting."""
         return ("" if self.control in CONTROLS else "device.") + self.control + _SUFFIXES[self.gesture]
 
     @property
     def words(self) -> str:
-        """As an operator calls it."""
+        """The operator's words for this gesture of the control."""
         return f"{self.control} held" if self.gesture is Gesture.HOLD else self.control
 
 
@@ -156,7 +156,7 @@ class BindingSettings(StrictModel):
         return self
 
     def _allow(self, binding: Binding) -> None:
-        """Raises ValueError for an action that its gesture is too slow, too coarse or too ambiguous for."""
+        """Raise ValueError if the gesture is too slow, too coarse or too ambiguous for its action."""
         control, gesture, action = binding
         if action is Action.PAUSE_TOGGLE and gesture is not Gesture.TAP:
             raise ValueError(f"{binding.field} is pause_toggle, which must not wait; allowed: {control}")
@@ -184,7 +184,7 @@ class BindingSettings(StrictModel):
                 raise ConfigError(f"{key} = {binding.action}: {device} has no {no}; allowed: {has}")
 
     def bound(self) -> Iterator[Binding]:
-        """All that is bound, control by control."""
+        """Yield all bindings, control by control."""
         for control in (*CONTROLS, *self.of_device):
             for gesture in _SUFFIXES:
                 if (action := self.action_of(control, gesture)) is not Action.NONE:
@@ -192,21 +192,21 @@ class BindingSettings(StrictModel):
 
     @property
     def of_device(self) -> tuple[str, ...]:
-        """Controls that only the device has, each once."""
+        """The controls that only the device has, each once."""
         return tuple(dict.fromkeys(key.removesuffix(_SUFFIXES[Gesture.HOLD]) for key in self.device))
 
     def meanings(self) -> dict[str, str]:
-        """In words what each control of a hand does that does something."""
+        """Return the action of each bound gesture in words, by the operator's words for the gesture."""
         words = {binding.words: MEANINGS[binding.action] for binding in self.bound()}
         return words | {"lower and upper together": "the headset's alignment: stops both arms until they are let go"}
 
     def action_of(self, control: str, gesture: Gesture) -> Action:
-        """The action of a control's gesture; its beginning does nothing by itself."""
+        """Return the action of a control's gesture. The gesture ``DOWN`` has no action."""
         if gesture is Gesture.DOWN:
             return Action.NONE
         key = control + _SUFFIXES[gesture]
         return getattr(self, key) if control in CONTROLS else self.device.get(key, Action.NONE)
 
     def words_of(self, action: str) -> str | None:
-        """The gesture that an action is bound to, as an operator calls it."""
+        """Return the operator's words for the gesture to which an action is bound; None if it is not bound."""
         return next((binding.words for binding in self.bound() if binding.action == action), None)

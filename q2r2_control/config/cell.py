@@ -1,6 +1,6 @@
 """The YAML of a cell: pydantic models and :func:`load_config`.
 
-Every key has a unit and a range here; ``config/dual_iiwa7.yaml`` shows them all with comments.
+Every key has a unit and a range here. The file ``config/dual_iiwa7.yaml`` shows all keys with comments.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 
 try:
-    from yaml import CSafeLoader as _SafeLoader  # libyaml reads a cell ten times as fast
-except ImportError:  # a PyYAML that was built without libyaml
+    from yaml import CSafeLoader as _SafeLoader  # With libyaml, a cell is read ten times as fast.
+except ImportError:  # PyYAML was built without libyaml.
     from yaml import SafeLoader as _SafeLoader  # type: ignore[assignment]
 
-AUTO: Literal["auto"] = "auto"  # the loop's rate is chosen when a run in real time begins
+AUTO: Literal["auto"] = "auto"  # The loop's rate is chosen when a run in real time begins.
 HIGHEST_FITTING_RATE_HZ = 1000.0
 
 
@@ -138,7 +138,7 @@ class MujocoConfig(StrictModel):
     position_damping_ratio: float = Field(1.0, gt=0, le=5, description="of the position servos")
     rotor_share: float = Field(
         1.0,
-        ge=0.01,  # light wrist joints without any could not be integrated
+        ge=0.01,  # Light wrist joints without any rotor inertia could not be integrated.
         le=1,
         description="of the rotors' inertia that the joints feel; a torque loop on the joint hides most",
     )
@@ -200,23 +200,23 @@ class Config(StrictModel):
 
     @property
     def simulated_cameras(self) -> dict[str, CameraConfig]:
-        """Those of the simulated cell; the others are on ROS topics."""
+        """The cameras of the simulated cell, by name. The others are on ROS topics."""
         return {name: camera for name, camera in self.cameras.items() if camera.topic is None}
 
     @property
     def nominal_rate_hz(self) -> float:
-        """Rate of the loop [Hz]; the highest one that may be chosen, as long as it is ``auto``."""
+        """The rate of the loop [Hz]. While it is ``auto``, this is the highest rate that may be chosen."""
         return HIGHEST_FITTING_RATE_HZ if self.loop_rate_hz == AUTO else float(self.loop_rate_hz)
 
     @property
     def gripper_delay(self) -> float:
-        """The longest time until a gripper has a command and its opening is measured, beyond a few ticks [s]."""
+        """The longest time until a gripper has its command and its opening is measured, besides a few ticks [s]."""
         by_modbus = any(isinstance(cabinet.gripper, ModbusGripperConfig) for cabinet in self.fri.values())
         return MODBUS_DELAY if by_modbus else 0.0
 
     @property
     def note_on_grippers(self) -> str | None:
-        """A line about a control that leads grippers where no arm has one; None where all is well."""
+        """A line about a control that is bound to a gripper if no arm has a gripper; None otherwise."""
         analog = self.teleop.bindings.words_of(Action.GRIPPER_ANALOG)
         moved = any(arm.gripper.joints for arm in self.arms.values()) or any(cell.gripper for cell in self.fri.values())
         if analog is None or moved or self.controller is ControllerKind.EXTERNAL:
@@ -224,12 +224,12 @@ class Config(StrictModel):
         return f"teleop.bindings: {analog} is gripper_analog, but no arm has a gripper; allowed: arms.*.gripper.joints"
 
     def model_of(self, arm: str) -> str:
-        """The model that an arm is, or is part of."""
+        """Return the model of an arm, or the robot model of which the arm is a part."""
         part_of = self.robot or next(made for side, made in self.arms.items() if side == arm)
         return part_of.model or ""
 
     def named_tool_frame(self, arm: str) -> str | None:
-        """Name in the cell of the link that the operator moves, where the file names that link."""
+        """Return the name in the cell of the link that the operator moves; None if the file does not name it."""
         made = next(made for side, made in self.arms.items() if side == arm)
         if made.tool.model is not None:
             return None if made.tool.frame is None else f"{arm}_{made.tool.frame}"
@@ -242,9 +242,11 @@ class Config(StrictModel):
 def load_config(path: str | os.PathLike[str]) -> Config:
     """Read and check a cell's YAML.
 
-    ``path`` is looked up from the working directory first, then among the files shipped with the package. Relative
-    paths in the file are looked up from its own folder before that.
-    Raises :class:`ConfigError` with one line that names file, key, value and what is allowed.
+    ``path`` is looked up from the working directory first, and then among the files shipped with the package. Relative
+    paths in the file are first looked up from its own folder.
+
+    Raises:
+        ConfigError: If the file cannot be used. One line names file, key, value and what is allowed.
     """
     file = find_resource(path)
     try:
@@ -255,19 +257,21 @@ def load_config(path: str | os.PathLike[str]) -> Config:
 
 
 def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = None) -> Config:
-    """Check the YAML of a cell that was read from ``path``; paths in it are looked up from a ``folder`` first.
+    """Check the YAML of a cell that was read from ``path``. Paths in it are first looked up from a ``folder``.
 
-    Raises :class:`ConfigError` as :func:`load_config` does.
+    Raises:
+        ConfigError: As in :func:`load_config`.
     """
     try:
         data = yaml.load(text, Loader=_Loader)
-    # Values such as dates and huge integers, and nesting without end, raise Python's own exceptions.
+    # Values such as dates and huge integers, and too deep nesting, raise Python's own exceptions.
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path}: not YAML: {_line(error)}") from error
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}")
     try:
-        # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
+        # The check is strict, because `off` would otherwise count as 0.0. The data pass through JSON, so that sequences
+        # may become tuples, and names enums, in spite of the strict check.
         content = json.dumps(data, default=str)
         config = validated(Config, "", content, as_json=True, strict=True, context={"folder": folder})
         return _within_driver_limits(config)
@@ -277,15 +281,16 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
         raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
 
 
-# A KUKA driver's joints end a degree before the model's, and its soft limits 5 degrees before that [rad]. Beyond them
-# lbr_fri_ros2_stack shuts the connection, and a cabinet ends its session. The driver's safe_stop does so one step at a
-# joint's fastest before the ends, 1.8 degrees at most where commands are due every 10 ms, which the 5 degrees include.
+# A KUKA driver's joint limits are one degree inside the model's, and its soft limits 5 degrees inside these [rad].
+# Beyond the limits, lbr_fri_ros2_stack closes the connection, and a cabinet ends its session. The driver's safe_stop
+# does so one step at a joint's greatest speed before the limits. This step is 1.8 degrees at most if commands are due
+# every 10 ms, which the 5 degrees include.
 _DRIVER_MARGIN = 0.105
-# Commands come unevenly. One more than usual in a period of the driver makes its filter, of time constant T, faster by
-# the time between commands / T, an eighth for 5 ms and 40 ms; one that was late by d adds (d / T)^2 / 2. A joint beyond
-# its velocity limit shuts the connection as well.
+# Commands come unevenly. One more command than usual in a period of the driver speeds up its filter of time constant T
+# by the time between commands / T, which is an eighth for 5 ms and 40 ms. A command that was late by d adds
+# (d / T)^2 / 2. A joint beyond its velocity limit closes the connection as well.
 _DRIVER_SPEED = 0.85
-# Answers that catch up with a cabinet's clock show it 1.05 of the reference's speeds (plants.fri.answers).
+# If answers catch up with a cabinet's clock, the cabinet sees 1.05 times the reference's speeds (plants.fri.answers).
 _CABINET_SPEED = 0.95
 
 
@@ -303,13 +308,13 @@ def _within_driver_limits(config: Config) -> Config:
 
 
 class _Loader(_SafeLoader):
-    """Stricter than plain YAML 1.1, where a later key silently replaces an earlier one and 1e-3 is a text."""
+    """A stricter loader than that of YAML 1.1, where a later key silently replaces an equal one, and 1e-3 is a text."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
-                continue  # `<<: *other`: keys of the mapping itself may replace the merged ones
+                continue  # With `<<: *other`, keys of the mapping itself may replace the merged ones.
             key = self.construct_object(key_node, deep=True)
             if key in seen:
                 raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
@@ -323,5 +328,5 @@ _Loader.add_implicit_resolver(
 
 
 def _line(text: object) -> str:
-    """``text`` as one line of bounded length."""
+    """Return ``text`` as one line of bounded length."""
     return " ".join(str(text).split())[:300]

@@ -1,4 +1,4 @@
-"""Everything a user tunes about motion control, with units and ranges."""
+"""All settings of motion control, with units and ranges."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from q2r2_control.config.strict import StrictModel, validated
 from q2r2_control.errors import ConfigError, check_kind, shown
 
 EQUAL = "equal"
-_LIVE = "live"  # marks a setting that may change while a controller runs
+_LIVE = "live"  # Marks a setting that may change while a controller runs.
 LiveFloat = Annotated[float, _LIVE]
 _Weight = Annotated[float, Field(ge=0, le=1)]
 Weights = tuple[_Weight, _Weight, _Weight]
 Distance = Annotated[float, Field(ge=0, le=0.2)]  # [m]
-ObjectDistance = Annotated[
-    float, Field(ge=-0.05, le=0.2)
-]  # below 0: how far a box that is known roughly may overlap [m]
+# A negative distance is the allowed overlap of a box whose size is known only roughly [m].
+ObjectDistance = Annotated[float, Field(ge=-0.05, le=0.2)]
 LinkPattern = Annotated[str, Field(min_length=1)]
 ObstacleName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 
@@ -26,10 +25,10 @@ ObstacleName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_leng
 class DistanceSettings(StrictModel):
     """How far pairs of bodies stay apart, by what they are; left out: ``min_distance``.
 
-    A gripper's joints move a finger, and a tool (the hand) carries it. An obstacle stands in the cell, and the floor is
-    one. An object is the body that ``gripper.object`` describes, while it is held. ``arm_self`` is all of one arm
-    against itself and against the robot that it is a part of, its own object included. The other classes without
-    obstacles are about different arms.
+    A finger is moved by a gripper's joints, and carried by a tool (the hand). An obstacle stands in the cell, and the
+    floor counts as an obstacle. An object is the body that ``gripper.object`` describes, while it is held. ``arm_self``
+    is for all bodies of one arm among themselves and with the rest of its robot. They include the arm's own object. The
+    other classes without obstacles are for pairs of different arms.
     """
 
     arm_arm: Distance | None = Field(None, description="links of two arms, bases included [m]")
@@ -68,7 +67,7 @@ class ContactPair(StrictModel):
     speed: float = Field(0.03, ge=0.005, le=0.2, description="closing speed before and in contact [m/s]")
 
 
-_LONGEST_SOLVE = 0.005  # in real time, where a cell says nothing [s]
+_LONGEST_SOLVE = 0.005  # Default of solve_time_limit in real time [s].
 
 
 class ControllerSettings(StrictModel):
@@ -153,28 +152,32 @@ class ControllerSettings(StrictModel):
         return names
 
     def without_contact(self) -> ControllerSettings:
-        """The same, for modes in which nothing gives way: there ``contact_allowed`` allows nothing."""
+        """Return the settings for modes in which the arms do not yield. ``contact_allowed`` is empty there."""
         return self.model_copy(update={"contact_allowed": ()}) if self.contact_allowed else self
 
     def with_solver(self, name: str | None) -> ControllerSettings:
-        """The same with the solver called ``name``, whose own defaults hold if it is another one; None: as it is."""
+        """Return the settings with the solver called ``name``; None keeps the solver.
+
+        Another solver has its own default options.
+        """
         if name is None or name == self.solver:
             return self
         return self.model_copy(update={"solver": name, "solver_options": {}})
 
     def timed(self, realtime: bool) -> ControllerSettings:
-        """The same with a ``solve_time_limit`` in real time, and without one in simulated time.
+        """Return the settings with a ``solve_time_limit`` in real time, and without one in simulated time.
 
-        Whether a solution is late depends on the computer, and a repeatable run must not. In real time a solver that
-        blocks must not keep the arms waiting.
+        A repeatable run must not depend on the speed of the computer, on which it depends whether a solution is late.
+        In real time, the arms must not wait for a solver that blocks.
         """
         limit = (self.solve_time_limit or _LONGEST_SOLVE) if realtime else None
         return self.model_copy(update={"solve_time_limit": limit})
 
     def changed(self, values: Mapping[str, Any]) -> ControllerSettings:
-        """The same with other ``values`` of what is in ``LIVE``, by name.
+        """Return the settings with other ``values`` of settings in ``LIVE``, by name.
 
-        Raises :class:`ConfigError` for a name that is not among them and for a value that is not allowed.
+        Raises:
+            ConfigError: If a name is not in ``LIVE``, or if a value is not allowed.
         """
         check_kind("control", values, Mapping, f"new values by name, of {', '.join(LIVE)}")
         for name, value in values.items():
@@ -185,14 +188,14 @@ class ControllerSettings(StrictModel):
 
     @property
     def largest_distance(self) -> tuple[str, float]:
-        """Key and value of the largest distance that some pair may have to keep [m]."""
+        """Key and value of the largest distance in these settings that a pair may have to keep [m]."""
         by_class = {f"distances.{name}": value for name, value in self.distances if value is not None}
         by_name = {f"pairs[{i}].distance": named.distance for i, named in enumerate(self.pairs)}
         return max((("min_distance", self.min_distance), *by_class.items(), *by_name.items()), key=lambda item: item[1])
 
 
 def check_priority(priority: str, arms: Collection[str]) -> None:
-    """Raises :class:`ConfigError` unless ``priority`` is ``equal`` or one of ``arms``."""
+    """Raise :class:`ConfigError` unless ``priority`` is ``equal`` or one of ``arms``."""
     if priority != EQUAL and priority not in arms:
         raise ConfigError(f"control.priority = {priority!r:.60}: allowed here: {', '.join((EQUAL, *arms))}")
 
@@ -234,7 +237,8 @@ class AdmittanceSettings(StrictModel):
     damping_ratio: float = Field(1.0, ge=0.1, le=5, description="1 returns fastest without overshoot")
     mass: float = Field(10.0, ge=0.5, le=200, description="virtual mass of the tool [kg]")
     inertia: float = Field(0.3, ge=0.01, le=20, description="virtual inertia of the tool [kg m^2]")
-    # The weight of 0.2 kg, which the tool's model may be off by, and that weight 0.15 m from the tool frame.
+    # The tool's model may be wrong by the weight of 0.2 kg. The torque is that of this weight, 0.15 m from the tool
+    # frame.
     force_dead_band: float = Field(2.0, ge=0, le=50, description="a smaller force moves nothing [N]")
     torque_dead_band: float = Field(0.3, ge=0, le=10, description="a smaller torque moves nothing [Nm]")
     filter_time: float = Field(0.01, ge=0, le=0.5, description="time constant of the wrench's low-pass [s]")
@@ -246,8 +250,8 @@ def _live_fields(settings: type[StrictModel]) -> tuple[str, ...]:
     return tuple(name for name, field in settings.model_fields.items() if _LIVE in field.metadata)
 
 
-LIVE = _live_fields(ControllerSettings)  # names of what may change while a controller runs
-LIVE_IMPEDANCE = _live_fields(ImpedanceSettings)  # the same, of an impedance
+LIVE = _live_fields(ControllerSettings)  # Names of the settings that may change while a controller runs.
+LIVE_IMPEDANCE = _live_fields(ImpedanceSettings)  # The same for an impedance.
 
 
 class SupervisionSettings(StrictModel):

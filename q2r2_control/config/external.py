@@ -1,4 +1,4 @@
-"""The block ``external`` of a cell's YAML: controllers of others that move its arms, and where they are in ROS."""
+"""The block ``external`` of a cell's YAML: other controllers that move its arms, and their ROS names."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FrameName = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^\S+$")
 
 
 class ControllerKind(StrEnum):
-    """Who turns targets into the arms' motion."""
+    """The kind of controller that turns targets into the arms' motion."""
 
     BUILTIN = "builtin"
     EXTERNAL = "external"
@@ -73,7 +73,7 @@ class ExternalGripper(GripperSettings):
     topic: RosName | None = Field(None, description="its action or topic; none: /q2r2/left_gripper/gripper_cmd")
 
     def settings(self) -> GripperSettings:
-        """How it is told to open and close, without where."""
+        """Return the settings without the topic."""
         return GripperSettings(**self.model_dump(exclude={"topic"}))
 
 
@@ -86,7 +86,7 @@ class GuardLimits(StrictModel):
     max_angular_acceleration: float | None = Field(None, gt=0, le=400, description="of the target's rotation [rad/s^2]")
 
     def over(self, guard: GuardSettings) -> GuardSettings:
-        """``guard`` with what is given here in its place."""
+        """Return ``guard`` with the limits that are given here."""
         return guard.model_copy(update=self.model_dump(exclude_none=True))
 
 
@@ -153,17 +153,17 @@ class ExternalConfig(StrictModel):
         return self.mode is Mode.FILTERED
 
     def topic(self, arm: str) -> str:
-        """Where an arm's targets or joint commands go."""
+        """Return the topic of an arm's targets or joint commands."""
         made = self.arm(arm)
         return made.target_topic or self.terms.topic_of(made.ctrl_prefix)
 
     def arm(self, name: str) -> ExternalArm:
-        """One arm's controller."""
+        """Return one arm's controller."""
         return next(arm for side, arm in self.arms.items() if side == name)
 
 
 def check_external(kind: ControllerKind, external: ExternalConfig | None, arms: Iterable[str]) -> None:
-    """Raise :class:`ConfigError` unless there is an ``external`` for all arms, or none is wanted."""
+    """Raise :class:`ConfigError` unless ``external`` has all arms, or is None with the built-in controller."""
     if kind is ControllerKind.BUILTIN:
         if external is not None:
             raise ConfigError("external: allowed with controller: external only")
@@ -174,7 +174,7 @@ def check_external(kind: ControllerKind, external: ExternalConfig | None, arms: 
         raise ConfigError(f"external.arms: without {', '.join(sorted(missing))}; needed: {', '.join(arms)}")
     if surplus := set(external.arms) - set(arms):
         raise ConfigError(f"external.arms.{sorted(surplus)[0]}: the cell has no such arm; allowed: {', '.join(arms)}")
-    # Two arms that share a topic would be pulled to and fro.
+    # Two arms that share a topic would get the targets of both in turn.
     topics = [external.topic(arm) for arm in external.arms]
     frames = [made.tool_frame for made in external.arms.values() if made.tool_frame is not None]
     for what, values in (("commands", topics), ("tool_frame", frames)):
@@ -183,7 +183,7 @@ def check_external(kind: ControllerKind, external: ExternalConfig | None, arms: 
 
 
 def describe(external: ExternalConfig) -> dict[str, str]:
-    """The driven arms and their drives, one line an arm."""
+    """Return one line about the controller of each arm, by arm."""
     preset = external.terms
     source = "what the built-in controller makes of the hand's target" if external.filtered else "the hand's target"
     lines: dict[str, str] = {}

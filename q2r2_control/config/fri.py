@@ -1,4 +1,4 @@
-"""Where KUKA's cabinets are, whose Fast Robot Interface moves the arms, and where the arms' grippers are."""
+"""Settings of KUKA's cabinets, whose Fast Robot Interface moves the arms, and of the arms' grippers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ class GripperIoConfig(StrictModel):
     digital: bool = Field(False, description="the output is on or off, and not analog")
 
 
-# An opening of a gripper on Modbus is measured, and its newest command there, within this time, or it is not known [s].
+# A gripper on Modbus gets its newest command and measures its opening within this time. Otherwise the opening counts as
+# not known [s].
 MODBUS_DELAY = 0.15
 _ENDPOINT = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:/]+)(?::([0-9]{1,5}))?")
 _Count = Annotated[int, Field(ge=0, le=255)]
@@ -53,13 +54,13 @@ class ModbusGripperConfig(StrictModel):
 
     @property
     def endpoint(self) -> tuple[str, int] | None:
-        """Host and port of Modbus TCP; None: ``modbus`` is a serial device."""
+        """Host and port of Modbus TCP; None if ``modbus`` is a serial device."""
         found = _ENDPOINT.fullmatch(self.modbus)
         return None if found is None else (found[1].strip("[]"), int(found[2] or 502))
 
 
 def _kind(gripper: Any) -> str:
-    """The tag of a gripper's model. Keys in messages are without tags, which stand in brackets."""
+    """Return the tag of a gripper's model. Tags stand in brackets, so that they are left out of keys in messages."""
     by_modbus = "modbus" in gripper if isinstance(gripper, dict) else isinstance(gripper, ModbusGripperConfig)
     return "[modbus]" if by_modbus else "[io]"
 

@@ -1,4 +1,4 @@
-"""Another mount of an arm in the text of a cell, whose comments stay."""
+"""Replace the mount of an arm in the text of a cell. The comments of the text are kept."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from q2r2_control.errors import ConfigError
 
 
 def with_mount(text: str, side: str, position: Sequence[float], rpy: Sequence[float]) -> str:
-    """The YAML ``text`` of a cell with another ``arms.SIDE.mount`` [m, rad].
+    """Return the YAML ``text`` of a cell with another ``arms.SIDE.mount`` [m, rad].
 
-    Raises :class:`ConfigError` where the file does not have that mount as a block of its own.
+    Raises:
+        ConfigError: If the text does not have that mount as a block of its own.
     """
     node: yaml.Node | None = yaml.compose(text, Loader=yaml.SafeLoader)
     for key in ("arms", side, "mount"):
@@ -35,7 +36,7 @@ def with_mount(text: str, side: str, position: Sequence[float], rpy: Sequence[fl
 
 
 def _child(node: yaml.Node | None, key: str) -> yaml.Node | None:
-    """The value of a mapping's ``key``, unless it stands elsewhere, as that of an alias does."""
+    """Return the value of a mapping's ``key``; None if it stands elsewhere in the text, as that of an alias."""
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
     return next(
         (value for name, value in pairs if name.value == key and value.start_mark.index >= name.end_mark.index), None

@@ -1,4 +1,4 @@
-"""An obstacle that comes, moves and goes while a controller runs."""
+"""An obstacle that appears, moves and disappears while a controller runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from q2r2_control.errors import ConfigError, check_kind, shown
 
 
 class MovingObstacle(ObstacleConfig):
-    """Its shape and pose in the world, and how fast any of its points may move from then on."""
+    """The shape and pose of an obstacle in the world, and the greatest speed of any of its points from then on."""
 
     shape: Literal["box", "sphere", "capsule"]
     speed: float = Field(ge=0, le=10, description="no point of it ever gets faster; 0: it stays [m/s]")
@@ -27,12 +27,12 @@ class MovingObstacle(ObstacleConfig):
 
     @property
     def slower(self) -> float:
-        """By how much its points are slower now than they may get [m/s]."""
+        """The difference between the greatest speed of its points and their speed now [m/s]."""
         return 0.0 if self.acceleration is None or self.speed_now is None else self.speed - self.speed_now
 
     @property
     def rise(self) -> float:
-        """How long they take to make up for that at least, more than 0 [s]."""
+        """The least time in which its points can reach their greatest speed, more than 0 [s]."""
         return max(self.slower / (self.acceleration or 1.0), 1e-9)
 
     @model_validator(mode="after")
@@ -43,14 +43,14 @@ class MovingObstacle(ObstacleConfig):
 
 
 class ObstacleReport(NamedTuple):
-    """An obstacle as it was reported last."""
+    """The last report of an obstacle."""
 
     obstacle: MovingObstacle
-    age: float  # that its pose has now [s]
+    age: float  # The age of its pose now [s].
 
 
 def check_obstacle(name: str, obstacle: MovingObstacle | None, names: Collection[str]) -> None:
-    """Raises :class:`ConfigError` for a name that ``control.moving_obstacles`` lacks and for what is no obstacle."""
+    """Raise :class:`ConfigError` for a name that is not in ``names``, or if ``obstacle`` has another type."""
     if not isinstance(name, str) or name not in names:
         allowed = ", ".join(names) or "none; control.moving_obstacles names them"
         raise ConfigError(f"moving obstacle {shown(name)}: allowed: {allowed}")

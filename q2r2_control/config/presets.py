@@ -1,7 +1,7 @@
-"""Terms of community controllers: topic, type, frame, rate, activation, limits.
+"""Properties of community controllers: topic, message type, rate, activation, limits.
 
 ``{ctrl}`` stands for the controller's own name with its namespace, the parameter ``ctrl_prefix`` of an arm controller.
-``{robot}`` stands for that namespace alone. An installed package adds a controller by an entry point of
+``{robot}`` stands for that namespace alone. An installed package can add a controller by an entry point of
 ``q2r2_control.presets`` that is a :class:`Preset` of the same name.
 """
 
@@ -19,15 +19,15 @@ POSE = "geometry_msgs/msg/PoseStamped"
 
 
 class Hold(StrEnum):
-    """Messages to a controller while its arm is paused and its target stands still."""
+    """The messages to a controller while its arm is paused and its target stands still."""
 
-    REPEAT = "repeat"  # the last target, stamped anew
-    SILENCE = "silence"  # nothing: it holds by itself, and a stale target is its own reason to stop
+    REPEAT = "repeat"  # The last target with a new stamp.
+    SILENCE = "silence"  # No messages. The controller then holds the arm by itself, and stops for an old target.
 
 
 # For controllers without limits of their own.
 _CAREFUL = GuardSettings()
-# The built-in controller keeps its own limits, which are narrower; what is left is that no target jumps.
+# The built-in controller keeps its own limits, which are narrower. These limits only prevent jumps of a target.
 _WIDE = GuardSettings(
     max_velocity=3.0, max_acceleration=50.0, max_angular_velocity=12.0, max_angular_acceleration=200.0
 )
@@ -35,27 +35,27 @@ _WIDE = GuardSettings(
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """One controller's terms."""
+    """The properties of one controller."""
 
     name: str
-    activation: str  # what it takes for a target to count
-    topic: str = "{ctrl}/target_frame"  # of its target
-    message: str = POSE  # type of its target
-    rate: float = 100.0  # that it is driven at [Hz]
-    lowest_rate: float = 50.0  # below which it stops or stutters [Hz]
+    activation: str  # The conditions under which it follows a target, in words.
+    topic: str = "{ctrl}/target_frame"  # Topic of its target.
+    message: str = POSE  # Message type of its target.
+    rate: float = 100.0  # Rate at which targets are sent [Hz].
+    lowest_rate: float = 50.0  # Below this rate, it stops or moves unevenly [Hz].
     hold: Hold = Hold.REPEAT
     guard: GuardSettings = _CAREFUL
-    output: str = "none"  # of cartesian_controller in mode filtered: what joints it commands itself, if any
-    zero_wrench: str | None = None  # topic where a zero wrench is sent, without which it may push
-    command_type: str | None = None  # service that has to be told that targets are poses, at each of its starts
+    output: str = "none"  # The kind of joint commands that cartesian_controller sends itself in mode filtered, if any.
+    zero_wrench: str | None = None  # Topic for a zero wrench. Without this message, the controller may push.
+    command_type: str | None = None  # Service that sets the type of targets to poses. It is called at each start.
 
     @property
     def takes_poses(self) -> bool:
-        """Whether it takes tool poses; other presets take joint positions."""
+        """Whether the controller takes tool poses. Other presets take joint positions."""
         return self.message == POSE
 
     def topic_of(self, ctrl_prefix: str) -> str:
-        """Where the controller with this name takes its targets."""
+        """Return the topic on which the controller with this name takes its targets."""
         return self.topic.format(ctrl=ctrl_prefix, robot=ctrl_prefix.rpartition("/")[0])
 
 
@@ -63,7 +63,8 @@ _LATCHES = "active; keeps the last target for ever"
 BUILTIN = Preset("builtin", "always on", rate=100.0, lowest_rate=20.0, hold=Hold.SILENCE, guard=_WIDE)
 _ALL = (
     BUILTIN,
-    # Its velocity clamp counts the time since the target last changed: a long pause would let the next one through.
+    # The velocity limit of this controller uses the time since the target last changed. After a long pause without
+    # messages, the next target would therefore not be limited.
     Preset("kuka_lbr_clik", _LATCHES),
     Preset("kuka_lbr_impedance", _LATCHES, rate=200.0, lowest_rate=100.0, zero_wrench="{ctrl}/target_wrench"),
     Preset("fzi", "targets count when they come after its activation"),
@@ -87,7 +88,7 @@ _ALL = (
     Preset(
         "lbr_position",
         "the first command equals the measured positions",
-        topic="{robot}/command/lbr_joint_position_command",  # resolved in its namespace, so beside the node
+        topic="{robot}/command/lbr_joint_position_command",  # Resolved in the node's namespace.
         message="lbr_fri_idl/msg/LBRJointPositionCommand",
         rate=200.0,
         lowest_rate=100.0,
@@ -130,12 +131,12 @@ PRESETS = {preset.name: preset for preset in _ALL}
 
 
 def preset_names() -> tuple[str, ...]:
-    """The presets of this package, then those that others have installed."""
+    """Return the names of the presets of this package, and then those of other installed packages."""
     return (*PRESETS, *(name for name in names_of(ENTRY_POINTS) if name not in PRESETS))
 
 
 def preset_called(name: str) -> Preset:
-    """The preset of this package, or of an installed one. Raises :class:`ConfigError`."""
+    """Return the preset of this package, or of an installed one; raises :class:`ConfigError` if there is none."""
     if name in PRESETS:
         return PRESETS[name]
     if name not in preset_names():
@@ -149,16 +150,16 @@ def preset_called(name: str) -> Preset:
 class Mode(StrEnum):
     """The kind of target that an external controller follows."""
 
-    RAW = "raw"  # the hand's target itself
-    FILTERED = "filtered"  # what the built-in controller makes of it: within limits and free of collisions
+    RAW = "raw"  # The hand's target itself.
+    FILTERED = "filtered"  # The target after the built-in controller: within limits and free of collisions.
 
 
-# A warning about mode raw, at the start and in q2r2 check.
+# The warning about mode raw, at the start and in q2r2 check.
 RAW_WARNING = "raw: no limits, no distances, no self-collision"
 
 
 def preset_of(name: str, mode: str) -> tuple[Preset, Mode]:
-    """Preset and mode by their names. Raises :class:`ConfigError` for names and pairs that are not allowed."""
+    """Return preset and mode by their names; raises :class:`ConfigError` for names or pairs that are not allowed."""
     preset = preset_called(name)
     if mode not in list(Mode):
         raise ConfigError(f"mode = {mode!r:.60}: allowed are {', '.join(Mode)}")

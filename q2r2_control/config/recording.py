@@ -1,4 +1,4 @@
-"""Cameras of a cell, and what makes a recorded episode unfit to be learned from, with units and ranges."""
+"""Settings of cameras and recordings, and thresholds that a recorded episode has to meet, with units and ranges."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ Radians = Annotated[float, Field(ge=0, le=3.15)]
 class JudgeSettings(StrictModel):
     """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. None: that number is not judged.
 
-    Shares are of the time for which an arm is engaged, unless said otherwise. No threshold then depends on an episode's
-    length. The numbers are those of ``q2r2_control.judging``.
+    Shares are fractions of the time for which an arm is engaged, unless a description says otherwise. No threshold thus
+    depends on the length of an episode. The package ``q2r2_control.judging`` computes the numbers.
     """
 
     min_pose_rate: Annotated[float, Field(ge=0, le=1000)] | None = Field(
@@ -90,7 +90,7 @@ class RecordingSettings(StrictModel):
     )
 
 
-# It becomes a part of a topic's name and of a feature's.
+# The name of a camera is a part of the names of its topic and of its feature in a dataset.
 CameraName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 _LEAST_DISTANCE = 1e-6  # [m]
 
@@ -98,7 +98,8 @@ _LEAST_DISTANCE = 1e-6  # [m]
 class CameraConfig(StrictModel):
     """A camera of the simulated cell, or one whose pictures come on a ROS topic.
 
-    The former is fixed in the world or on a link. Its own frame has x the way it looks, and z up in the picture.
+    The simulated camera is fixed in the world or on a link. In its own frame, x is the direction of view, and z points
+    up in the picture.
     """
 
     topic: str | None = Field(
@@ -112,7 +113,7 @@ class CameraConfig(StrictModel):
     look_at: Metres3 | None = Field(None, description="point in the middle of the picture, in the link's frame [m]")
     rpy: Radians3 | None = Field(None, description="instead of look_at: of the camera's frame in the link's [rad]")
     field_of_view: float = Field(0.9, ge=0.05, le=2.8, description="from the lower to the upper edge [rad]")
-    # Even, as video wants them.
+    # Width and height are even, because video formats need even numbers.
     width: int = Field(640, ge=16, le=3840, multiple_of=2, description="[pixels]")
     height: int = Field(480, ge=16, le=2160, multiple_of=2, description="[pixels]")
     rate: float = Field(30.0, gt=0, le=240, description="[pictures/s]")

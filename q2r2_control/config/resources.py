@@ -1,4 +1,4 @@
-"""Where the shipped config/ and robots/ files are: in a checkout beside the package, installed under share/."""
+"""Find the shipped config/ and robots/ files: beside the package in a checkout, or under share/ if installed."""
 
 from __future__ import annotations
 
@@ -12,15 +12,19 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def resource_roots() -> list[Path]:
-    """Folders that can hold config/ and robots/, nearest first."""
+    """Return the folders that can hold config/ and robots/, nearest first."""
     installed = [Path(sysconfig.get_path("data", scheme)) for scheme in ("venv", "posix_user", "posix_prefix")]
-    # pip --target puts share/ beside the package, colcon beside the lib/ of lib/python3.x/site-packages.
+    # With pip --target, share/ is beside the package. With colcon, it is beside lib/ of lib/python3.x/site-packages.
     installed += [_CHECKOUT, *_CHECKOUT.parents[2:3]]
     return [_CHECKOUT, *(root / "share" / "q2r2_control" for root in installed)]
 
 
 def find_resource(path: str | os.PathLike[str]) -> Path:
-    """Resolve ``path`` from the working directory, then among the shipped files. Raises :class:`ConfigError`."""
+    """Find ``path`` from the working directory, then among the shipped files.
+
+    Raises:
+        ConfigError: If there is no such file, or if the path cannot be looked up.
+    """
     if not isinstance(path, str | os.PathLike):
         raise ConfigError(f"{shown(path)}: allowed: the path of a file, as text or pathlib.Path")
     wanted = Path(path)
@@ -31,7 +35,7 @@ def find_resource(path: str | os.PathLike[str]) -> Path:
             if candidate.is_file():
                 return candidate
     except (OSError, ValueError, RuntimeError) as error:
-        # A name that is too long, a folder that may not be entered, the home of an unknown user.
+        # The name is too long, a folder may not be entered, or the user of a home folder is not known.
         raise ConfigError(f"{path!s:.120}: cannot be looked up: {error!s:.120}") from error
     raise ConfigError(f"{path}: no such file here, nor among the shipped ones ({_shipped(wanted)})")
 

@@ -14,9 +14,10 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class StrictModel(BaseModel):
-    """Settings without unknown keys, change, or numbers that are not finite.
+    """Settings that allow no unknown keys, no changes, and only finite numbers.
 
-    Raises :class:`ConfigError` that names key, value and what is allowed, for wrong values and for a change.
+    Raises:
+        ConfigError: For wrong values and for a change. The message names key, value and what is allowed.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -35,8 +36,8 @@ class StrictModel(BaseModel):
     def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Self:
         return validated(cls, f"{cls.__name__}: ", json_data, as_json=True, **options)
 
-    # By this pydantic knows its own initialiser. It would call another one for settings within settings too, and an
-    # error from there could not name their key in full.
+    # By this attribute, pydantic recognises its own initialiser. It would call any other initialiser also for settings
+    # within settings, and an error from there could not name the full key.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -45,9 +46,10 @@ class StrictModel(BaseModel):
 
 
 def validated(model: type[Model], where: str, values: object, *, as_json: bool = False, **options: Any) -> Model:
-    """Settings made of ``values``, or of a JSON text; ``options`` as ``pydantic.BaseModel.model_validate`` has them.
+    """Return settings made of ``values``, or of a JSON text. ``options`` are those of pydantic's ``model_validate``.
 
-    Raises :class:`ConfigError` that begins with ``where``.
+    Raises:
+        ConfigError: If a value is not allowed. The message begins with ``where``.
     """
     validator: Any = model.__pydantic_validator__
     try:
@@ -58,36 +60,36 @@ def validated(model: type[Model], where: str, values: object, *, as_json: bool =
 
 
 def config_error(error: ValidationError, model: type[BaseModel]) -> ConfigError:
-    """All faults in a ``model``; the message is that of the first one, and says how many more there are."""
-    # A misspelt key leaves others missing or empty; the misspelling says more.
+    """Return an error with all faults in a ``model``. Its message has the first fault and the number of others."""
+    # If a key is misspelt, the right key is missing too. The misspelt key comes first, because it explains the fault.
     found = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
-    # A value that none of several kinds fits has a fault for each of them.
+    # A value that fits none of several types has one fault for each of them. Only the first is kept.
     faults = list({key: _line(key, fault, model) for fault in reversed(found) for key in [_key(fault)]}.values())[::-1]
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
     return ConfigError(faults[0] + more, faults)
 
 
 def _key(fault: ErrorDetails) -> str:
-    # In brackets stand notes of pydantic: "[key]", and tags of models among which a key's value is one.
+    # Parts in brackets are notes of pydantic: "[key]", and the tags of alternative models for a key's value.
     key = ".".join(str(part) for part in fault["loc"] if not str(part).startswith("["))
     return " ".join(key.split())[:300] or "(top level)"
 
 
 def _line(key: str, fault: ErrorDetails, model: type[BaseModel]) -> str:
-    """One line about a ``fault`` in a ``model``: key, value, and what is allowed."""
+    """Return one line about a ``fault`` in a ``model``: key, value, and what is allowed."""
     if fault["type"] == "missing":
         return f"{key}: missing, and has no default"
     allowed = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
         allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1], model))}"
-    # Of a whole block the text says itself which of its keys do not go together.
+    # For a whole block, the text itself names the keys that do not fit together.
     is_block = fault["type"] == "value_error" and isinstance(fault["input"], dict)
     value = "" if is_block else f" = {shown(fault['input'])}"
     return f"{key}{value}: {allowed}"
 
 
 def _keys_at(location: tuple[int | str, ...], root: type[BaseModel]) -> list[str]:
-    """Names of the keys that the model at ``location`` in ``root`` accepts."""
+    """Return the names of the keys that the model at ``location`` in ``root`` accepts."""
     model: Any = root
     for part in location:
         annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
@@ -104,9 +106,10 @@ Network = IPv4Network | IPv6Network
 
 
 def network_of(text: str) -> Network:
-    """The network ``text``, such as ``192.168.1.0/24`` or ``fd00::/64``; a single address is a network of one.
+    """Return the network ``text``, such as ``192.168.1.0/24`` or ``fd00::/64``. One address is a network of one host.
 
-    Raises :class:`ValueError` that names the text and what is allowed.
+    Raises:
+        ValueError: If the text is not a network. The message names the text and what is allowed.
     """
     try:
         return ip_network(text)
@@ -119,7 +122,7 @@ def network_of(text: str) -> Network:
     raise ValueError(f"{text!r} is an address within a network: write {meant}, or {text.split('/')[0]} alone")
 
 
-# Eleven periods of a 75 Hz headset, so that a few lost or late messages on a wireless link do not stop the arms. It is
-# short enough that a tool at the default 0.5 m/s moves no more than 75 mm before it begins to brake. It holds for hand
-# data, tool poses, targets and acknowledgements of commands.
+# The time-out is eleven periods of a 75 Hz headset, so that a few lost or late messages on a wireless link do not stop
+# the arms. In this time, a tool at the default 0.5 m/s moves no more than 75 mm before it begins to brake. The time-out
+# holds for hand data, tool poses, targets and acknowledgements of commands.
 STREAM_TIMEOUT = 0.15  # [s]

@@ -1,4 +1,4 @@
-"""Everything an operator tunes about teleoperation, with units and ranges."""
+"""All settings of teleoperation, with units and ranges."""
 
 from __future__ import annotations
 
@@ -21,11 +21,14 @@ _ALLOWED = "three of +x -x +y -y +z -z that use x, y and z once each, e.g. [+z, 
 
 
 def axes_matrix(axes: Sequence[str]) -> Array:
-    """Signed permutation M, (3, 3): a position p of the input becomes M p in the world, a rotation R becomes M R M'.
+    """Return the signed permutation M (3, 3) from the input's axes to those of the world.
 
-    ``axes[i]`` is the input's axis that becomes the world's i-th. A determinant of -1 says that the input counts in a
-    left-handed frame, as raw Unity does; M R M' is a proper rotation then too.
-    Raises :class:`ValueError` that names the value and what is allowed.
+    A position p of the input becomes M p in the world, and a rotation R becomes M R M'. ``axes[i]`` is the input's axis
+    that becomes the world's i-th axis. The determinant is -1 if the frame of the input is left-handed, as in raw Unity.
+    M R M' is a proper rotation then too.
+
+    Raises:
+        ValueError: If the axes are not allowed. The message names the value and what is allowed.
     """
     rows = {sign + axis: factor * row for sign, factor in _SIGNS for axis, row in zip("xyz", np.eye(3), strict=True)}
     if any(axis not in rows for axis in axes) or sorted(axis[1] for axis in axes) != ["x", "y", "z"]:
@@ -34,19 +37,19 @@ def axes_matrix(axes: Sequence[str]) -> Array:
 
 
 class Stance(StrEnum):
-    """Where the operator stands and which hand moves which arm."""
+    """The operator's place, which decides which hand moves which arm."""
 
-    SIDE_BY_SIDE = "side_by_side"  # beside the robot, facing the same way: left moves left
-    MIRROR = "mirror"  # facing the robot: hands swapped, the room's axes kept
-    MIRROR_REFLECTED = "mirror_reflected"  # hands swapped and the motion reflected left to right
+    SIDE_BY_SIDE = "side_by_side"  # Beside the robot, facing the same way. The left hand moves the left arm.
+    MIRROR = "mirror"  # Facing the robot. The hands are swapped, and a motion keeps its direction in the world.
+    MIRROR_REFLECTED = "mirror_reflected"  # The hands are swapped, and the motion is reflected left to right.
 
     def hand_of(self, arm: str) -> str:
-        """The hand that leads an arm."""
+        """Return the hand that leads an arm."""
         return arm if self is Stance.SIDE_BY_SIDE else SIDES[1 - SIDES.index(arm)]
 
 
 class RotationFrame(StrEnum):
-    """Frame in which the hand's rotation is applied to the tool."""
+    """The frame in which the hand's rotation is applied to the tool."""
 
     BASE = "base"
     TOOL = "tool"
@@ -64,7 +67,7 @@ class FilterSettings(StrictModel):
 
     @property
     def delay(self) -> float:
-        """From the receipt of a hand's sample to what the filter makes of it, at low frequencies [s]."""
+        """Delay from the receipt of a hand's sample to the output of the filter, at low frequencies [s]."""
         return self.interpolation_delay + self.smoothing_delay
 
 
@@ -87,7 +90,7 @@ class LeashSettings(StrictModel):
     carried_angle: float = Field(0.1, ge=0.03, le=2, description="of that frame's rotation [rad]")
 
     def carried(self) -> LeashSettings:
-        """The leash of the frame between two tools, which is no longer than that of a tool."""
+        """Return the leash of the frame between two tools, which is not longer than that of a tool."""
         distance, angle = (math.inf if length is None else length for length in (self.distance, self.angle))
         shorter = {"distance": min(distance, self.carried_distance), "angle": min(angle, self.carried_angle)}
         return self.model_copy(update=shorter)

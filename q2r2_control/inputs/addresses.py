@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-EVERY_NETWORK = ("", "0.0.0.0", "::")  # as hosts to listen on
+EVERY_NETWORK = ("", "0.0.0.0", "::")  # Hosts to listen on all networks.
 NO_NETWORK = "of this machine (it has no network now)"
-# Linux: requests about a network interface by its name, and flags of its state.
+# Linux: requests about a network interface by its name, and flags of the interface's state.
 _GET_FLAGS, _GET_ADDRESS = 0x8913, 0x8915
 _UP, _LOOPBACK, _RUNNING = 0x1, 0x8, 0x40
 _IPV6_TABLE = Path("/proc/net/if_inet6")
@@ -19,7 +19,7 @@ _GLOBAL_SCOPE, _TENTATIVE_OR_DEPRECATED = 0x00, 0x60
 
 
 def reachable_addresses(host: str) -> tuple[str, ...]:
-    """The addresses by which others reach a server on ``host``, first the one of the way out of this computer."""
+    """Return the addresses by which others reach a server on ``host``. The address of the default route comes first."""
     if host not in EVERY_NETWORK:
         return (host,)
     found = [address for address in (_way_out(socket.AF_INET, "192.0.2.1"), *_ipv4_addresses()) if address]
@@ -29,8 +29,8 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
 
 
 def _way_out(family: socket.AddressFamily, elsewhere: str) -> str | None:
-    """The address with which this computer reaches one that is for documentation only."""
-    # Connecting a UDP socket sends nothing; it only picks the way.
+    """Return the address of this computer on the route to ``elsewhere``, an address that is for documentation only."""
+    # A UDP socket that connects sends nothing, and only selects the route.
     with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.connect((elsewhere, 9))
         return str(probe.getsockname()[0])
@@ -38,18 +38,18 @@ def _way_out(family: socket.AddressFamily, elsewhere: str) -> str | None:
 
 
 def _ipv4_addresses() -> Iterator[str]:
-    """The address of each network interface that is connected."""
+    """Yield the address of each network interface that is connected."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         for _, name in socket.if_nameindex():
             request = struct.pack("16s24x", name.encode())
-            with suppress(OSError):  # of an interface without an address
+            with suppress(OSError):  # The interface has no address.
                 flags = struct.unpack_from("H", fcntl.ioctl(asked, _GET_FLAGS, request), 16)[0]
                 if flags & _UP and flags & _RUNNING and not flags & _LOOPBACK:
                     yield socket.inet_ntoa(fcntl.ioctl(asked, _GET_ADDRESS, request)[20:24])
 
 
 def _ipv6_addresses() -> Iterator[str]:
-    """Addresses that other networks reach too; those of one link need the link's name, which no URL has."""
+    """Yield the addresses with global scope. Those of one link need the link's name, which no URL has."""
     with suppress(OSError):
         for line in _IPV6_TABLE.read_text().splitlines():
             digits, _, _, scope, flags, _ = line.split()

@@ -1,6 +1,7 @@
-"""Small assembly work of two hands, as way points: what lies on the table of config/dual_iiwa7.yaml is picked up.
+"""Small assembly work of two hands, as way points. The hands pick up parts on the table of config/dual_iiwa7.yaml.
 
-Nothing is corrected on the way: where a part lies is known, and where a tool arrives is what the robot makes of it.
+Nothing is corrected during the work. The places of the parts are known, and each tool arrives as precisely as the robot
+follows the hand.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ _GRIP, _OVER = 0.243, 0.33
 
 
 def _meeting(middle: float) -> dict[str, tuple[WayPoint, ...]]:
-    """Ways of both hands that lead their blocks to ``middle`` [m] from the cell's middle, and put them back."""
+    """Return way points with which both hands bring their blocks to ``middle`` [m] from the cell's centre, and back."""
     left: tuple[WayPoint, ...] = (
         (1.4, 0.55, 0.25, 0.35, 0.0, 0.0),  # over the block
         (3.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # down around it
         (4.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # grasp
         (5.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # lift
-        (9.0, 0.55, middle, 0.40, -0.25, 0.0),  # to the middle, wrists outwards
+        (9.0, 0.55, middle, 0.40, -0.25, 0.0),  # move to the middle, with the wrists outwards
         (10.0, 0.55, middle, 0.40, -0.25, 0.0),
-        (12.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # back
+        (12.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # move back
         (14.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # put down
         (15.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # let go
         (17.4, *LEFT_HOME),
@@ -35,7 +36,7 @@ def _meeting(middle: float) -> dict[str, tuple[WayPoint, ...]]:
 
 MEET = HandWork(
     duration=17.4,
-    tools=_meeting(0.065),  # where the grippers nearly touch
+    tools=_meeting(0.065),  # There the grippers nearly touch.
     steps=(
         (0.0, "each hand reaches for its block"),
         (3.2, "both grasp"),
@@ -46,10 +47,11 @@ MEET = HandWork(
     ),
     presses={"left": (3.5, 14.9), "right": (3.7, 15.1)},
 )
-# Both hands go to one place: each target gets 65 mm from its tool, which the leash allows, and the blocks come back.
+# Both hands move to one place. Each target gets 65 mm away from its tool, which the leash allows, and the hands then
+# bring the blocks back.
 CLASH = replace(MEET, tools=_meeting(0.0))
 
-_LOW = 0.216  # tips 3 mm above the table
+_LOW = 0.216  # Height with the finger tips 3 mm above the table [m].
 GRASP = HandWork(
     duration=10.6,
     tools={
@@ -96,7 +98,7 @@ STACK = HandWork(
             (6.9, 0.55, -0.25, _GRIP, 0.0, 0.0),  # grasp
             (8.2, 0.55, -0.25, 0.41, 0.0, 0.0),
             (8.4, 0.55, -0.25, 0.41, 0.0, 0.0),
-            (10.2, 0.52, 0.00, 0.41, 0.0, 0.0),  # over both, as the other hand leaves
+            (10.2, 0.52, 0.00, 0.41, 0.0, 0.0),  # over both blocks, while the other hand leaves
             (11.2, 0.52, 0.00, _GRIP + 0.12, 0.0, 0.0),
             (11.9, 0.52, 0.00, _GRIP + 0.12, 0.0, 0.0),  # let go
             (12.8, 0.52, 0.00, 0.42, 0.0, 0.0),
@@ -116,12 +118,12 @@ STACK = HandWork(
     presses={"left": (2.2, 6.7), "right": (6.3, 11.3)},
 )
 
-# The hands hold the bar, which lies along y, from both sides, tilted so that their wrists are farther apart than the
-# fingers. Straight down, wrists would keep 60 mm more between the tools than the bar leaves.
+# The bar lies along y. The hands hold it from both sides, tilted so that their wrists are farther apart than the
+# fingers. If the tools pointed straight down, the wrists would keep them 60 mm too far apart for the bar.
 _TILT, _TURN = 0.4, 0.5 * math.pi
-_BAR_LOW = 0.2193  # the lower corners of the tilted tips 3 mm above the table
-_OFF = 0.045  # of each tool from the bar's middle, along it
-_BACK_Y, _BACK_Z = 0.09 * math.sin(_TILT), 0.09 * math.cos(_TILT)  # before and after a grasp
+_BAR_LOW = 0.2193  # Height with the lower corners of the tilted finger tips 3 mm above the table [m].
+_OFF = 0.045  # Distance of each tool from the bar's middle, along the bar [m].
+_BACK_Y, _BACK_Z = 0.09 * math.sin(_TILT), 0.09 * math.cos(_TILT)  # Offset of a tool before and after a grasp [m].
 _LEFT, _RIGHT = (-_TILT, -_TURN), (_TILT, _TURN)
 HANDOVER = HandWork(
     duration=18.4,
@@ -131,8 +133,8 @@ HANDOVER = HandWork(
             (3.4, 0.44, 0.15 + _OFF, _BAR_LOW, *_LEFT),
             (4.1, 0.44, 0.15 + _OFF, _BAR_LOW, *_LEFT),  # grasp
             (5.2, 0.44, 0.15 + _OFF, 0.34, *_LEFT),  # lift
-            (6.8, 0.46, _OFF, 0.38, *_LEFT),  # to the middle
-            (9.2, 0.46, _OFF, 0.38, *_LEFT),  # let go, once the other hand has it
+            (6.8, 0.46, _OFF, 0.38, *_LEFT),  # move to the middle
+            (9.2, 0.46, _OFF, 0.38, *_LEFT),  # let go when the other hand holds the bar
             (10.2, 0.46, _OFF + _BACK_Y, 0.38 + _BACK_Z, *_LEFT),
             (12.4, *LEFT_HOME),
         ),
@@ -141,8 +143,8 @@ HANDOVER = HandWork(
             (5.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),  # where the bar's right end will be
             (6.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),
             (8.0, 0.46, -_OFF, 0.38, *_RIGHT),
-            (10.2, 0.46, -_OFF, 0.38, *_RIGHT),  # grasp, and wait until the other hand is gone
-            (11.8, 0.46, -_OFF - 0.12, 0.38, *_RIGHT),  # away with it
+            (10.2, 0.46, -_OFF, 0.38, *_RIGHT),  # grasp, and wait until the other hand has left
+            (11.8, 0.46, -_OFF - 0.12, 0.38, *_RIGHT),  # carry the bar away
             (13.0, 0.46, -_OFF - 0.12, 0.38, *_RIGHT),
             (14.6, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # put down
             (15.3, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # let go
@@ -164,7 +166,7 @@ HANDOVER = HandWork(
 )
 
 
-# In the order in which they can follow each other.
+# All works, in the order in which they can follow each other.
 WORKS: Mapping[str, HandWork] = {
     "meet": MEET,
     "clash": CLASH,

@@ -31,55 +31,65 @@ _SAMPLE: tuple[tuple[str, type | tuple[type, ...], str], ...] = (
 
 @runtime_checkable
 class Input(Protocol):
-    """A source of hand samples, polled once per control tick by the loop's own thread.
+    """A source of hand samples. The thread of the control loop polls it once per tick.
 
-    Order of use: ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``. An input that is found by
-    its name has a class method ``from_config(config)`` as well. Its class may have further attributes: ``options``,
-    names of what ``from_config`` takes by keyword, which are options of ``q2r2 run`` and ``say``, a function that
-    prints a line; ``cell``, a function that returns a cell with what this input knows better, as its own axes;
-    ``executable``, the ROS executable that stands for it instead of ``hand_input``; and ``simulated``, True if its
-    samples follow from the times of its polls, so that a run may be in simulated time.
+    The order of use is ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``. An input that is
+    found by its name also has a class method ``from_config(config)``. Its class may have these further attributes:
+
+    - ``options``: The names of keyword arguments of ``from_config``. Each is an option of ``q2r2 run``, or ``say``, a
+      function that prints a line.
+    - ``cell``: A function that returns a cell with the settings that this input knows better, such as its own axes.
+    - ``executable``: The ROS executable that is started for this input instead of ``hand_input``.
+    - ``simulated``: True if the samples depend only on the times of the polls, so that a run may be in simulated time.
     """
 
-    controls: DeviceControls  # the buttons and axes that its samples have
+    controls: DeviceControls  # The buttons and axes that its samples have.
 
     @property
     def connected(self) -> bool:
         """Whether samples can arrive now. The loop reports every change from True to False to the teleop layer."""
 
     def start(self) -> None:
-        """Begin to receive; returns at once. Raises :class:`Q2R2Error` when the source cannot be opened."""
+        """Begin to receive, and return at once.
+
+        Raises:
+            Q2R2Error: If the source cannot be opened.
+        """
 
     def poll(self, now: float) -> list[HandSample]:
-        """Samples that came in since the last poll, oldest first; empty when there are none.
+        """Return the samples that were received since the last poll, oldest first. The list is empty if there are none.
 
-        ``now`` [s] is on the clock of the samples' stamps. Never waits, and never raises because of what was received.
-        The returned samples stay as they are: others keep it for some ticks.
+        ``now`` [s] is on the clock of the samples' stamps. The method never waits, and never raises because of received
+        data. The input must not change a returned sample, because other objects keep it for some ticks.
         """
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
-        """Vibrate a hand controller if the source has any; otherwise nothing happens. Never waits."""
+        """Vibrate a hand controller, if the source has one. The method never waits."""
 
     def close(self) -> None:
-        """Release every resource; may be called twice."""
+        """Release every resource. The method may be called twice."""
 
 
 @runtime_checkable
 class PolicySource(Input, Protocol):
-    """An input that brings actions of a policy too. In each run, ``prepare`` comes before ``start``."""
+    """An input that also has actions of a policy. In each run, ``prepare`` is called before ``start``."""
 
     def prepare(self, robot: Robot, realtime: bool) -> None:
-        """A run of ``robot`` begins; in simulated time, the policy has to be waited for."""
+        """Prepare for a run of ``robot``. In simulated time, the loop has to wait for the policy."""
 
     def chunks(self) -> list[ActionChunk]:
-        """Chunks that came in since the last call, oldest first. Never waits and never raises."""
+        """Return the chunks that came since the last call, oldest first. The method never waits and never raises."""
 
     def observe(self, observation: Observation) -> None:
-        """The state of a tick, for the policy; its numbers stay as they are. In real time this never waits."""
+        """Give the policy the state of a tick, whose numbers never change. In real time the method never waits."""
 
 
 def check_samples(samples: list[HandSample]) -> list[HandSample]:
-    """The ``samples`` of a poll. Raises :class:`InputError` for what is none; their numbers may be any."""
+    """Return the ``samples`` of a poll. Their numbers may have any value.
+
+    Raises:
+        InputError: If ``samples`` is not a list of HandSample, or if a field of a sample has a wrong type.
+    """
     check_kind("poll() of the input", samples, list, "a list of HandSample", InputError)
     for sample in samples:
         check_kind("a sample of the input", sample, HandSample, "a HandSample", InputError)
@@ -89,25 +99,30 @@ def check_samples(samples: list[HandSample]) -> list[HandSample]:
 
 
 def options_of(source: str) -> tuple[str, ...]:
-    """The options that the input called ``source`` takes. Raises :class:`ConfigError` for an unknown name."""
+    """Return the options of the input called ``source``; raises :class:`ConfigError` if the name is unknown."""
     return tuple(getattr(load_class(INPUTS, source), "options", ()))
 
 
 def is_simulated(source: str) -> bool:
-    """True if the input called ``source`` can be polled in simulated time. Raises :class:`ConfigError` for no input."""
+    """Return whether the input called ``source`` can be polled in simulated time.
+
+    Raises:
+        ConfigError: If the name is unknown.
+    """
     return bool(getattr(load_class(INPUTS, source), "simulated", False))
 
 
 def adapted(source: str, config: Config) -> Config:
-    """The cell with the settings that the input called ``source`` knows better."""
+    """Return the cell with the settings that the input called ``source`` knows better."""
     adapt = getattr(load_class(INPUTS, source), "cell", None)
     return config if adapt is None else adapt(config)
 
 
 def make_input(source: Input | str, config: Config, **options: object) -> Input:
-    """The input called ``source``, with those of the ``options`` that it takes, or ``source`` itself.
+    """Return ``source`` itself, or the input of that name, made with those of the ``options`` that it has.
 
-    Raises :class:`ConfigError` for an unknown name.
+    Raises:
+        ConfigError: If the name is unknown, or if ``source`` is neither a name nor an input.
     """
     if not isinstance(source, str):
         check_kind("input", source, Input, "the name of an input, or an object with all methods of Input")

@@ -1,4 +1,4 @@
-"""The network's side of the headset server, for its thread alone: who drives, who waits, bytes in and out."""
+"""Serve the clients of the headset server, in its own thread: which client drives, which wait, bytes in and out."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from q2r2_control.inputs.messages import KEEPALIVE, FrameDecoder, HandPose, Wire
 from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
 from q2r2_control.types import HapticFeedback
 
-KEEPALIVE_AFTER = 1.0  # of own silence [s]
-SILENCE_ALLOWED = 2.0  # without a whole frame [s]; the app sends a keepalive after 1 s
-TURN = 0.05  # longest wait for the network; timeouts are looked at this often [s]
-_RECEIVE_BYTES = 1 << 12  # some 40 messages: the control loop gets the interpreter between two such portions
-MAX_FRAMES_PER_SECOND = 2000  # the app sends about 450; more would take processor time from the control loop
+KEEPALIVE_AFTER = 1.0  # The server sends a keepalive if it has sent nothing for longer [s].
+SILENCE_ALLOWED = 2.0  # A driver without a whole frame for longer is dropped [s]. The app sends a keepalive after 1 s.
+TURN = 0.05  # Longest wait for the network. Timeouts are checked this often [s].
+_RECEIVE_BYTES = 1 << 12  # About 40 messages. Between two such portions, the control loop gets the interpreter.
+MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450. More would take processor time from the control loop.
 
 _LOG = logging.getLogger("q2r2_control.inputs.headset")
 
@@ -41,12 +41,16 @@ class Client(Peer):
         self.socket = connection
         self.decoder = FrameDecoder()
         self.refused_hosts: set[str] = set()
-        self.announced = False  # in the log
+        self.announced = False  # Whether the log names this client.
         self.last_sent = now
         self._frames = RateLimit(MAX_FRAMES_PER_SECOND)
 
     def receive(self, frame: WireFrame, now: float) -> Reception | None:
-        """Take one frame; the hand's message if it was one. Raises :class:`ProtocolError` also for a flood."""
+        """Take one frame, and return the hand's message if the frame has one.
+
+        Raises:
+            ProtocolError: For bytes that the protocol does not allow, and for too many frames in a second.
+        """
         self.last_frame = now
         if not self._frames.take(now):
             raise ProtocolError(f"more than {MAX_FRAMES_PER_SECOND} frames in a second")
@@ -60,22 +64,22 @@ class Client(Peer):
 class Handlers:
     """Methods that the server's thread calls."""
 
-    admitted: Callable[[Client], None]  # a client drives from now on
-    lost: Callable[[str], None]  # the driver is gone, for a reason
-    receive: Callable[[Client, WireFrame, float], None]  # a frame of the driver, at a time [s]; may raise ProtocolError
-    due: Callable[[], Iterable[HapticFeedback]]  # what to send to the driver
+    admitted: Callable[[Client], None]  # Called if a client drives from now on.
+    lost: Callable[[str], None]  # Called with the reason if the driver is gone.
+    receive: Callable[[Client, WireFrame, float], None]  # Takes a driver's frame and time [s]. May raise ProtocolError.
+    due: Callable[[], Iterable[HapticFeedback]]  # Returns the vibrations to send to the driver.
 
 
 class Connections:
-    """Serves the driver, and newcomers until :func:`~q2r2_control.inputs.listener.decide` has decided on them."""
+    """Serves the driver, and each newcomer until :func:`~q2r2_control.inputs.listener.decide` has decided on it."""
 
     def __init__(
         self, door: TcpListener, allow: Sequence[Network] | None, clock: Callable[[], float], handlers: Handlers
     ) -> None:
         self._door, self._allow, self._clock, self._handlers, self._log = door, allow, clock, handlers, door.log
         self._driver: Client | None = None
-        self._waiting: list[Client] = []  # in the order of their arrival
-        self._unwelcome: set[str] = set()  # hosts outside ``allow`` that the log has named
+        self._waiting: list[Client] = []  # In the order of their arrival.
+        self._unwelcome: set[str] = set()  # Hosts outside ``allow`` that the log has named.
         self._last_fault = ""
         self._waker, self._waiter = socket.socketpair()
         self._waker.setblocking(False)
@@ -85,18 +89,18 @@ class Connections:
         self._door_watched = False
 
     def wake(self) -> None:
-        """Make :meth:`serve` return soon; from any thread, at any time."""
-        # A full pipe wakes the thread as well; with a closed one there is no thread.
+        """Make :meth:`serve` return soon. Any thread may call this at any time."""
+        # A full pipe wakes the thread as well. If the pipe is closed, there is no thread.
         with suppress(OSError):
             self._waker.send(b"\0")
 
     def serve(self) -> None:
-        """Wait for the network once, ``TURN`` at most, and handle what there is."""
-        # Data sent before this time are read before anybody is judged by it. No client is then taken for silent because
-        # this thread, or the whole process, stood still.
+        """Wait for the network once, for ``TURN`` at most, and handle all events."""
+        # All data that were sent before this time are read before a decision about a client. Otherwise a client could
+        # count as silent because this thread, or the whole process, stood still.
         asked = self._clock()
         self._watch_door(asked)
-        # A connection ends in its own event or behind this loop, so that none of these events is of one that has ended.
+        # A connection ends in its own event or after this loop, so that no event belongs to an ended connection.
         for key, _ in self._selector.select(TURN):
             key.data()
         self._settle(asked)
@@ -106,7 +110,7 @@ class Connections:
         self._log.flush(now)
 
     def report(self, error: Exception) -> None:
-        """Log a fault of the server itself, once in a row."""
+        """Log a fault of the server itself. The same fault is logged only once in a row."""
         if repr(error) != self._last_fault:
             _LOG.error("headset server: unexpected fault, dropping the headset", exc_info=error)
         self._last_fault = repr(error)
@@ -123,7 +127,7 @@ class Connections:
             open_one.close()
 
     def _watch_door(self, now: float) -> None:
-        """Connections beyond the rate wait in the kernel, which costs this process nothing."""
+        """Accept connections within the rate. Others wait in the kernel, which takes no time of this process."""
         watched = self._door.accepts.is_open(now)
         if watched and not self._door_watched:
             self._selector.register(self._door, selectors.EVENT_READ, self._accept)
@@ -140,10 +144,10 @@ class Connections:
             self._waiting.append(client)
 
     def _settle(self, now: float) -> None:
-        """Decide who drives, with all read that was sent before ``now``."""
+        """Decide which client drives. All data that were sent before ``now`` [s] have been read."""
         driver = self._driver
         if driver is not None and now - driver.last_frame > SILENCE_ALLOWED:
-            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # half-open: it would keep others out
+            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # Such a client would keep others out.
         for client in tuple(self._waiting):
             if not is_allowed(client.host, self._allow):
                 self._refuse(client, f"{client.host} is not in headset.allow", self._unwelcome)
@@ -159,7 +163,7 @@ class Connections:
                 self._refuse(client, reason, driver.refused_hosts)
 
     def _refuse(self, client: Client, reason: str, named: set[str]) -> None:
-        """Send a newcomer away. The app tries again every second: one line for each host is enough."""
+        """Refuse a newcomer. The app tries again every second, so the log has only one line for each host."""
         if client.host not in named and len(named) < MAX_HOSTS_NAMED:
             named.add(client.host)
             self._write(client, logging.WARNING, f"refused: {reason}")
@@ -179,7 +183,7 @@ class Connections:
         except ProtocolError as error:
             self._drop(client, str(error))
         except Exception as error:
-            # After any exception this thread has to go on, and a newcomer must not cost the driver its place.
+            # After any exception this thread has to go on, and a fault of a newcomer must not stop the driver.
             self.report(error)
             self._drop(client, "unexpected fault of the server")
         else:
@@ -201,7 +205,7 @@ class Connections:
     def _send(self, client: Client, now: float) -> None:
         outgoing = client.session.outgoing
         if not outgoing and client is self._driver:
-            # Encoded only now, so that a client that does not read gets the newest vibration and not all of them.
+            # Vibrations are encoded only now, so that a client that reads late gets only the newest one.
             for vibration in self._handlers.due():
                 client.session.queue_haptic(vibration)
             if not outgoing and now - client.last_sent > KEEPALIVE_AFTER:
@@ -234,7 +238,7 @@ class Connections:
             self._waiting.remove(client)
         self._selector.unregister(client.socket)
         with client.socket, suppress(OSError):
-            # Behind what was left unsent, which may be the end of a frame.
+            # The unsent bytes go first, since they may be the end of a frame.
             client.socket.send(bytes(client.session.outgoing) + log_frame("error", last_words or reason))
 
     def _write(self, client: Client, level: int, what: str) -> None:

@@ -1,4 +1,4 @@
-"""Work in which a force counts: a tray that both hands carry, a sponge over the table, a peg into a hole."""
+"""Work with contact forces: both hands carry a tray, a hand wipes the table with a sponge, a peg goes into a hole."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ import math
 
 from q2r2_control.inputs.way_points import LEFT_HOME, RIGHT_HOME, HandWork, WayPoint
 
-_TURN = 0.5 * math.pi  # fingers close along x
-_X, _Y, _HELD = 0.64, 0.10, 0.235  # of the tools at the tray's handles
+_TURN = 0.5 * math.pi  # With this turn, the fingers close along x [rad].
+_X, _Y, _HELD = 0.64, 0.10, 0.235  # Places of the tools at the tray's handles [m].
 _CARRIED = (_X - 0.115, _HELD + 0.11)
 
 
 def _at_handle(side: float) -> tuple[WayPoint, ...]:
-    """Over the handle to this ``side`` of the tray's middle, and around it."""
+    """Return way points over the handle at this ``side`` of the tray's middle, and around the handle."""
     turn = -side * _TURN
     return (
         (2.2, _X, side * _Y, _HELD + 0.09, 0.0, turn),
         (3.4, _X, side * _Y, _HELD, 0.0, turn),
-        (4.8, _X, side * _Y, _HELD, 0.0, turn),  # grasp; from here on the left hand carries
+        (4.8, _X, side * _Y, _HELD, 0.0, turn),  # grasp; the left hand moves both tools from here
     )
 
 
 def _from_handle(side: float, home: tuple[float, float, float, float, float]) -> tuple[WayPoint, ...]:
     turn = -side * _TURN
     return (
-        (15.2, _X, side * _Y, _HELD, 0.0, turn),  # let go, each with its own hand
+        (15.2, _X, side * _Y, _HELD, 0.0, turn),  # let go; each hand moves its own tool again
         (16.4, _X, side * _Y, _HELD + 0.09, 0.0, turn),
         (18.6, *home),
     )
@@ -38,7 +38,7 @@ CARRY = HandWork(
             (6.2, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # lift
             (7.8, _CARRIED[0], _Y, _CARRIED[1], 0.0, -_TURN),
             (9.2, _CARRIED[0], _Y, _CARRIED[1], 0.0, -_TURN),
-            (10.8, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # back
+            (10.8, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # move back
             (12.6, _X, _Y, _HELD - 0.003, 0.0, -_TURN),  # put down, until it rests on the table
             *_from_handle(1.0, LEFT_HOME),
         ),
@@ -58,7 +58,7 @@ CARRY = HandWork(
 )
 
 _SPONGE_X, _SPONGE_Y, _SPONGE_HELD = 0.60, 0.42, 0.248
-_WIPING = _SPONGE_HELD - 0.012  # the springs of the impedance and of the sponge press with it [m]
+_WIPING = _SPONGE_HELD - 0.012  # Lower, so that the springs of the impedance and of the sponge press [m].
 _STROKES = ((0.72, 0.42), (0.72, 0.39), (0.60, 0.39), (0.60, 0.36), (0.72, 0.36))
 WIPE = HandWork(
     duration=19.4,
@@ -71,7 +71,7 @@ WIPE = HandWork(
             (6.6, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD + 0.01, 0.0, 0.0),
             (8.2, _SPONGE_X, _SPONGE_Y, _WIPING, 0.0, 0.0),  # press
             *((10.0 + 1.5 * i, *place, _WIPING, 0.0, 0.0) for i, place in enumerate(_STROKES)),
-            (17.4, *_STROKES[-1], _WIPING, 0.0, 0.0),  # let go, where it cannot fall
+            (17.4, *_STROKES[-1], _WIPING, 0.0, 0.0),  # let go where the sponge cannot fall
             (18.2, *_STROKES[-1], 0.33, 0.0, 0.0),
             (19.4, *LEFT_HOME),
         )
@@ -87,13 +87,14 @@ WIPE = HandWork(
 )
 
 _PEG, _HOLE = (0.60, -0.40), (0.66, -0.24)
-_PEG_HELD = 0.265  # 30 mm over the middle of a peg of 70 mm
-_ON_TOP = _PEG_HELD + 0.04  # with the peg on the socket
-_TURNS, _WIDEST, _PRESSED = 4, 0.004, 0.005  # of the search: a spiral, and how far below the socket's top it presses
+_PEG_HELD = 0.265  # The tool is 30 mm above the middle of a peg of 70 mm [m].
+_ON_TOP = _PEG_HELD + 0.04  # The peg stands on the socket [m].
+# The search: turns of the spiral, its greatest radius [m], and how far the target is below the socket's top [m].
+_TURNS, _WIDEST, _PRESSED = 4, 0.004, 0.005
 
 
 def _searching(begins: float, duration: float) -> tuple[WayPoint, ...]:
-    """A spiral, pressed on lightly, until the peg falls in."""
+    """Return way points on a spiral with light pressure, on which the peg finds the hole."""
     points, steps = [], 8 * _TURNS
     for i in range(steps + 1):
         angle, radius = 2.0 * math.pi * _TURNS * i / steps, _WIDEST * i / steps
@@ -113,7 +114,7 @@ PEG = HandWork(
             (6.8, *_HOLE, _ON_TOP + 0.03, 0.0, 0.0),
             (8.2, *_HOLE, _ON_TOP + 0.008, 0.0, 0.0),
             *_searching(9.4, 8.0),
-            (19.2, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # in
+            (19.2, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # push the peg in
             (20.6, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # let go
             (21.8, *_HOLE, 0.36, 0.0, 0.0),
             (24.0, *RIGHT_HOME),

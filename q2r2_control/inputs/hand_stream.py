@@ -1,4 +1,4 @@
-"""The hands of one headset at a time: from its messages to samples for the loop, and to figures for people."""
+"""Turn the messages of one headset at a time into samples for the loop, and into figures for people."""
 
 from __future__ import annotations
 
@@ -11,28 +11,34 @@ from q2r2_control.types import HandSample
 
 
 class HandStream:
-    """The same way for the messages of every headset, however it is connected.
+    """Handles the messages of every headset in the same way, however the headset is connected.
 
-    One thread calls :meth:`admit`, :meth:`receive` and :meth:`lose`; the loop's calls :meth:`take` and never waits.
+    One thread calls :meth:`admit`, :meth:`receive` and :meth:`lose`. The loop's thread calls :meth:`take`, and never
+    waits.
     """
 
     def __init__(self, watch: HandsWatch, tell: Callable[[Watched], None] | None = None) -> None:
-        """``watch`` finds poses that must not be followed; ``tell`` gets each message instead of the loop."""
+        """Make a stream.
+
+        Args:
+            watch: Finds poses that must not be followed.
+            tell: Gets each message instead of the loop.
+        """
         self._watch, self._tell = watch, tell
         self._samples, self._tracker = SampleQueue(), HandTracker()
-        self._lock = threading.Lock()  # of the figures
+        self._lock = threading.Lock()  # Protects the figures.
         self._recorders: dict[str, TopicRecorder] = {}
-        self.peer: str | None = None  # that drives
+        self.peer: str | None = None  # The headset that drives.
         self._connections = 0
         self._last_disconnect: str | None = None
 
     @property
     def connected(self) -> bool:
-        """Whether a headset drives, and no loss is left that :meth:`take` has not shown yet."""
+        """Whether a headset drives, and :meth:`take` has shown every lost connection."""
         return self.peer is not None and not self._samples.is_cut
 
     def admit(self, peer: str) -> None:
-        """A headset drives from now on; nothing of an earlier one counts."""
+        """Let a headset drive from now on, and forget all data of an earlier one."""
         self._watch.reset()
         self._tracker = HandTracker()
         with self._lock:
@@ -41,13 +47,13 @@ class HandStream:
             self.peer = peer
 
     def lose(self, reason: str) -> None:
-        """The headset that drove is gone."""
-        self._samples.cut()  # before the peer, so that `connected` cannot be true of the next one too early
+        """Note that the headset that drove is gone."""
+        self._samples.cut()  # Done before the peer changes, so that `connected` is not true too early for the next one.
         with self._lock:
             self.peer, self._last_disconnect = None, reason
 
     def receive(self, reception: Reception, now: float) -> None:
-        """A message of the headset that drives, received at ``now`` [s]."""
+        """Take a message of the headset that drives, received at ``now`` [s]."""
         with self._lock:
             self._recorders.setdefault(reception.topic, TopicRecorder()).record(reception.message, now)
         for watched in self._watch.receive(reception, now):
@@ -58,11 +64,11 @@ class HandStream:
                 self._samples.put(sample)
 
     def take(self) -> list[HandSample]:
-        """Samples since the last time, oldest first. None of a lost connection: those poses are not the hand's."""
+        """Return the samples since the last call, oldest first. Samples of a lost connection are left out."""
         return self._samples.take()
 
     def statistics(self, address: tuple[str, int], now: float) -> HeadsetStatistics:
-        """A snapshot for people, of a server at ``address``."""
+        """Return a snapshot for people, of a server at ``address``."""
         with self._lock:
             return HeadsetStatistics(
                 address=address,

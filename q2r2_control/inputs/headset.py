@@ -1,4 +1,4 @@
-"""The TCP server that the Quest2ROS app connects to: one background thread, one headset at a time, no ROS."""
+"""The TCP server for the Quest2ROS app. It has one background thread, serves one headset at a time, and uses no ROS."""
 
 from __future__ import annotations
 
@@ -25,26 +25,32 @@ _LOG = logging.getLogger(__name__)
 
 
 def watch_of(config: Config) -> HandsWatch:
-    """The faults of a headset's hands that a cell wants to be found."""
+    """Return a watch for those faults of a headset's hands that the cell's settings name."""
     headset = config.headset
     return HandsWatch(headset.frozen_time, headset.watch_frame, config.teleop.gate.timeout)
 
 
 class HeadsetServer:
-    """Hand samples from, and vibrations to, the Quest2ROS app. Implements :class:`~q2r2_control.inputs.base.Input`.
+    """Receives hand samples from the Quest2ROS app, and sends it vibrations.
 
-    Samples are stamped with ``clock`` when their bytes are received. The loop's thread never waits for the network
-    or for decoding. A client that breaks the protocol, floods, or is silent for 2 s is dropped with one logged line.
-    ``allow`` names the networks whose hosts may connect, None all of them; :func:`~q2r2_control.inputs.listener.decide`
-    says who of those drives. ``watch`` finds poses that must not be followed. A ``listener`` gets each message at once,
-    in the receiving thread; then :meth:`poll` returns nothing. ``say`` gets lines for people once it listens: where,
-    and who can drive.
+    Implements :class:`~q2r2_control.inputs.base.Input`. The loop's thread never waits for the network or for decoding.
+    A client that breaks the protocol, sends too many frames, or is silent for 2 s is dropped with one logged line.
+
+    Args:
+        host: The address to listen on.
+        port: The port to listen on; 0 for any free port.
+        clock: Stamps the samples when their bytes are received [s].
+        listener: Gets each message at once, in the receiving thread. In this case, :meth:`poll` returns nothing.
+        allow: The networks whose hosts may connect; None for all. :func:`~q2r2_control.inputs.listener.decide` decides
+            which of their clients drives.
+        watch: Finds poses that must not be followed.
+        say: Gets lines for people when the server listens: its address, and who can drive.
     """
 
     controls = QUEST_CONTROLS
     options = ("host", "port", "say")
     executable = "tcp_endpoint"
-    url: str | None = None  # the app has no page
+    url: str | None = None  # The app has no page.
 
     def __init__(
         self,
@@ -56,27 +62,31 @@ class HeadsetServer:
         watch: HandsWatch | None = None,
         say: Callable[[str], None] = _LOG.debug,
     ) -> None:
-        self.address = host, port  # after ``start`` the port that was bound
+        self.address = host, port  # After ``start``, the port is the one that was bound.
         self._allow, self._clock, self._say = allow, clock, say
         self._stream = HandStream(watch or HandsWatch(), listener)
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._owed: dict[str, HapticFeedback] = {}  # the newest of each hand
+        self._owed: dict[str, HapticFeedback] = {}  # The newest vibration of each hand.
         self._owed_lock = threading.Lock()
-        self._session_lock = threading.Lock()  # never taken by poll or what sends
-        self._client: Client | None = None  # the last one
+        self._session_lock = threading.Lock()  # Neither poll nor send_haptic takes it.
+        self._client: Client | None = None  # The last client that was admitted.
 
     @classmethod
     def from_config(
         cls, config: Config, host: str | None = None, port: int | None = None, say: Callable[[str], None] = _LOG.debug
     ) -> HeadsetServer:
-        """At the cell's address, or another ``host`` or ``port``."""
+        """Make a server at the address of the cell's headset, or at another ``host`` or ``port``."""
         given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
         headset = HeadsetConfig(**(config.headset.model_dump() | given))
         return cls(headset.host, headset.port, allow=headset.networks, watch=watch_of(config), say=say)
 
     def start(self) -> None:
-        """Listen. Raises :class:`InputError` when host and port cannot be bound, or when already started."""
+        """Listen for headsets.
+
+        Raises:
+            InputError: If host and port cannot be bound, or if the server was started already.
+        """
         if self._thread is not None:
             raise InputError(f"headset: already listening on {written(*self.address)}")
         warm_up()
@@ -96,7 +106,7 @@ class HeadsetServer:
 
     @property
     def connected(self) -> bool:
-        """Whether a headset is connected, and no loss is left that ``poll`` has not shown yet."""
+        """Whether a headset is connected, and ``poll`` has shown every lost connection."""
         return self._stream.connected
 
     @property
@@ -105,11 +115,11 @@ class HeadsetServer:
         return self._stream.peer
 
     def poll(self, now: float) -> list[HandSample]:
-        """Samples since the last poll, oldest first. None of a lost connection: those poses are not the hand's."""
+        """Return the samples since the last poll, oldest first. Samples of a lost connection are left out."""
         return self._stream.take()
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
-        """Vibrate, values clipped to 0..1; nothing happens unless a headset listens, or when a value is not finite."""
+        """Vibrate with values clipped to 0..1. Nothing happens if no headset listens, or if a value is not finite."""
         values = (feedback.frequency, feedback.amplitude)
         if feedback.hand not in SIDES or not all(map(math.isfinite, values)) or self._stream.peer is None:
             return
@@ -135,7 +145,7 @@ class HeadsetServer:
             )
 
     def close(self) -> None:
-        """Drop the headset and stop listening; may be called twice."""
+        """Drop the headset and stop listening. The method may be called twice."""
         if self._thread is None:
             return
         self._stop.set()
@@ -162,7 +172,7 @@ class HeadsetServer:
         self._stream.admit(client.peer)
 
     def _receive(self, client: Client, frame: WireFrame, now: float) -> None:
-        # Locked for each frame, so that a snapshot never waits for a whole burst.
+        # The lock is taken for each frame, so that a snapshot never waits for many frames.
         with self._session_lock:
             reception = client.receive(frame, now)
         if reception is not None:

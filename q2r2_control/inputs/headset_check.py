@@ -17,27 +17,27 @@ from q2r2_control.inputs.messages import MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, HeadsetStatistics
 from q2r2_control.types import SIDES, Array, HandSample
 
-SILENCE = 2.0  # without data before advice is given [s]
+SILENCE = 2.0  # Time without data before advice is given [s].
 _PERIOD = 0.05  # [s]
-_WINDOW = 0.5  # of the movement that is put in words [s]
-_STILL = 0.02  # a hand that moved less in the window is still [m]
+_WINDOW = 0.5  # Length of the movement that is put in words [s].
+_STILL = 0.02  # A hand that moved less in the window is still [m].
 _DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
 
 
 class HandMovement:
-    """Puts one hand's recent movement in words, in the world's axes as the config's ``teleop.axes`` makes them."""
+    """Puts one hand's recent movement in words, in the world's axes that the config's ``teleop.axes`` defines."""
 
     def __init__(self, axes: tuple[str, str, str]) -> None:
         self._axes: Array = axes_matrix(axes)
         self._positions: deque[tuple[float, Array]] = deque(maxlen=1000)
 
     def add(self, sample: HandSample) -> None:
-        """Take a sample; one that is not finite has no direction."""
+        """Take a sample. A sample that is not finite is left out."""
         if np.isfinite(sample.position).all():
             self._positions.append((sample.pose_stamp, self._axes @ sample.position))
 
     def in_words(self, now: float) -> str:
-        """The dominant direction of the last half second: "forward +x", ..., "still", or "no data"."""
+        """Return the dominant direction of the last half second: "forward +x", ..., "still", or "no data"."""
         while self._positions and self._positions[0][0] < now - _WINDOW:
             self._positions.popleft()
         if not self._positions:
@@ -51,12 +51,12 @@ class HandMovement:
 
     @property
     def position(self) -> Array | None:
-        """(3,) newest position of the window [m]."""
+        """The newest position of the window (3,) [m]; None without data."""
         return self._positions[-1][1] if self._positions else None
 
 
 class CheckedServer(Protocol):
-    """A server that headsets connect to, by an app or by a page at ``url``."""
+    """A server to which headsets connect, by an app or by a page at ``url``."""
 
     @property
     def url(self) -> str | None: ...
@@ -70,11 +70,11 @@ class CheckedServer(Protocol):
 @dataclass(frozen=True, slots=True)
 class HeadsetCheck:
     statistics: HeadsetStatistics
-    directions: dict[str, str]  # hand -> where it moves
-    positions: dict[str, Array | None]  # hand -> world position [m]
-    heard: bool  # data came at some time
-    missing: tuple[str, ...]  # topics that a run needs and that never came
-    advice: tuple[str, ...]  # lines; empty while all comes that a run needs
+    directions: dict[str, str]  # Direction of movement by hand, in words.
+    positions: dict[str, Array | None]  # Position by hand, in the world [m].
+    heard: bool  # Whether data came at some time.
+    missing: tuple[str, ...]  # Topics that a run needs and that never came.
+    advice: tuple[str, ...]  # Lines of advice. They are empty while all topics come that a run needs.
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -98,14 +98,14 @@ def watch_headset(
     show: Callable[[HeadsetCheck], None],
     stopping: Callable[[], bool],
 ) -> HeadsetCheck:
-    """Watch a started server for ``duration`` [s] or until ``stopping``; returns the last state, ``show`` gets all."""
+    """Watch a started server for ``duration`` [s] or until ``stopping``. Show each state, and return the last one."""
     hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
     start, heard = time.monotonic(), False
     last_data = dict.fromkeys(needed_topics(config), start)
     missing = tuple(last_data)
     while True:
         now = time.monotonic()
-        ends = stopping() or (duration is not None and now - start >= duration)  # before the last look
+        ends = stopping() or (duration is not None and now - start >= duration)  # Decided before the last poll.
         for sample in server.poll(now):
             hands[sample.hand].add(sample)
             heard = True
@@ -115,7 +115,7 @@ def watch_headset(
         missing = tuple(name for name in missing if name not in statistics.topics)
         silent = tuple(name for name, last in last_data.items() if now - last > SILENCE)
         if ends and not silent:
-            silent = missing  # there is no time left to wait for it
+            silent = missing  # There is no time left to wait for these topics.
         nothing_comes = len(silent) == len(last_data)
         check = HeadsetCheck(
             statistics=statistics,
@@ -132,7 +132,7 @@ def watch_headset(
 
 
 def needed_topics(config: Config) -> tuple[str, ...]:
-    """The needs of a run: poses and inputs, which have the button that engages, of each hand that leads an arm."""
+    """Return the topics that a run needs: poses and inputs (with the buttons) of each hand that leads an arm."""
     same_side = config.teleop.stance is Stance.SIDE_BY_SIDE
     hands = {hand for hand in SIDES for arm in config.arms if (hand == arm) is same_side}
     needed = (MessageType.POSE, MessageType.INPUTS)
@@ -140,7 +140,7 @@ def needed_topics(config: Config) -> tuple[str, ...]:
 
 
 def advice_on_some(silent: tuple[str, ...]) -> tuple[str, ...]:
-    """Missing topics where others come, a line a hand."""
+    """Return advice if some topics come and others are ``silent``, with one line for each hand."""
     lines = []
     for hand in SIDES:
         kinds = {HAND_TOPICS[name].kind: name for name in silent if HAND_TOPICS[name].hand == hand}
@@ -154,7 +154,7 @@ def advice_on_some(silent: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def advice(statistics: HeadsetStatistics, url: str | None = None) -> tuple[str, ...]:
-    """Things to check when no data comes, the most likely cause first."""
+    """Return the things to check if no data comes, the most likely cause first."""
     host, port = statistics.address
     lines = [f"nothing arrives for {SILENCE:g} s on {written(host, port)}"]
     if statistics.peer is not None:

@@ -1,4 +1,4 @@
-"""The door: connections come in at a bounded rate, one client drives, and people are told addresses. No clocks."""
+"""Accept connections at a bounded rate, decide which client drives, and tell people the addresses. No clock is read."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from typing import TypeVar
 from q2r2_control.config.strict import Network
 from q2r2_control.inputs.addresses import reachable_addresses
 
-LINES_PERIOD = 1.0  # between two lines about one host [s]
-MAX_WAITING = 4  # newcomers of which it is not yet known whether they may drive, one of each host
-MAX_HOSTS_NAMED = 8  # with lines of their own within LINES_PERIOD; all others share theirs
+LINES_PERIOD = 1.0  # Time between two lines about one host [s].
+MAX_WAITING = 4  # Greatest number of clients that wait for a decision, one of each host.
+MAX_HOSTS_NAMED = 8  # Number of hosts with lines of their own within LINES_PERIOD. All other hosts share lines.
 ONLY_THIS_MACHINE = ("127.0.0.1", "::1", "localhost")
 _OTHERS = "other hosts"
 
 
 class RateLimit:
-    """At most ``count`` in each ``period`` [s]."""
+    """A limit of at most ``count`` events in each ``period`` [s]."""
 
     def __init__(self, count: int, period: float = 1.0) -> None:
         self._count, self._period = count, period
         self._start, self._taken = -math.inf, 0
 
     def is_open(self, now: float) -> bool:
-        """Whether one more is allowed at ``now`` [s]."""
+        """Return whether one more is allowed at ``now`` [s]."""
         return self._taken < self._count or now - self._start >= self._period
 
     def take(self, now: float) -> bool:
@@ -45,17 +45,17 @@ class RateLimit:
 
 @dataclass
 class _Host:
-    since: float  # of its last line
+    since: float  # Time of its last line [s].
     level: int = 0
-    text: str = ""  # the most important line held back, the newest of those
+    text: str = ""  # The newest of the most important lines that are held back.
     held_back: int = 0
 
 
 class HostLog:
     """Writes at most one line a second about each host.
 
-    A line that comes too early is held back. When the second is over, the newest of the most important ones is
-    written, with the number of those left out.
+    A line that comes too early is held back. When the second is over, the newest of the most important lines is
+    written, with the number of the lines that are left out.
     """
 
     def __init__(self, logger: logging.Logger) -> None:
@@ -63,7 +63,7 @@ class HostLog:
         self._hosts: dict[str, _Host] = {}
 
     def write(self, host: str, level: int, text: str, now: float) -> None:
-        """Write, or hold back, a line about ``host``; ``level`` is one of ``logging``."""
+        """Write a line about ``host``, or hold it back. The ``level`` is one of ``logging``."""
         self.flush(now)
         if host not in self._hosts and len(self._hosts) >= MAX_HOSTS_NAMED:
             host = _OTHERS
@@ -77,7 +77,7 @@ class HostLog:
             known.level, known.text = level, text
 
     def flush(self, now: float) -> None:
-        """Write the lines whose second is over; all of them at ``now`` = inf."""
+        """Write the lines whose second is over. At ``now`` = inf, all lines are written."""
         for host, known in list(self._hosts.items()):
             if now - known.since >= LINES_PERIOD:
                 del self._hosts[host]
@@ -87,30 +87,31 @@ class HostLog:
                     self._hosts[host] = _Host(now)
 
     def _write(self, level: int, text: str) -> None:
-        self._logger.log(level, "%s", text)  # the text is no format: it may quote what a client sent
+        self._logger.log(level, "%s", text)  # The text is not used as a format, since it may quote a client.
 
 
-# Taking a connection costs the interpreter, and so the control loop, some 0.1 ms. A client in the kernel's queue of 128
-# is taken within 0.35 s. When that is full, the kernel drops new ones, and the client tries again after 1 s.
-ACCEPTS, ACCEPTS_PERIOD = 20, 0.05  # [s]
-ANSWERS_PER_SECOND = 10  # to one host; the app connects once a second
-_RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with a reset, which leaves nothing behind in the kernel
+# To accept a connection takes the interpreter, and so the control loop, about 0.1 ms. A client in the kernel's queue of
+# 128 is accepted within 0.35 s. If the queue is full, the kernel drops new clients, and a client tries again after 1 s.
+ACCEPTS, ACCEPTS_PERIOD = 20, 0.05  # Number of connections, and the period in which they are accepted [s].
+ANSWERS_PER_SECOND = 10  # Answers to one host. The app connects once a second.
+_RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with a reset, which leaves nothing behind in the kernel.
 
 
 class TcpListener:
-    """Listens on ``host`` and ``port``. Raises OSError, OverflowError or ValueError where that is not possible.
+    """Listens on ``host`` and ``port``. Raises OSError, OverflowError or ValueError if that is not possible.
 
-    A host that connects more than ``ANSWERS_PER_SECOND`` is closed without a word, which costs least.
+    If a host connects more than ``ANSWERS_PER_SECOND`` times in a second, its connections are closed without an answer,
+    which takes the least time.
     """
 
     def __init__(self, host: str, port: int, log: HostLog) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-        self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # with SO_REUSEADDR
+        self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # Sets SO_REUSEADDR.
         self._socket.setblocking(False)
-        self.port = int(self._socket.getsockname()[1])  # that was bound
+        self.port = int(self._socket.getsockname()[1])  # The port that was bound.
         self.log = log
-        self.accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)  # while it is not open, there is no use in waiting
+        self.accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)  # While it is not open, no connection is accepted.
         self._answers: dict[str, RateLimit] = {}
         self._answers_since = -math.inf
 
@@ -118,13 +119,16 @@ class TcpListener:
         return self._socket.fileno()
 
     def arrivals(self, now: float) -> Iterator[tuple[socket.socket, str, str]]:
-        """Connections within the rate: a socket that does not block, host (IPv4 through IPv6 as IPv4), and peer."""
+        """Yield the connections within the rate: a socket that does not block, the host, and the peer.
+
+        The host of an IPv4 connection through an IPv6 socket is an IPv4 address.
+        """
         while self.accepts.take(now):
             try:
                 connection, address = self._socket.accept()
             except BlockingIOError:
                 return
-            except OSError as error:  # out of file descriptors, or the peer has gone again
+            except OSError as error:  # There are no file descriptors left, or the peer has gone again.
                 logging.getLogger(__name__).debug("accept: %s", error)
                 continue
             host = str(getattr(ip_address(address[0]), "ipv4_mapped", None) or address[0])
@@ -145,17 +149,17 @@ class TcpListener:
 
 
 def written(host: str, port: int) -> str:
-    """Host and port in one text, as ``[::1]:10000`` with IPv6."""
+    """Return host and port in one text, such as ``[::1]:10000`` with IPv6."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def app_settings(host: str, port: int) -> str:
-    """The app's settings, for a server that listens on ``host``."""
+    """Return the app's settings, for a server that listens on ``host``."""
     return f"address {' or '.join(reachable_addresses(host))}, port {port}, protocol ROS2"
 
 
 def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple[str, ...]:
-    """The app's settings, and who can drive now, for a server that listens on ``host``."""
+    """Return lines with the app's settings and who can drive now, for a server that listens on ``host``."""
     if host in ONLY_THIS_MACHINE:
         return (f"{host} can be reached from this machine only; --host 0.0.0.0 admits the network",)
     if allow is None:
@@ -169,44 +173,44 @@ def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach an address."""
+    """Return whether only this machine can reach an address."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 
 
-# Rules 1 to 4 are those of docs/headset.md, "Who drives". A quiet driver gives way only to its own peer, after 37
-# periods of the app's poses, three times as long as the time that pauses the arms. A silently lost link looks alive for
-# seconds.
-QUIET_ALLOWED = 0.5  # without a frame, against the same peer on a new connection [s]
-POSES_ALLOWED = 5.0  # without a hand pose, against a client that sends them [s]
-WAIT_ALLOWED = 2.0  # for a newcomer to show what gives it the place [s]
+# Rules 1 to 4 are those of docs/headset.md, "Who drives". A driver without frames gives way only to its own peer, after
+# 37 periods of the app's poses. That is more than three times the time that pauses the arms. Without this rule, a link
+# that was lost without a message would keep other clients out for seconds.
+QUIET_ALLOWED = 0.5  # A driver without a frame for longer gives way to the same peer on a new connection [s].
+POSES_ALLOWED = 5.0  # A driver without a hand pose for longer gives way to a client that sends poses [s].
+WAIT_ALLOWED = 2.0  # A newcomer that may not drive after this time is refused [s].
 
 
 @dataclass
 class Peer:
     """The known facts about a connected client."""
 
-    peer: str  # address and port, for people
-    host: str  # address
-    since: float  # when it connected [s]
-    last_frame: float  # when its last whole frame was received [s]
-    last_pose: float = -math.inf  # when its last hand pose was received [s]
-    registrations: Sequence[Mapping[str, str]] = ({}, {})  # topics that it publishes, and that it listens to
+    peer: str  # Address and port, for people.
+    host: str  # Address.
+    since: float  # When it connected [s].
+    last_frame: float  # When its last whole frame was received [s].
+    last_pose: float = -math.inf  # When its last hand pose was received [s].
+    registrations: Sequence[Mapping[str, str]] = ({}, {})  # Topics that it publishes, and topics that it listens to.
 
 
 SomePeer = TypeVar("SomePeer", bound=Peer)
 
 
 class Admission(Enum):
-    ADMIT = "admit"  # drives from now on, instead of the driver if there is one
-    WAIT = "wait"  # may stay, unheard, until more is known
+    ADMIT = "admit"  # The client drives from now on, instead of the driver if there is one.
+    WAIT = "wait"  # The client may stay until more is known about it. None of its data is used.
     REFUSE = "refuse"
 
 
 def decide(driver: Peer | None, newcomer: Peer, now: float) -> tuple[Admission, str]:
-    """The admission of ``newcomer`` at ``now`` [s] by rules 2 to 4, and why it, or the ``driver``, gets no place."""
+    """Decide on ``newcomer`` at ``now`` [s] by rules 2 to 4. The text says why it, or the ``driver``, has to leave."""
     if driver is None:
         return Admission.ADMIT, ""
     if now - driver.last_pose > POSES_ALLOWED:
@@ -225,9 +229,10 @@ def decide(driver: Peer | None, newcomer: Peer, now: float) -> tuple[Admission, 
 def verdicts(
     waiting: Sequence[SomePeer], driver: Callable[[], SomePeer | None], now: float
 ) -> Iterator[tuple[SomePeer, bool, str]]:
-    """Each newcomer that is admitted (True) or refused at ``now`` [s], and why it, or the driver, gets no place.
+    """Yield each newcomer that is admitted (True) or refused at ``now`` [s], and why it, or the driver, has to leave.
 
-    Others go on waiting: the newest of each host, and ``MAX_WAITING`` at most. The ``driver`` may change meanwhile.
+    Other newcomers go on waiting: the newest of each host, and ``MAX_WAITING`` at most. The driver may change between
+    two yields, so ``driver`` returns the present one.
     """
     newest = {client.host: client for client in waiting}
     still_waiting = 0
@@ -237,12 +242,12 @@ def verdicts(
         if verdict is Admission.ADMIT:
             yield client, True, reason
         elif verdict is Admission.REFUSE or newest[client.host] is not client or still_waiting == MAX_WAITING:
-            assert current is not None  # without one, everybody is admitted
+            assert current is not None  # Without a driver, every newcomer is admitted.
             yield client, False, reason or f"{current.peer} is connected"
         else:
             still_waiting += 1
 
 
 def is_allowed(host: str, networks: Sequence[Network] | None) -> bool:
-    """Whether the address ``host`` lies in one of ``networks``; None admits all (rule 1)."""
+    """Return whether the address ``host`` lies in one of ``networks``; None allows all addresses (rule 1)."""
     return networks is None or any(ip_address(host) in network for network in networks)

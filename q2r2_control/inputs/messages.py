@@ -1,9 +1,9 @@
-"""The data of the Quest2ROS app in both directions: frames of ROS-TCP-Connector 0.7, and the messages in them. No
-sockets.
+"""Read and write the data of the Quest2ROS app: frames of ROS-TCP-Connector 0.7, and the messages in them.
 
-A frame is ``u32 n | n bytes destination | u32 m | m bytes payload``, little-endian, in both directions (public source
-of Unity ROS-TCP-Connector 0.7.0). Messages are (de)serialised by rosbags and checked more strictly than it does, which
-distinguishes the dialects. Read with the wrong one, a pose is noise and a button stays pressed.
+This module has no sockets. A frame is ``u32 n | n bytes destination | u32 m | m bytes payload``, little-endian, in both
+directions (public source of Unity ROS-TCP-Connector 0.7.0). The package rosbags (de)serialises the messages. This
+module checks them more strictly than rosbags, to distinguish the dialects. If a message is read in the wrong dialect, a
+pose is noise and a button stays pressed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, HapticFeedback
 
 
 class Dialect(StrEnum):
-    """How the app serialises: chosen in its settings, and visible in the bytes only."""
+    """The app's form of serialisation. The app's settings choose it, and only the bytes of the messages show it."""
 
     ROS1 = "ROS1"
     ROS2 = "ROS2"
@@ -34,7 +34,7 @@ class Dialect(StrEnum):
 
 
 class MessageType(StrEnum):
-    """Types by their two-part names on the wire."""
+    """Message types, by their two-part names in the app's frames."""
 
     POSE = "geometry_msgs/PoseStamped"
     TWIST = "geometry_msgs/Twist"
@@ -43,17 +43,17 @@ class MessageType(StrEnum):
 
     @property
     def full_name(self) -> str:
-        """Three-part name, as ROS 2 and rosbags write it."""
+        """The name in three parts, as ROS 2 and rosbags write it."""
         return self.value.replace("/", "/msg/")
 
 
 @dataclass(frozen=True, slots=True)
 class HandPose:
-    """A hand's pose as sent: nothing is normalised, restamped or renamed. An identity rotation has w = -1."""
+    """A hand's pose as it was sent: nothing is normalised, restamped or renamed. An identity rotation has w = -1."""
 
     position: Array  # (3,) [m]
     quaternion: Array  # (4,) x y z w
-    stamp: float  # the headset's own clock [s]
+    stamp: float  # Time on the headset's own clock [s].
     frame_id: str
 
 
@@ -88,10 +88,10 @@ _FIXED_SIZES = {
 
 
 def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
-    """Read a pose, twist or inputs message.
+    """Read a pose, twist or inputs message. Its numbers may have any value, also NaN.
 
-    Numbers may be anything, NaN included; the bytes may not: a length, encapsulation, boolean or string that ``kind``
-    does not have in ``dialect`` raises :class:`ProtocolError`.
+    Raises:
+        ProtocolError: For a length, encapsulation, boolean or string that ``kind`` does not have in ``dialect``.
     """
     _check_bytes(kind, payload, dialect)
     store = message_types(dialect)
@@ -113,7 +113,7 @@ def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
 
 
 def fits(kind: MessageType, payload: bytes, dialect: Dialect) -> bool:
-    """Whether ``payload`` can be a message of ``kind`` in ``dialect``; never true of both dialects."""
+    """Return whether ``payload`` can be a message of ``kind`` in ``dialect``. No payload fits both dialects."""
     try:
         _check_bytes(kind, payload, dialect)
     except ProtocolError:
@@ -129,7 +129,7 @@ def encode(vibration: HapticFeedback, dialect: Dialect) -> bytes:
 
 
 def warm_up() -> None:
-    """Compile every (de)serialiser now, about 0.5 s once a process, so that no first message waits for it."""
+    """Compile every (de)serialiser now, so that no first message waits for it. This takes about 0.5 s per process."""
     for dialect in Dialect:
         for kind in MessageType:
             message_types(dialect).get_msgdef(kind.full_name)
@@ -137,7 +137,7 @@ def warm_up() -> None:
 
 @cache
 def message_types(dialect: Dialect) -> Typestore:
-    """The message types of ROS 1 Noetic or ROS 2 Jazzy, and those of quest2ros."""
+    """Return the message types of ROS 1 Noetic or ROS 2 Jazzy, and those of quest2ros."""
     store = get_typestore(Stores.ROS1_NOETIC if dialect is Dialect.ROS1 else Stores.ROS2_JAZZY)
     for kind, text in ((MessageType.INPUTS, _INPUTS_FIELDS), (MessageType.HAPTIC, _HAPTIC_FIELDS)):
         store.register(get_types_from_msg(text, kind.full_name))
@@ -145,20 +145,23 @@ def message_types(dialect: Dialect) -> Typestore:
 
 
 def _check_bytes(kind: MessageType, payload: bytes, dialect: Dialect) -> None:
-    """Refuse what rosbags accepts: spare bytes, other encapsulations, strings without their NUL, booleans above 1."""
+    """Raise ProtocolError for bytes that rosbags accepts.
+
+    These are spare bytes, other encapsulations, strings without their NUL, and booleans above 1.
+    """
     ros2 = dialect is Dialect.ROS2
-    length = int.from_bytes(payload[12:16], "little")  # of a pose's frame_id, in both dialects
+    length = int.from_bytes(payload[12:16], "little")  # Length of a pose's frame_id, in both dialects.
     if kind is not MessageType.POSE:
         expected = _FIXED_SIZES[kind, dialect]
     elif ros2:
-        expected = 4 + (12 + length + 7) // 8 * 8 + 56  # doubles are aligned to 8, behind the encapsulation
+        expected = 4 + (12 + length + 7) // 8 * 8 + 56  # Doubles are aligned to 8 bytes after the encapsulation.
     else:
         expected = 16 + length + 56
     if len(payload) != expected:
         raise ProtocolError(f"a {dialect} {kind} has {expected} bytes here, got {len(payload)}")
     if ros2 and payload[:4] != _PLAIN_LITTLE_ENDIAN_CDR:
         raise ProtocolError(f"a {dialect} {kind} starts with 00 01 00 00, got {payload[:4].hex(' ')}")
-    # With a frame_id of 4, 12, ... bytes a pose has the same size in both dialects: only the NUL tells them apart.
+    # If the frame_id has 4, 12, ... bytes, a pose has the same size in both dialects. Only the NUL tells them apart.
     if kind is MessageType.POSE and payload[16 : 16 + length].endswith(b"\0") is not ros2:
         raise ProtocolError(f"frame_id of a {dialect} pose ends {'without' if ros2 else 'with'} NUL")
     buttons = payload[4:6] if ros2 else payload[:2]
@@ -170,18 +173,18 @@ def _vector(message: Any) -> Array:
     return np.array([message.x, message.y, message.z])
 
 
-MAX_FRAME_BYTES = 1 << 20  # a hand message has under 200; a longer frame means that the stream is out of step
-KEEPALIVE = bytes(8)  # a frame without destination and payload
+MAX_FRAME_BYTES = 1 << 20  # A hand message has under 200. A longer frame shows that its start was read wrongly.
+KEEPALIVE = bytes(8)  # A frame without destination and payload.
 
 
 class WireFrame(NamedTuple):
     destination: str
     payload: bytes
-    terminated: bool  # whether the destination came with a trailing NUL
+    terminated: bool  # Whether the destination came with a trailing NUL.
 
 
 def encode_frame(destination: str, payload: bytes) -> bytes:
-    """The bytes of one frame from the server, whose destinations carry no NUL in either dialect."""
+    """Return the bytes of one frame from the server. Its destinations have no NUL in either dialect."""
     name = destination.encode()
     return len(name).to_bytes(4, "little") + name + len(payload).to_bytes(4, "little") + payload
 
@@ -189,8 +192,8 @@ def encode_frame(destination: str, payload: bytes) -> bytes:
 class FrameDecoder:
     """Cuts a byte stream into frames, however the network has split or joined them.
 
-    Frames are taken one by one: whole frames before a fault are still used. Holds at most one frame of
-    ``MAX_FRAME_BYTES`` and what :meth:`feed` was last given. Of no use any more after a :class:`ProtocolError`.
+    Frames are taken one by one, so that whole frames before a fault are still used. The decoder holds at most one frame
+    of ``MAX_FRAME_BYTES`` and the last data of :meth:`feed`. After a :class:`ProtocolError`, the decoder is of no use.
     """
 
     def __init__(self) -> None:
@@ -200,10 +203,11 @@ class FrameDecoder:
         self._buffer += data
 
     def next_frame(self) -> WireFrame | None:
-        """The next whole frame, or None until more bytes come.
+        """Return the next whole frame, or None until more bytes come.
 
-        Raises :class:`ProtocolError` for a frame above ``MAX_FRAME_BYTES``, as soon as its length fields say so. Raises
-        it too for a destination that is not UTF-8, and for payload without a destination.
+        Raises:
+            ProtocolError: For a frame above ``MAX_FRAME_BYTES``, as soon as its length fields say so. Also for a
+                destination that is not UTF-8, and for a payload without a destination.
         """
         name_size = self._length_at(0)
         if name_size is None:
@@ -226,7 +230,7 @@ class FrameDecoder:
         return WireFrame(destination, payload, terminated=name.endswith(b"\0"))
 
     def finish(self) -> None:
-        """Tell the decoder that the stream has ended. Raises :class:`ProtocolError` when that was inside a frame."""
+        """Tell the decoder that the stream has ended; raises :class:`ProtocolError` if that was inside a frame."""
         if self._buffer:
             raise ProtocolError(f"stream ended inside a frame, {len(self._buffer)} bytes after its start")
 

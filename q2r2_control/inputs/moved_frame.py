@@ -1,8 +1,8 @@
-"""Notices when not the hands moved but the frame that they are measured in: then both move as one.
+"""Detect that the frame of the hands' poses has moved, and not the hands. Both hands then move as one rigid body.
 
-A frame moves at once, when the headset is recentred, or for as long as something carries it along, such as the
-operator's head. Either looks like a motion of both hands, and no arm may follow it. Human hands do not move as one
-rigid body: they tremble and turn, each on its own.
+A frame moves in one step if the headset is recentred. The motion lasts longer if something carries the frame along,
+such as the operator's head. Both cases look like a motion of the two hands, and no arm may follow it. Human hands do
+not move as one rigid body, because each hand trembles and turns by itself.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import pinocchio as pin
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.types import SIDES, Array, HandInputs
 
-_FARTHEST = 1e3  # of a coordinate: no tracking system reaches as far [m]
+_FARTHEST = 1e3  # Greatest coordinate. No tracking system reaches as far [m].
 
 
 class Move(NamedTuple):
-    """From one place to another, or how much that may be."""
+    """The size of a motion from one place to another, or a limit of it."""
 
     distance: float  # [m]
     angle: float  # [rad]
@@ -34,7 +34,7 @@ class Place(NamedTuple):
 
     @classmethod
     def of(cls, pose: HandPose) -> Place | None:
-        """None where the pose is none."""
+        """Return the place of a pose; None if its numbers are not a pose."""
         length = math.sqrt(float(pose.quaternion @ pose.quaternion))
         if not 0.5 <= length <= 2.0 or not float(np.abs(pose.position).max()) <= _FARTHEST:
             return None
@@ -42,14 +42,14 @@ class Place(NamedTuple):
 
 
 class HandPair(NamedTuple):
-    """Both hands at a time, and what a motion of both as one rigid body does not change."""
+    """Both hands at one time, and the quantities that a motion of both as one rigid body does not change."""
 
     t: float  # [s]
     left: Place
     right: Place
-    seen: Array  # (3,) the right hand's position in the left hand's axes [m]
-    apart: float  # distance of the hands [m]
-    turn: Array  # (3, 3) the right hand's rotation in the left hand's axes
+    seen: Array  # (3,) The right hand's position in the left hand's axes [m].
+    apart: float  # Distance of the hands [m].
+    turn: Array  # (3, 3) The right hand's rotation in the left hand's axes.
 
     @classmethod
     def of(cls, t: float, left: Place, right: Place) -> HandPair:
@@ -58,10 +58,10 @@ class HandPair(NamedTuple):
 
 
 def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
-    """Whether what a rigid motion keeps is kept: distance, relative rotation, and the direction to the other hand.
+    """Return whether distance, relative rotation and direction of the hands are unchanged, as after a rigid motion.
 
-    An angle's tolerance moves the other hand, as seen from this one, by that angle times the distance of the hands. A
-    smaller bound would demand less noise of the rotations than is allowed.
+    An error of a hand's rotation by the angle of the tolerance moves the other hand, in the axes of the first, by that
+    angle times the distance of the hands. A smaller bound would allow less rotation noise than the tolerance itself.
     """
     shift = math.dist(after.seen, before.seen)
     if (
@@ -72,25 +72,28 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
     return 0.5 * (float(np.vdot(before.turn, after.turn)) - 1.0) >= math.cos(tolerance.angle)
 
 
-# A step: from one sample to the next by more than this, and by more than _STANDS_OUT times any of the _BEFORE samples
-# before. From rest that is 0.7 m/s within one sample, more than 30 m/s^2.
+# A step is a motion from one sample to the next by more than this, and by more than _STANDS_OUT times the motion at any
+# of the last _BEFORE samples. From rest, this is 0.7 m/s within one sample, or more than 30 m/s^2.
 _STEP = Move(0.010, math.radians(2.0))
 _STANDS_OUT, _BEFORE = 3.0, 4
-_PERIOD = 1.0 / 72.0  # of samples; closer ones were held up on the way [s]
+_PERIOD = 1.0 / 72.0  # Period of samples [s]. Samples come closer together if one was delayed on the way.
 _STEP_TOLERANCE = Move(0.002, math.radians(0.75))
-# Over a longer gap hands get farther by themselves, from rest with its square: at 20 m/s^2 and 70 rad/s^2 by _STEP [s].
+# In this time, hands move by _STEP from rest at 20 m/s^2 and 70 rad/s^2 [s]. Over a longer gap, they may move farther,
+# by the square of its length.
 _STEP_GAP = 0.032
 # A frame that is carried along.
-_WINDOW = 1.5  # [s]
-_CARRIED = 0.15  # of both hands [m]
+_WINDOW = 1.5  # Length of the motion that is judged [s].
+_CARRIED = 0.15  # Least distance that both hands move [m].
 _NEAR = 0.4 * _CARRIED
 _CARRIED_TOLERANCE = Move(0.001, math.radians(0.5))
-_SAME_TIME = 0.01  # the two hands' messages of one time come within this [s]
-_ALIVE = 0.05  # a hand without a pose for longer is not waited for [s]
-_LONGEST_GAP = 0.15  # what a hand did across a longer one is not judged [s]
-# The buttons of an alignment may come after the poses that it moves; so long nobody is told [s].
+_SAME_TIME = 0.01  # Messages of the two hands within this time belong together [s].
+_ALIVE = 0.05  # A pose does not wait for a hand that has had no pose for longer [s].
+_LONGEST_GAP = 0.15  # The motion of a hand across a longer gap is not judged [s].
+# Delay before a moved frame counts as a fault, since the buttons of an alignment may come after the poses that it
+# moves [s].
 _CHORD_TIME = 0.04
-_CHORD_SEEN = 0.01  # before a pose that they moved, whoever follows it shall have seen those buttons [s]
+# A pose within this time after the buttons of an alignment is dropped, so that its receiver sees the buttons first [s].
+_CHORD_SEEN = 0.01
 
 
 class PoseVerdict(Enum):
@@ -101,24 +104,24 @@ class PoseVerdict(Enum):
 
 
 class MovedFrame:
-    """Judges the poses of both hands as they come. Times are receipt times [s]."""
+    """Judges the poses of both hands when they are received. Times are receipt times [s]."""
 
     def __init__(self, fault_time: float) -> None:
-        """``fault_time``: after the frame has moved, no pose is good for this long [s]."""
+        """Make a detector. After the frame has moved, each pose has a fault for ``fault_time`` [s]."""
         self._fault_time = fault_time
-        self._chords: dict[str, float] = {}  # hands that align, since when
+        self._chords: dict[str, float] = {}  # Since when each hand holds the buttons of an alignment [s].
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything received but who holds the buttons of an alignment."""
+        """Forget everything that was received, except which hand holds the buttons of an alignment."""
         self._ways = {hand: _Way() for hand in SIDES}
         self._pairs: deque[HandPair] = deque()
-        self._near: HandPair  # since when the left hand is within _NEAR of it; where there are pairs
+        self._near: HandPair  # Since this pair, the left hand is within _NEAR of its place. Set if there are pairs.
         self._suspected: float | None = None
         self._bad_until = -math.inf
 
     def take_inputs(self, hand: str, inputs: HandInputs, now: float) -> None:
-        """With both buttons the operator aligns the frame: whatever moves as one then is meant to."""
+        """Take the buttons of a hand. With both buttons the operator aligns the frame, which may then move."""
         if inputs.button_upper and inputs.button_lower:
             self._chords.setdefault(hand, now)
             self.reset()
@@ -135,7 +138,7 @@ class MovedFrame:
         if not way.add(place, now):
             self._pairs.clear()
         other.is_new = other.is_new and now - other.stamp <= _SAME_TIME
-        if other.is_new:  # the counterpart of this one
+        if other.is_new:  # The other hand's pose belongs to this one.
             way.is_new = other.is_new = False
             self._judge(HandPair.of(now, *(self._ways[side].place for side in SIDES)), now)
         if self._suspected is not None:
@@ -160,7 +163,8 @@ class MovedFrame:
             pairs.popleft()
         if math.dist(pair.left.position, self._near.left.position) > _NEAR:
             self._near = pair
-        # Where the left hand stayed near one place for all of the window, nothing was carried: spares a hand at rest.
+        # If the left hand stayed near one place for the whole window, the frame was not carried. A hand at rest then
+        # takes no further computation.
         if self._near.t > pairs[0].t and _carried(pairs):
             self._bad_until = now + self._fault_time
             pairs.clear()
@@ -169,16 +173,16 @@ class MovedFrame:
 class _Way:
     """The recent motion of one hand."""
 
-    place: Place  # after the first one was added
+    place: Place  # Set when the first place is added.
 
     def __init__(self) -> None:
         self.stamp = -math.inf
-        self.is_new = False  # and has no counterpart of the other hand yet
-        self.stands_out = False  # among the moves before
+        self.is_new = False  # Whether the newest place waits for the place of the other hand.
+        self.stands_out = False  # Whether the newest move is a step.
         self._moves: deque[Move] = deque(maxlen=_BEFORE)
 
     def add(self, place: Place, now: float) -> bool:
-        """The newest place; returns whether it goes on from the last one."""
+        """Add the newest place. Return whether it continues the motion, without a long gap."""
         gap = now - self.stamp
         goes_on = gap <= _LONGEST_GAP
         if goes_on:
@@ -200,7 +204,7 @@ class _Way:
 
 
 def _carried(pairs: deque[HandPair]) -> bool:
-    """Whether the newest of ``pairs`` is far from an earlier one, and all in between differ by rigid motions only."""
+    """Return whether the newest pair is far from an earlier one, and all pairs since differ by rigid motions only."""
     newest = pairs[-1]
     for pair in list(pairs)[-2::-1]:
         if not moved_as_one(pair, newest, _CARRIED_TOLERANCE):

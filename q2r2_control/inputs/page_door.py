@@ -1,4 +1,4 @@
-"""Who may open a page of this package: browsers of this machine, or those that know the token of its URL."""
+"""Decide who may open a page of this package: browsers of this machine, or browsers that know the token of its URL."""
 
 from __future__ import annotations
 
@@ -24,19 +24,23 @@ _PORT = re.compile(r":\d{1,5}$")
 def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:
     body = text.encode()
     headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))})
-    headers["X-Frame-Options"] = "DENY"  # a page around this one could steal a click
+    headers["X-Frame-Options"] = "DENY"  # A page around this one could steal a click.
     return Response(status.value, status.phrase, headers, body)
 
 
 def protect(response: Response, policy: str) -> None:
-    """Add the headers of a page: nothing but itself is loaded, it is not kept, and no other site gets its URL."""
+    """Add the headers of a page: its ``policy`` for content, no storage in a cache, and no URL for other sites."""
     response.headers["Content-Security-Policy"] = policy
     response.headers["Cache-Control"] = "no-store"
-    response.headers["Referrer-Policy"] = "no-referrer"  # the URL has the token
+    response.headers["Referrer-Policy"] = "no-referrer"  # The URL has the token.
 
 
 def tls_context(certificate: str | None) -> ssl.SSLContext | None:
-    """For a PEM file with its key; None without one. Raises :class:`ConfigError`."""
+    """Return the TLS settings of a PEM file with its key; None without a file.
+
+    Raises:
+        ConfigError: If the file cannot be used.
+    """
     if certificate is None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -52,9 +56,10 @@ def tls_context(certificate: str | None) -> ssl.SSLContext | None:
 class PageDoor:
     """A socket that listens, and the check of every request to it.
 
-    A page of another site may not connect, since its ``Origin`` differs. Nor may a name that an attacker's DNS leads
-    here, since the names of a loopback address are known. The port of a ``Host`` is free: ssh may forward another one,
-    and the name alone is what an attacker's page lacks. Beyond loopback, a request needs the token of the URL.
+    A page of another site may not connect, since its ``Origin`` differs. A name from an attacker's DNS is refused too,
+    since the names of a loopback address are known. The port of a ``Host`` is not checked, because ssh may forward
+    another port, and an attacker's page already fails by its name. Beyond loopback, a request needs the token of the
+    URL.
     """
 
     def __init__(
@@ -66,10 +71,18 @@ class PageDoor:
         certificate: str | None = None,
         addresses: Sequence[str] = (),
     ) -> None:
-        """``option`` is named in errors, ``addresses`` are in URLs; without them, those of ``host`` are.
+        """Listen on ``host`` and ``port``.
 
-        With a ``certificate``, a PEM file with its key, the page is served by HTTPS. Raises :class:`ConfigError` if the
-        address cannot be bound or the certificate cannot be used.
+        Args:
+            host: The address to listen on.
+            port: The port to listen on; 0 for any free port.
+            option: The option that error messages name.
+            token: The token that a request needs, unless the host is a loopback address.
+            certificate: A PEM file with its key, to serve the page by HTTPS; None for HTTP.
+            addresses: The addresses in the URLs; without any, those of ``host``.
+
+        Raises:
+            ConfigError: If the address cannot be bound, or if the certificate cannot be used.
         """
         self.tls = tls_context(certificate)
         try:
@@ -88,7 +101,7 @@ class PageDoor:
         self.urls = tuple(f"{self._scheme}://{written(name, self.port)}{self._query}" for name in names)
 
     def refusal(self, request: Request, *, with_token: bool = True) -> str | None:
-        """Why a request is not answered, or None."""
+        """Return why a request is refused; None if it is allowed."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         if len(hosts) != 1:
             return "a request needs one Host"
@@ -105,7 +118,7 @@ class PageDoor:
 
     @property
     def _query(self) -> str:
-        """The part of a URL that knows the token."""
+        """The part of a URL that has the token."""
         return "" if self.token is None else f"/?token={self.token}"
 
     def _is_known(self, request: Request) -> bool:

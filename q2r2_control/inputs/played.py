@@ -1,4 +1,4 @@
-"""Plays hands whose poses and buttons are functions of time, the same at every run."""
+"""Play hands whose poses and buttons are functions of time, and the same in every run."""
 
 from __future__ import annotations
 
@@ -13,31 +13,34 @@ import pinocchio as pin
 
 from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, HandInputs, HandSample, HapticFeedback
 
-# Rates that a headset was measured to send at [Hz].
+# Least and greatest measured rate of a headset's samples [Hz].
 _RATES = (72.0, 76.0)
-_LONGEST_DROPOUT = 5  # samples
-_RECEIPT_JITTER = 0.0015  # [s], scale of an exponential distribution
+_LONGEST_DROPOUT = 5  # Greatest number of samples that are lost together.
+_RECEIPT_JITTER = 0.0015  # Scale of the exponential distribution of delays [s].
 _ROTATION_NOISE = math.radians(0.03)
 
 
 class SampleTiming(ABC):
-    """How the samples of one hand come about; at each of ``times``, ``measured`` is asked first, then ``lateness``."""
+    """Times, noise and delays of the samples of one hand.
+
+    For each of the ``times``, ``measured`` is called first, and then ``lateness``.
+    """
 
     @abstractmethod
     def times(self) -> Iterator[float]:
-        """Times [s] of all samples, from 0 on without end."""
+        """Yield the times of all samples, from 0 on without end [s]."""
 
     def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
-        """The measurement of a hand that is at ``pose`` at ``t`` [s]."""
+        """Return the measurement of a hand that is at ``pose`` at ``t`` [s]."""
         return pose
 
     def lateness(self) -> float:
-        """Receipt of a sample after its measurement [s]."""
+        """Return the time from the measurement of a sample to its receipt [s]."""
         return 0.0
 
 
 class EvenSampling(SampleTiming):
-    """Exact poses at an even rate [Hz], received at once, or each later by up to ``jitter`` [s], from ``seed``."""
+    """Exact poses at an even rate [Hz]. Each is received after a random delay of up to ``jitter`` [s]."""
 
     def __init__(self, rate_hz: float, jitter: float = 0.0, seed: int | tuple[int, ...] = 0) -> None:
         self._rate, self._jitter, self._random = rate_hz, jitter, np.random.default_rng(seed)
@@ -50,11 +53,16 @@ class EvenSampling(SampleTiming):
 
 
 class HeadsetSampling(SampleTiming):
-    """A headset's samples, all from ``seed``: uneven at 72-76 Hz, received late, with sensor noise.
+    """The samples of a headset: uneven at 72-76 Hz, received late, and with sensor noise.
 
-    ``position_noise`` is the noise's standard deviation along each axis [m]. ``tremor`` adds that of a human hand, 8-12
-    Hz with about 1 mm and 0.3 degrees; a ``shaky`` one's has 6 Hz, 2 mm and 0.6 degrees. ``dropout_probability`` is
-    that of every sample to be lost, with up to 4 more. All are lost from the first of ``lost`` to the second [s].
+    Args:
+        hand: The hand, which is a part of the seed.
+        seed: Seed of all random numbers.
+        position_noise: Standard deviation of the noise along each axis [m].
+        tremor: Add the tremor of a human hand, 8-12 Hz with about 1 mm and 0.3 degrees.
+        dropout_probability: Probability of every sample to be lost, with up to 4 more.
+        shaky: Change the tremor to 6 Hz, 2 mm and 0.6 degrees.
+        lost: Start and end of a time in which all samples are lost [s].
     """
 
     def __init__(
@@ -71,7 +79,7 @@ class HeadsetSampling(SampleTiming):
         self._lost = lost
         self._random = np.random.default_rng([seed, SIDES.index(hand)])
         self._position_noise, self._dropout_probability = position_noise, dropout_probability
-        # Two tones per degree of freedom beat like a real tremor does.
+        # Two tones per degree of freedom rise and fall together like a real tremor.
         self._frequencies = self._random.uniform(*((5.5, 6.5) if shaky else (8.0, 12.0)), (6, 2))
         self._phases = self._random.uniform(0.0, 2.0 * math.pi, (6, 2))
         self._amplitudes = (1.0 if shaky else 0.5) * tremor * np.array([1e-3] * 3 + [math.radians(0.3)] * 3)
@@ -93,19 +101,19 @@ class HeadsetSampling(SampleTiming):
         return pin.SE3(pin.exp3(turn) @ pose.rotation, pose.translation + shift)
 
     def lateness(self) -> float:
-        """Short of a sample's period, so that the order is kept."""
+        """Return a delay that is shorter than a sample's period, so that the samples keep their order."""
         return min(float(self._random.exponential(_RECEIPT_JITTER)), 0.01)
 
 
-HandPose = Callable[[str, float], pin.SE3]  # hand, time since the first poll [s] -> pose in the input's frame
-HandButtons = Callable[[str, float], HandInputs]  # hand, time since the first poll [s]
+HandPose = Callable[[str, float], pin.SE3]  # Hand, time since the first poll [s] -> pose in the input's frame.
+HandButtons = Callable[[str, float], HandInputs]  # Hand, time since the first poll [s] -> buttons.
 
-# The play pauses when it is not polled for longer than this [s].
+# The motion pauses if the input is not polled for longer than this [s].
 _LONGEST_BACKLOG = 1.0
 
 
 class PlayedInput:
-    """Samples of hands along given ways, from the first poll on, whenever it is polled. Implements :class:`Input`."""
+    """Gives samples of hands along given paths. Their time starts at the first poll. Implements :class:`Input`."""
 
     controls = replace(QUEST_CONTROLS, words=replace(QUEST_CONTROLS.words, nobody="a script moves the hands"))
 
@@ -128,21 +136,24 @@ class PlayedInput:
         self._connected = False
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
-        """Does nothing: what is played has no vibration."""
+        """Do nothing, since played hands have no vibration."""
 
     def hand_pose(self, hand: str, t: float) -> pin.SE3:
-        """Where ``hand`` ideally is at ``t`` [s], on the clock of the samples' stamps; play time before any poll."""
+        """Return the ideal pose of ``hand`` at ``t`` [s] on the clock of the stamps.
+
+        Before any poll, ``t`` is the time since the first poll.
+        """
         return self._pose(hand, t - (self._origin or 0.0))
 
     def poll(self, now: float) -> list[HandSample]:
-        """Samples that came due since the last poll, with the time they were due as receipt time; oldest first."""
+        """Return the samples that became due since the last poll, oldest first. Their receipt time is the due time."""
         if not self._connected or not math.isfinite(now):
             return []
         if self._origin is None:
             self._origin = now
         backlog = now - self._origin - self._due
         if backlog < 0.0:
-            return []  # as at most polls
+            return []  # Most polls end here.
         self._origin += max(backlog - _LONGEST_BACKLOG, 0.0)
         samples = []
         for index, stream in enumerate(self._streams):
@@ -154,15 +165,15 @@ class PlayedInput:
         return sorted(samples, key=lambda sample: sample.pose_stamp)
 
     def due(self) -> float:
-        """When the next sample comes due, on the clock of the polls [s]; inf where there was no poll yet."""
+        """Return when the next sample becomes due, on the clock of the polls [s]; inf if there was no poll yet."""
         return math.inf if self._origin is None else self._origin + self._due
 
     def _first_due(self) -> float:
-        """When the next sample comes due in play time [s]; inf where there is no hand."""
+        """Return when the next sample becomes due, in time since the first poll [s]; inf without a hand."""
         return min((sample.pose_stamp for sample in self._next), default=math.inf)
 
     def _samples(self, hand: str, sampling: SampleTiming) -> Iterator[HandSample]:
-        """With their receipt in play time as stamps."""
+        """Yield samples whose stamps are times of receipt since the first poll [s]."""
         for t in sampling.times():
             pose = sampling.measured(self._pose(hand, t), t)
             due, quaternion = t + sampling.lateness(), pin.Quaternion(pose.rotation).coeffs()

@@ -1,7 +1,7 @@
-"""Actions of a policy as an input: those that a dataset has move the arms again.
+"""Actions of a policy as an input. The actions have the same form as in a dataset.
 
-The numbers of an action are those of the features of datasets, in their order: :class:`ActionSpace`. They are checked
-where they come in, on the policy's own thread, and become tool poses there. Teleop follows these as it follows a hand.
+The numbers of an action are those of a feature of datasets, in the same order: :class:`ActionSpace`. The policy's own
+thread checks them, and converts them to tool poses. Teleop follows these poses as it follows a hand.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import POSE_FIELDS, QUEST_CONTROLS, ActionChunk, Array, HandSample, HapticFeedback, Observation
 
 MOTION_FIELDS = ("x", "y", "z", "rx", "ry", "rz")
-_GAPS = 0.002, 0.5  # from one action to the next [s]
-_MOST = 1000  # actions in a chunk
+_GAPS = 0.002, 0.5  # Least and greatest time from one action to the next [s].
+_MOST = 1000  # Greatest number of actions in a chunk.
 _NO_OPERATOR = replace(QUEST_CONTROLS, words=replace(QUEST_CONTROLS.words, nobody="a policy moves the arms"))
-_KEPT = 20  # chunks between two ticks: of more, the newest
-_JOINED = 1.0  # how long a policy that computes may take to end with the run [s]
+_KEPT = 20  # Number of chunks that are kept between two ticks. These are the newest.
+_JOINED = 1.0  # Time that a computing policy has to finish when the run ends [s].
 
 
 class ActionSpace(StrEnum):
-    """Whose numbers an action has: the name of the feature of a dataset. Openings of all grippers may follow."""
+    """The numbers of an action, by the name of the feature of a dataset. Openings of all grippers may follow."""
 
-    JOINTS = "action"  # joint positions of all arms [rad]
-    TOOL = "action.tool"  # tool poses x y z [m] qx qy qz qw in the world
-    TOOL_DELTA = "action.tool_delta"  # motion to the next target, in the target's own frame [m], rotation vector [rad]
+    JOINTS = "action"  # Joint positions of all arms [rad].
+    TOOL = "action.tool"  # Tool poses x y z [m] qx qy qz qw in the world.
+    TOOL_DELTA = "action.tool_delta"  # Motion to the next target, in the target's frame [m], rotation vector [rad].
 
 
 def action_names(robot: Robot, space: ActionSpace) -> tuple[str, ...]:
-    """The names of an action's numbers, without those of grippers."""
+    """Return the names of an action's numbers, without those of grippers."""
     if space is ActionSpace.JOINTS:
         return tuple(robot.joint_names)
     fields = POSE_FIELDS if space is ActionSpace.TOOL else MOTION_FIELDS
@@ -56,19 +56,23 @@ Policy = Callable[[Observation], npt.ArrayLike]
 
 
 class PolicyInput:
-    """Moves the arms by actions that :meth:`send` brings, and lets a hand take over. Implements :class:`PolicySource`.
+    """Moves the arms by actions of :meth:`send`, and lets a hand take over. Implements :class:`PolicySource`.
 
-    ``policy`` is a function of an :class:`Observation` that returns the next actions, (n, size) or (size,), the first
-    of them for the observation's time. It runs on a thread of its own, and is asked again when half of its actions are
-    over. In simulated time the loop waits for it. Without one, a program calls :meth:`send` by itself, from any thread.
+    Args:
+        policy: A function of an :class:`Observation` that returns the next actions, (n, size) or (size,). The first
+            action is for the observation's time. The function runs on a thread of its own, and is called again when
+            half of its actions are over. In simulated time, the loop waits for it. Without a policy, a program calls
+            :meth:`send` itself, from any thread.
+        space: The space of the actions; None for the policy's attribute ``space``, or joints if it has none.
+        rate: The rate of the actions [Hz]; None for the policy's attribute ``rate``, or 30 Hz if it has none.
+        operator: An input whose hands take over. A press engages an arm, and the next press gives it back.
 
-    ``space`` and ``rate`` [Hz] are those of its actions; None: its attributes of these names, or joints at 30 Hz.
-    ``operator`` is an input whose hands take over: a press engages an arm, and the next one gives it back. Raises
-    :class:`ConfigError` for a space or a rate that is not allowed.
+    Raises:
+        ConfigError: If the space, the rate, the policy or the operator is not allowed.
     """
 
     options = ("policy", "takeover", "fast", "say")
-    simulated = True  # where no hands take over that are not
+    simulated = True  # With an operator, only if the operator's input is simulated too.
 
     def __init__(
         self,
@@ -89,20 +93,20 @@ class PolicyInput:
         check_kind("operator", operator, (Input, NoneType), "an object with all methods of Input, or None")
         self.space, self.period, self._policy, self.operator = ActionSpace(space), 1.0 / float(rate), policy, operator
         self.controls = _NO_OPERATOR if operator is None else operator.controls
-        self.observation: Observation | None = None  # the newest one
+        self.observation: Observation | None = None  # The newest observation.
         self._chunks: deque[ActionChunk] = deque(maxlen=_KEPT)
         self._wake, self._ends = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
         self._robot: Robot | None = None
         self._realtime, self._started = True, False
-        self._due = -np.inf  # when the policy is asked again [s]
+        self._due = -np.inf  # When the policy is called again [s].
         self._errors = PolicyErrors()
 
     @classmethod
     def from_config(
         cls, config: Config, policy: str | None = None, takeover: str | None = None, **options: object
     ) -> PolicyInput:
-        """``policy`` is "module:name" of a policy, or a class of policies; ``takeover`` the name of an input."""
+        """Make an input. ``policy`` is "module:name" of a policy or its class; ``takeover`` is the name of an input."""
         if policy is None:
             raise ConfigError("input policy: --policy MODULE:NAME is missing, which names the policy")
         operator = None if takeover is None else make_input(takeover, config, **options)
@@ -163,11 +167,15 @@ class PolicyInput:
             self.operator.close()
 
     def send(self, actions: npt.ArrayLike, times: npt.ArrayLike | None = None, names: Sequence[str] = ()) -> None:
-        """Actions (n, size) or one (size,), to be followed at ``times`` (n,) [s] on the loop's clock.
+        """Send actions (n, size), or one action (size,). From their first time on, they replace all earlier actions.
 
-        They replace what was sent before from their first time on. Without ``times`` the first is for the newest
-        observation, and the others follow at the rate. ``names`` of the numbers, where given, are checked. Never
-        raises: actions that cannot be used stop the arms, with a line that says why.
+        The method never raises. Actions that cannot be used stop the arms, with a line that says why.
+
+        Args:
+            actions: The numbers of the actions.
+            times: When the arms follow each action (n,), on the loop's clock [s]. Without them, the first action is for
+                the time of the newest observation, and the others follow at the rate.
+            names: The names of the numbers, which are checked. Without them, only the number of values is checked.
         """
         try:
             chunk = self._checked(actions, times, names)
@@ -196,7 +204,7 @@ class PolicyInput:
             self.send(actions, observation.time + self.period * np.arange(count))
         except UnusableError as error:
             self._chunks.append(self._fault(str(error)))
-        except BaseException as error:  # whatever a policy does, the loop goes on
+        except BaseException as error:  # The loop goes on after any error of a policy.
             if not isinstance(error, Exception) and threading.current_thread() is threading.main_thread():
                 raise  # The exception comes from a signal handler, and ends the program.
             self._errors.show(error)
@@ -259,10 +267,10 @@ class PolicyInput:
         return stamps
 
     def _tools(self, postures: Array) -> dict[str, Array]:
-        """Tool poses (n, 7) of each arm at joint positions (n, nv)."""
+        """Return the tool poses (n, 7) of each arm at joint positions (n, nv)."""
         robot = self._robot
         assert robot is not None
-        data = robot.model.createData()  # of this call: any thread may send
+        data = robot.model.createData()  # Each call has its own data, since any thread may send.
         tools = {arm: np.empty((len(postures), 7)) for arm in robot.arms}
         for index, q in enumerate(postures):
             pin.forwardKinematics(robot.model, data, q)
@@ -273,7 +281,7 @@ class PolicyInput:
 
 
 def _loaded(where: str) -> Policy:
-    """The policy at "module:name", of this folder or installed. Raises :class:`ConfigError` where there is none."""
+    """Return the policy at "module:name", from this folder or installed; raises :class:`ConfigError` without one."""
     check_kind("--policy", where, str, "MODULE:NAME")
     module, _, name = where.partition(":")
     if (here := str(Path.cwd())) not in sys.path:
@@ -281,7 +289,7 @@ def _loaded(where: str) -> Policy:
     try:
         found = getattr(importlib.import_module(module), name)
         found = found() if isinstance(found, type) else found
-    except Exception as error:  # whatever its module does
+    except Exception as error:  # The module may raise any error.
         raise ConfigError(f"--policy {where}: {type(error).__name__}: {error}"[:200]) from error
     if not callable(found):
         raise ConfigError(f"--policy {where}: allowed: MODULE:NAME of a function of an Observation, or a class of such")

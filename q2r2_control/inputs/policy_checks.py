@@ -1,4 +1,4 @@
-"""Why the actions of a policy cannot be used, and the traceback of a policy that failed."""
+"""Check the actions of a policy, and log the traceback of a policy that failed."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ import numpy as np
 from q2r2_control.errors import shown
 from q2r2_control.types import Array
 
-_LARGEST = 1e3  # of any number, in metres or radians
+_LARGEST = 1e3  # Largest absolute value of any number [m or rad].
 _logger = logging.getLogger(__name__)
 
 
 class UnusableError(Exception):
-    """Why actions cannot be used."""
+    """Raised if actions cannot be used. The message says why."""
 
 
 def numbers_of(what: str, values: Any) -> Array:
-    """The ``values`` as an array of their own. Raises :class:`UnusableError` where they are no numbers."""
+    """Return a copy of the ``values`` as an array; raises :class:`UnusableError` if they are not numbers."""
     if values is None:
         raise UnusableError(f"{what} are None; allowed: an array of numbers")
     try:
-        return np.array(values, dtype=np.float64)  # a copy: its sender may use the array again
+        return np.array(values, dtype=np.float64)  # A copy, since the sender may use the array again.
     except (TypeError, ValueError, OverflowError) as error:
         raise UnusableError(f"{what} = {shown(values)}; allowed: an array of numbers ({error})") from error
 
 
 def check_finite(values: Array, names: Sequence[str]) -> None:
-    """Raises :class:`UnusableError` for a number of ``values`` (n, size) that is not finite, or too large."""
-    if not (usable := np.abs(values) <= _LARGEST).all():  # nor is NaN
+    """Raise :class:`UnusableError` if a number of ``values`` (n, size) is not finite, or is too large."""
+    if not (usable := np.abs(values) <= _LARGEST).all():  # The comparison is also False for NaN.
         action, column = np.argwhere(~usable)[0]
         allowed = f"allowed: finite numbers, {_LARGEST:g} at most"
         raise UnusableError(f"action {action}: {names[column]} = {values[action, column]}; {allowed}")
 
 
 def check_names(names: Sequence[str], expected: Sequence[str], grippers: Sequence[str]) -> None:
-    """Raises :class:`UnusableError` for other names than the joints' or arms', and grippers' behind, in this order."""
+    """Raise :class:`UnusableError` unless ``names`` are the ``expected`` ones, and then some ``grippers``, in order."""
     for place, name in enumerate(expected):
         if place >= len(names) or names[place] != name:
             found = shown(names[place]) if place < len(names) else "missing"
@@ -50,14 +50,14 @@ def check_names(names: Sequence[str], expected: Sequence[str], grippers: Sequenc
 
 
 class PolicyErrors:
-    """Logs the traceback of each error of a policy once, although the policy is asked many times a second."""
+    """Logs the traceback of each error of a policy once, although the policy is called many times a second."""
 
     def __init__(self) -> None:
-        self._shown: set[str] = set()  # types of errors, and the lines that raised them
+        self._shown: set[str] = set()  # Types of errors, and the lines that raised them.
 
     def show(self, error: BaseException) -> None:
         """Log ``error`` with its traceback, unless this type was logged from the same line before."""
-        own = error.__traceback__  # whose first frame is the caller's, which nobody needs to see
+        own = error.__traceback__  # Its first frame is that of the caller, which is left out.
         trace = None if own is None else own.tb_next
         frames = traceback.extract_tb(trace)
         place = f"{type(error).__name__} {[(frame.filename, frame.lineno) for frame in frames[-1:]]}"

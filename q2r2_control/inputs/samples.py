@@ -1,4 +1,4 @@
-"""Makes samples of messages, but of poses that are no motion of the hands, and queues them for the loop."""
+"""Make samples of the hands' messages, detect poses that must not be followed, and queue the samples for the loop."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ from q2r2_control.inputs.moved_frame import MovedFrame, PoseVerdict
 from q2r2_control.inputs.session import Reception
 from q2r2_control.types import SIDES, HandFault, HandInputs, HandSample
 
-# Between two polls: 0.8 s of poses and inputs of two hands at 75 Hz; a loop that stalls for longer pauses all arms.
+# The samples kept between two polls: 0.8 s of poses and inputs of two hands at 75 Hz. A loop that stalls for longer
+# pauses all arms.
 SAMPLES_KEPT = 256
 
 
 class HandTracker:
-    """Joins the poses and inputs of one connection into samples with the newest of both."""
+    """Joins the poses and inputs of one connection. Each sample has the newest of both."""
 
     def __init__(self) -> None:
         self._poses: dict[str, tuple[HandPose, float, HandFault | None]] = {}
         self._inputs: dict[str, tuple[HandInputs, float]] = dict.fromkeys(SIDES, (HandInputs(), float("-inf")))
 
     def update(self, hand: str, message: HandMessage, now: float, fault: HandFault | None = None) -> HandSample | None:
-        """The sample after ``message`` came at ``now`` [s], a pose with its ``fault``; None before the first pose."""
+        """Return the sample after ``message`` was received at ``now`` [s]; None before the first pose and for a twist.
+
+        ``fault`` is that of a pose.
+        """
         if isinstance(message, HandPose):
             self._poses[hand] = (message, now, fault)
         elif isinstance(message, HandInputs):
@@ -37,17 +41,17 @@ class HandTracker:
 
 
 class SampleQueue:
-    """Bounded queue between two threads that keeps the newest samples, and shows a cut.
+    """Bounded queue between two threads. It keeps the newest samples, and shows that the connection was cut.
 
-    After :meth:`cut` the next two takes are empty, and :attr:`is_cut` is true until the second. A loop that checks once
-    a tick, before or after it takes, cannot miss a connection that was lost and made again. It never reads two clients'
-    poses as one motion.
+    After :meth:`cut` the next two calls of :meth:`take` return nothing, and :attr:`is_cut` is true until the second. A
+    loop that checks :attr:`is_cut` once per tick, before or after :meth:`take`, thus notices a connection that was lost
+    and made again. Such a loop never reads the poses of two clients as one motion.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._samples: deque[HandSample] = deque(maxlen=SAMPLES_KEPT)
-        self._takes_owed = 0  # that return nothing
+        self._takes_owed = 0  # Number of the next takes that return nothing.
 
     @property
     def is_cut(self) -> bool:
@@ -58,7 +62,7 @@ class SampleQueue:
             self._samples.append(sample)
 
     def take(self) -> list[HandSample]:
-        """All samples since the last take, oldest first."""
+        """Return all samples since the last take, oldest first."""
         with self._lock:
             if self._takes_owed:
                 self._takes_owed -= 1
@@ -68,45 +72,51 @@ class SampleQueue:
             return samples
 
     def cut(self) -> None:
-        """The connection is lost: forget queued samples, which may be old."""
+        """Note that the connection is lost, and forget the queued samples, which may be old."""
         with self._lock:
             self._samples.clear()
             self._takes_owed = 2
 
 
-FROZEN_TIME = 0.5  # 37 samples of a headset whose noise changes each of them [s]
+FROZEN_TIME = 0.5  # Time of 37 samples of a headset, whose noise changes each of them [s].
 
 
 class Watched(NamedTuple):
     reception: Reception
-    stamp: float  # receipt time [s]
-    fault: HandFault | None = None  # of a pose
+    stamp: float  # Time of receipt [s].
+    fault: HandFault | None = None  # The fault of a pose.
 
 
 class HandsWatch:
-    """Finds poses of real hands that must not be followed: frozen ones, and those of a frame that moved.
+    """Finds poses of real hands that must not be followed: frozen poses, and poses after their frame has moved.
 
-    Sensor noise changes each pose of a hand at rest: one that stays the same is the copy of an old one. A fault of the
-    frame lasts for twice ``timeout``, after which watches for missing data have noticed that faulty poses are left out.
-    No message is late but for a pose that stands out: it may wait for the other hand's.
+    Sensor noise changes each pose of a hand at rest, so a pose that stays the same is a copy of an old one. A fault of
+    the frame lasts for twice ``timeout``. By then, watches for missing data have noticed that faulty poses are left
+    out. Only a pose after an unusually large step may be delayed, because it may wait for the other hand's pose.
     """
 
     def __init__(
         self, frozen_time: float | None = FROZEN_TIME, frame: bool = True, timeout: float = STREAM_TIMEOUT
     ) -> None:
-        """``frozen_time`` [s]: a pose may stay the same, None: for ever; ``frame``: whether to watch the frame."""
+        """Make a watch.
+
+        Args:
+            frozen_time: A pose that stays the same for this long is frozen [s]; None if no pose counts as frozen.
+            frame: Whether to watch for a frame that moves.
+            timeout: Half the time for which a fault of the frame lasts [s].
+        """
         self._frozen_time, self._watches_frame, self._fault_time = frozen_time, frame, 2.0 * timeout
         self.reset()
 
     def reset(self) -> None:
-        """A new connection: what comes from now on is not the motion of what came before."""
-        self._numbers: dict[str, bytes] = {}  # of each hand's newest pose
-        self._since: dict[str, float] = {}  # when they last changed [s]
+        """Start anew for a new connection, whose poses do not continue the motion of the poses before."""
+        self._numbers: dict[str, bytes] = {}  # The numbers of each hand's newest pose.
+        self._since: dict[str, float] = {}  # When these last changed [s].
         self._frame = MovedFrame(self._fault_time) if self._watches_frame else None
         self._waiting: list[Watched] = []
 
     def receive(self, reception: Reception, now: float) -> list[Watched]:
-        """The samples to hand on after ``reception`` came at ``now`` [s], in this order."""
+        """Return the messages to hand on after ``reception`` came at ``now`` [s], in this order."""
         hand, message = reception.hand, reception.message
         if isinstance(message, HandInputs) and self._frame is not None:
             self._frame.take_inputs(hand, message, now)

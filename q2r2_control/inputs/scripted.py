@@ -1,7 +1,7 @@
-"""Scripted hands: ideal or human-like motion with button presses, the same at every run.
+"""Scripted hands: ideal or human-like motion with button presses, the same in every run.
 
-All motions are displacements from wherever the hands start. Those that are not assembly work are written for the left
-hand, and the right hand mirrors them left to right. Axes: x forwards, y to the left, z up.
+All motions are displacements from the start of each hand. Motions without assembly work are written for the left hand,
+and the right hand mirrors them left to right. The axes are x forwards, y to the left, and z up.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from q2r2_control.robot.compose import compose
 from q2r2_control.types import SIDES, Array, HandInputs
 
 PRESS_DURATION = 0.15  # [s]
-FIRST_PRESS = 0.6  # when the lower buttons engage both arms [s]
-START = 1.2  # of the motion [s]
-_LAST_PRESS, _REST = 0.4, 0.6  # after work: the lower buttons pause both arms, and then the end [s]
-_RAMP = 1.0  # periodic motions gather speed for this long [s]
+FIRST_PRESS = 0.6  # When the lower buttons engage both arms [s].
+START = 1.2  # When the motion starts [s].
+_LAST_PRESS, _REST = 0.4, 0.6  # Time from the work to the press that pauses both arms, and from there to the end [s].
+_RAMP = 1.0  # Periodic motions accelerate for this long [s].
 
 # (t [s], frequency [Hz]) -> displacement (3,) [m] and rotation vector (3,) [rad] of a hand.
 Path = Callable[[float, float], tuple[Array, Array]]
@@ -37,17 +37,17 @@ class HandTrajectory:
     """The motion of both hands over time."""
 
     left: Path
-    right: Path | None = None  # None: the left hand's, mirrored
-    upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # hand -> times [s]
-    lower_presses: tuple[float, ...] = (FIRST_PRESS,)  # of both hands [s]
-    duration: float | None = None  # None: without end [s]
-    steps: tuple[tuple[float, str], ...] = ()  # from when on [s], in words
-    grips: tuple[float, ...] = ()  # taps of the left grip [s]
-    precise: tuple[tuple[float, float], ...] = ()  # from when to when both sticks are pushed up [s]
-    lost: tuple[float, float] = (math.inf, math.inf)  # from when to when the headset does not see the hands [s]
+    right: Path | None = None  # None if the right hand mirrors the left one.
+    upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Times of presses, by hand [s].
+    lower_presses: tuple[float, ...] = (FIRST_PRESS,)  # Times of presses by both hands [s].
+    duration: float | None = None  # [s]; None if the motion has no end.
+    steps: tuple[tuple[float, str], ...] = ()  # Start of each step [s], and the step in words.
+    grips: tuple[float, ...] = ()  # Times of taps on the left grip [s].
+    precise: tuple[tuple[float, float], ...] = ()  # Start and end of each time with both sticks pushed up [s].
+    lost: tuple[float, float] = (math.inf, math.inf)  # Start and end of the time without tracking of the hands [s].
 
     def displacement(self, hand: str, t: float, frequency: float) -> tuple[Array, Array]:
-        """Displacement (3,) [m] and rotation vector (3,) [rad] of ``hand`` at ``t`` [s]."""
+        """Return the displacement (3,) [m] and the rotation vector (3,) [rad] of ``hand`` at ``t`` [s]."""
         if hand == "left":
             return self.left(t, frequency)
         if self.right is not None:
@@ -56,7 +56,7 @@ class HandTrajectory:
         return displacement * (1.0, -1.0, 1.0), turn * (-1.0, 1.0, -1.0)
 
     def inputs(self, hand: str, t: float) -> HandInputs:
-        """Buttons of ``hand`` at time ``t`` [s]; a closed hand also shows on the index trigger."""
+        """Return the buttons of ``hand`` at time ``t`` [s]. The index trigger is pressed while the hand is closed."""
         upper = self.upper_presses.get(hand, ())
         grips = self.grips if hand == "left" else ()
         pressed = [
@@ -74,7 +74,7 @@ class HandTrajectory:
 
 
 def _phase(t: float, frequency: float) -> float:
-    """Angle of a periodic motion that gathers speed without a jerk [rad]."""
+    """Return the angle of a periodic motion, whose speed rises smoothly [rad]."""
     elapsed = max(t - START, 0.0)
     if elapsed < _RAMP:
         return math.pi * frequency * (elapsed - _RAMP / math.pi * math.sin(math.pi * elapsed / _RAMP))
@@ -82,19 +82,19 @@ def _phase(t: float, frequency: float) -> float:
 
 
 def _circle(t: float, frequency: float) -> tuple[Array, Array]:
-    """Radius 0.1 m, sidewards and up, as Quest2ROS2's SimulationInput draws it."""
+    """Return a circle of radius 0.1 m, sidewards and up, as in Quest2ROS2's SimulationInput."""
     phase = _phase(t, frequency)
     return np.array([0.0, 0.1 * math.sin(phase), 0.1 * (1.0 - math.cos(phase))]), np.zeros(3)
 
 
 def _line(t: float, frequency: float) -> tuple[Array, Array]:
-    """0.15 m there and back, forwards and up."""
+    """Return a line of 0.15 m there and back, forwards and up."""
     way = 0.15 * (1.0 - math.cos(_phase(t, frequency))) / 2.0
     return way * np.array([0.6, 0.0, 0.8]), np.zeros(3)
 
 
 def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
-    """30 degrees there and back about x, y and z in turn, 0.05 m above the start."""
+    """Return a rotation of 30 degrees there and back about x, y and z in turn, 0.05 m above the start."""
     phase = _phase(t, frequency)
     turn = np.zeros(3)
     turn[int(phase / (2.0 * math.pi)) % 3] = math.radians(30.0) * (1.0 - math.cos(phase)) / 2.0
@@ -103,7 +103,7 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
 
 
 def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
-    """Hands that do one work of a name after the other, and then pause."""
+    """Return the motion of hands that do several named works one after the other, and then pause the arms."""
     homes: dict[str, WayPoint] = {hand: (0.0, *HOME[hand], 0.0, 0.0) for hand in SIDES}
     points = {hand: [home] for hand, home in homes.items()}
     presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
@@ -136,7 +136,8 @@ def _from_home(points: Sequence[WayPoint], hand: str, precise: Sequence[tuple[fl
 
     def displacement(t: float, frequency: float) -> tuple[Array, Array]:
         place, turn = way.at(t)
-        # While the tool goes a share of the hand's way only, the hand goes farther, and it does not go back afterwards.
+        # With precision, the tool moves only a fraction of the hand's way. The hand therefore moves farther, and keeps
+        # this offset afterwards.
         fine = sum((way.at(min(max(t, begins), ends))[0] - way.at(begins)[0] for begins, ends in precise), np.zeros(3))
         return place - home + (1.0 / PRECISION_SCALE - 1.0) * fine, turn
 
@@ -152,15 +153,20 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
 
 
 def place_of(seed: int, spread: float) -> tuple[float, float]:
-    """How much farther along x and y than in the cell the parts of all tasks lie, up to ``spread`` [m] to any side."""
+    """Return by how much the parts of all tasks are shifted along x and y, by up to ``spread`` [m] to any side."""
     x, y = np.random.default_rng([seed, _PLACES]).uniform(-spread, spread, 2).tolist()
     return x, y
 
 
 def trajectory_named(name: str, place: tuple[float, float] | None = None) -> HandTrajectory:
-    """One of :data:`TRAJECTORIES`, or works such as ``handover+stack``, on parts that lie at another ``place`` [m].
+    """Return one of :data:`TRAJECTORIES`, or several works, such as ``handover+stack``.
 
-    Raises :class:`ConfigError` for others, and for a place of what has no parts.
+    Args:
+        name: The trajectory, or works joined by ``+``.
+        place: By how much all parts are shifted along x and y [m].
+
+    Raises:
+        ConfigError: If the name is unknown, or if a place is given for a motion without parts.
     """
     works = name.split("+")
     if place is not None and all(work in WORKS for work in works):
@@ -175,18 +181,19 @@ def trajectory_named(name: str, place: tuple[float, float] | None = None) -> Han
     return in_sequence([(work, WORKS[work]) for work in works])
 
 
-_PLACES = 7  # beside the seed, so that places do not depend on what else is drawn with it
-_PACE = 1.25  # of hasty hands
-_HESITATIONS, _HESITATES = 3, 0.4  # [s]
-_LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1  # since a headset lost the hands [s]
-_EARLY = (0.1, 0.45)  # when that is, of the work, before it presses on anything
-_NO_PRESS = (0.3, 0.6)  # before and after a press the hands do not stop [s]
+_PLACES = 7  # Second seed, so that places do not depend on other random numbers of the same first seed.
+_PACE = 1.25  # Speed of hasty hands, relative to the written motion.
+_HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and length of each [s].
+# Times since a headset lost the hands: it sees them again, they engage, they carry, and the work goes on [s].
+_LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
+_EARLY = (0.1, 0.45)  # Range of the fraction of the work at which this happens, before a tool presses on anything.
+_NO_PRESS = (0.3, 0.6)  # Times before and after a press in which the hands do not stop [s].
 
 
 def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
-    """The same work by hasty hands: faster, with hesitation, and the headset loses them for a second once.
+    """Return the same work by hasty hands: faster, with hesitation, and once lost by the headset for a second.
 
-    They wait until they are seen again, engage both arms anew, and go on.
+    After the loss, the hands wait until the headset sees them again, engage both arms anew, and go on.
     """
     assert work.duration is not None
     random, presses = np.random.default_rng([seed, len(SIDES)]), [*work.lower_presses, *work.grips]
@@ -229,28 +236,35 @@ def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
     )
 
 
-# Where an operator holds the hands; only what follows from here on moves an arm.
+# Poses of an operator's hands at the start. Only the motion from there moves an arm.
 HANDS_AT_REST = {
     "left": pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([0.35, 0.25, 1.1])),
     "right": pin.SE3(pin.rpy.rpyToMatrix(-0.1, -0.2, -0.3), np.array([0.35, -0.25, 1.1])),
 }
 _DROPOUT_PROBABILITY = 0.005
-_DIFFERENCE = 1e-4  # half a central difference of the ideal pose [s]
+_DIFFERENCE = 1e-4  # Half the time step of a central difference of the ideal pose [s].
 DEFAULT_TRAJECTORY = "meet"
-_FULL_LENGTH = (
-    1.12  # of an arm that does the motions as they are written, an iiwa 7's, from its first joint to its last [m]
-)
+# Length of an iiwa 7 from its first joint to its last. The motions are written for an arm of this length [m].
+_FULL_LENGTH = 1.12
 
 
 class ScriptedInput(PlayedInput):
     """Plays a trajectory of both hands, from the first poll on. Implements :class:`Input`.
 
-    ``human`` hands are those of :class:`HeadsetSampling`, with tremor and dropouts; ``shaky`` ones tremble more, and do
-    their work as :func:`hurried` says. Others are sampled at an even rate,
-    and received each later by up to ``jitter`` [s]. Circle, line and rotate repeat ``frequency_hz`` times a second.
-    Hands go ``scale`` times as far as the trajectory is written, and turn as far as it is. Of tasks, they reach for
-    parts at :func:`place_of` the ``seed`` and ``spread`` [m].
-    Raises :class:`ConfigError` for an unknown trajectory or hand, and for a number that is not allowed.
+    Args:
+        trajectory: A trajectory, or its name.
+        hands: The hands that have samples.
+        human: Sample the hands as :class:`HeadsetSampling` does, with tremor and dropouts.
+        seed: Seed of all random numbers.
+        rate_hz: Even rate of the samples of hands that are neither ``human`` nor ``shaky`` [Hz].
+        frequency_hz: Repetitions of circle, line and rotate per second [Hz].
+        jitter: Greatest delay of each evenly sampled pose [s].
+        scale: Factor of all distances of the trajectory. Rotations are not scaled.
+        shaky: As ``human``, with more tremor. The hands work as :func:`hurried` says.
+        spread: Greatest shift of the parts of a task [m]; see :func:`place_of`.
+
+    Raises:
+        ConfigError: For an unknown trajectory or hand, and for a number that is not allowed.
     """
 
     options = ("trajectory", "human", "seed", "fast", "shaky", "spread")
@@ -306,17 +320,17 @@ class ScriptedInput(PlayedInput):
         shaky: bool = False,
         spread: float = 0.0,
     ) -> ScriptedInput:
-        """Motions as large as the shortest arm of the cell is long, if that is shorter than an iiwa 7.
+        """Make an input whose motions are scaled to the shortest arm of the cell, if it is shorter than an iiwa 7.
 
-        ``fast`` changes nothing: samples come by the time that passes, simulated or not.
+        ``fast`` changes nothing, because the samples depend on the times of the polls only, simulated or not.
         """
         shortest = min(compose(config).arm_lengths().values())
         scale = min(shortest / _FULL_LENGTH, 1.0)
         return cls(trajectory, human=human, seed=seed, shaky=shaky, scale=scale, spread=spread)
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
-        """How ``hand`` ideally moves at ``t`` [s], in the axes that its poses have [m/s, rad/s]."""
-        t -= self._origin or 0.0  # before the difference, which on a clock that counts since 1970 would be coarse
+        """Return the ideal velocity of ``hand`` at ``t`` [s], in the axes of its poses [m/s, rad/s]."""
+        t -= self._origin or 0.0  # Subtracted first, since the difference of times since 1970 would be inexact.
         before, after = (self._ideal(hand, t + step) for step in (-_DIFFERENCE, _DIFFERENCE))
         linear = (after.translation - before.translation) / (2.0 * _DIFFERENCE)
         return pin.Motion(linear, pin.log3(after.rotation @ before.rotation.T) / (2.0 * _DIFFERENCE))

@@ -1,4 +1,4 @@
-"""The session of one client: the ROS-TCP-Connector 0.7 protocol without sockets, threads or clocks."""
+"""Follow the ROS-TCP-Connector 0.7 protocol in the session of one client, without sockets, threads or clocks."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from q2r2_control.inputs.messages import (
 )
 from q2r2_control.types import SIDES, HandFault, HapticFeedback
 
-MAX_OUTGOING_BYTES = 1 << 16  # answers a client may leave unread
-MAX_COMMAND_BYTES = 1 << 14  # JSON of a system command; the app's have under 200
-MAX_TOPICS = 64  # a client may name; the app names about ten
-MAX_INCOMPLETE = 64  # registrations without topic or type that are answered in one session
+MAX_OUTGOING_BYTES = 1 << 16  # Size of the answers that a client may leave unread.
+MAX_COMMAND_BYTES = 1 << 14  # Length of the JSON of a system command. The app's have under 200.
+MAX_TOPICS = 64  # Number of topics that a client may name. The app names about ten.
+MAX_INCOMPLETE = 64  # Number of registrations without topic or type that are answered in one session.
 
 
 class HandTopic(NamedTuple):
@@ -51,19 +51,19 @@ _TOPIC_NAME = re.compile(r"[A-Za-z~_][A-Za-z0-9_~/]{0,255}")
 class Reception(NamedTuple):
     """One message of a hand."""
 
-    topic: str  # without leading slash
+    topic: str  # Name without leading slash.
     hand: str
     message: HandMessage
-    fault: HandFault | None = None  # of a pose, that the headset itself tells of
-    virtual: bool = False  # no hand, but what keys move: it rests without noise
+    fault: HandFault | None = None  # The fault of a pose that the headset itself reports.
+    virtual: bool = False  # True if keys or a gamepad move the hand, so that it rests without noise.
 
 
 def log_frame(level: str, text: str) -> bytes:
-    """A line for the app's console; ``level`` is log, warn or error."""
+    """Return the frame of a line for the app's console; ``level`` is log, warn or error."""
     return encode_frame(f"__{level}", json.dumps({"text": text}).encode())
 
 
-# The app takes any other first frame for an endpoint of another version, and throws it away.
+# The app takes any other first frame for that of an endpoint of another version, and ignores it.
 HANDSHAKE = encode_frame(
     "__handshake",
     json.dumps({"version": "v0.7.0", "metadata": json.dumps({"protocol": Dialect.ROS2.value})}).encode(),
@@ -71,35 +71,39 @@ HANDSHAKE = encode_frame(
 
 
 class _IncompleteRegistrationError(Exception):
-    """A command names no topic or no type: the app's user has left a field empty."""
+    """Raised if a command names no topic or no type, because the app's user has left a field empty."""
 
 
 class HeadsetSession:
-    """Protocol state of one client: frames in through :meth:`receive`, bytes out through :attr:`outgoing`.
+    """The protocol state of one client. :meth:`receive` takes its frames, and :attr:`outgoing` has the bytes for it.
 
-    The server sends first, in ROS2, before the client's dialect is known; an app that is set to ROS1 logs an error and
-    goes on. The dialect is read from the NUL that only ROS2 clients put behind every destination, then each payload has
-    to fit it. No message is read by guessing.
+    The server sends first, in ROS2, before the client's dialect is known. An app that is set to ROS1 logs an error and
+    goes on. The dialect follows from the NUL that only ROS2 clients put behind every destination. Each payload then has
+    to fit this dialect, so that no message is read by guessing.
 
-    Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration with an empty topic or type, which the
-    app's user left empty, gets an error for the app's console, as from Unity's own endpoint. An unknown command, a name
-    that no topic can have, or a payload that its topic cannot have is a :class:`ProtocolError`: the two sides do not
+    Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration whose topic or type the app's user
+    left empty gets an error for the app's console, as from Unity's own endpoint. An unknown command, a name that no
+    topic can have, or a payload that its topic cannot have raises a :class:`ProtocolError`, since the two sides do not
     speak the same protocol.
     """
 
     def __init__(self) -> None:
         self.dialect: Dialect | None = None
-        self.published: dict[str, str] = {}  # topic without leading slash -> type, as registered
-        self.subscribed: dict[str, str] = {}  # topic without leading slash -> its spelling, which the client listens to
+        self.published: dict[str, str] = {}  # Topic without leading slash -> type, as registered.
+        self.subscribed: dict[str, str] = {}  # Topic without leading slash -> the client's own spelling of it.
         self.unknown_topics: Counter[str] = Counter()
         self.outgoing = bytearray(HANDSHAKE)
         self._skip_body = False
         self._incomplete = 0
 
     def receive(self, frame: WireFrame) -> Reception | None:
-        """Take one frame; the hand's message if it was one. Raises :class:`ProtocolError`: drop the client."""
+        """Take one frame, and return the hand's message if the frame has one.
+
+        Raises:
+            ProtocolError: If the client has to be dropped.
+        """
         if not frame.destination and not frame.payload:
-            return None  # a keepalive
+            return None  # The frame is a keepalive.
         dialect = Dialect.ROS2 if frame.terminated else Dialect.ROS1
         if dialect is not (self.dialect or dialect):
             raise ProtocolError(
@@ -122,7 +126,7 @@ class HeadsetSession:
         return self._data(frame, dialect)
 
     def queue_haptic(self, vibration: HapticFeedback) -> None:
-        """Send a vibration, if the client listens; otherwise nothing happens."""
+        """Add a vibration to the outgoing bytes, if the client listens to them; otherwise nothing happens."""
         destination = self.subscribed.get(HAPTIC_TOPICS[vibration.hand])
         if destination is not None and self.dialect is not None:
             self.outgoing += encode_frame(destination, encode(vibration, self.dialect))
@@ -152,10 +156,10 @@ class HeadsetSession:
                 self._register(command, parameters)
             case "__topic_list":
                 types = _TOPIC_TYPES | self.published
-                names = [f"/{name}" for name in types]  # as in the ROS graph
+                names = [f"/{name}" for name in types]  # The names are written as in the ROS graph.
                 self._answer("__topic_list", {"topics": names, "types": list(types.values())})
             case "__ros_service" | "__unity_service" | "__remove_ros_service" | "__remove_unity_service":
-                pass  # there are none
+                pass  # q2r2 has no services.
             case "__request" | "__response":
                 self._skip_body = True
                 if command == "__request":
@@ -164,7 +168,7 @@ class HeadsetSession:
                 raise ProtocolError(f"unknown system command {command!r:.60}")
 
     def _register(self, command: str, parameters: dict[str, Any]) -> None:
-        """Idempotent: the app may register again at any time."""
+        """Register or remove a topic. The app may register the same topic again at any time."""
         written = _text(command, parameters, "topic")
         topic = _topic_name(written)
         registrations = self.published if "publish" in command else self.subscribed
@@ -183,7 +187,7 @@ class HeadsetSession:
 
 
 def _parameters(command: str, payload: bytes) -> dict[str, Any]:
-    """The JSON object of a system command; what is no JSON may also be nested too deeply, or hold too long a number."""
+    """Return the JSON object of a system command. Too deep nesting or too long a number counts as no JSON."""
     if len(payload) > MAX_COMMAND_BYTES:
         raise ProtocolError(f"{command!r:.60}: {len(payload)} bytes, at most {MAX_COMMAND_BYTES} are allowed")
     try:
@@ -205,23 +209,23 @@ def _text(command: str, parameters: dict[str, Any], key: str, whose: str = "") -
 
 
 def _topic_name(name: str) -> str:
-    """The name without its leading slash, which clients may write or not."""
+    """Return the name without its leading slash, which clients may write or not."""
     bare = name.removeprefix("/")
     if not _TOPIC_NAME.fullmatch(bare):
         raise ProtocolError(f"{name!r:.60} is not a topic name")
     return bare
 
 
-_STAMPS_KEPT = 1000  # more than any headset sends in a second
+_STAMPS_KEPT = 1000  # No headset sends as many messages in a second.
 
 
 @dataclass(frozen=True, slots=True)
 class TopicStatistics:
-    """One topic of the app since it connected."""
+    """The messages of one topic since the app connected."""
 
     count: int
-    rate: float  # messages in the last second [Hz]
-    age: float  # since the last message [s]
+    rate: float  # Messages in the last second [Hz].
+    age: float  # Time since the last message [s].
     last: HandMessage
 
 
@@ -229,19 +233,19 @@ class TopicStatistics:
 class HeadsetStatistics:
     """A snapshot of the server. After a disconnect, dialect and topics are those of the last connection."""
 
-    address: tuple[str, int]  # bound host and port
-    peer: str | None  # host:port of the connected headset
+    address: tuple[str, int]  # Bound host and port.
+    peer: str | None  # host:port of the connected headset.
     dialect: Dialect | None
     topics: dict[str, TopicStatistics]
-    unknown_topics: dict[str, int]  # data that nothing here reads, by topic
-    published: tuple[str, ...]  # topics that the app announced
-    subscribed: tuple[str, ...]  # topics that the app listens to
-    connections: int  # since the server was started
-    last_disconnect: str | None  # reason
+    unknown_topics: dict[str, int]  # Number of messages that nothing here reads, by topic.
+    published: tuple[str, ...]  # Topics that the app announced.
+    subscribed: tuple[str, ...]  # Topics that the app listens to.
+    connections: int  # Number since the server was started.
+    last_disconnect: str | None  # The reason of the last disconnection.
 
 
 class TopicRecorder:
-    """Counts the messages of one topic, and keeps the last. Times are receipt times [s]."""
+    """Counts the messages of one topic, and keeps the last one. Times are receipt times [s]."""
 
     _last: HandMessage
 
@@ -255,6 +259,6 @@ class TopicRecorder:
         self._last = message
 
     def snapshot(self, now: float) -> TopicStatistics:
-        """The figures at ``now`` [s]; only after the first :meth:`record`."""
+        """Return the figures at ``now`` [s]. A message has to be recorded first."""
         rate = float(sum(stamp > now - 1.0 for stamp in self._stamps))
         return TopicStatistics(self._count, rate, now - self._stamps[-1], self._last)

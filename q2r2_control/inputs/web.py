@@ -1,4 +1,4 @@
-"""Hands that a page in a browser moves, without a headset."""
+"""Hands that an operator moves on a page in a browser, without a headset."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ _MOTION = ("stance", "axes", "position_scale", "rotation_scale", "axis_scales", 
 
 
 def web_cell(config: Config) -> Config:
-    """The cell with a page's controls. A page drags the tool itself, which moves as far as its hand."""
+    """Return the cell with the page's controls. A tool moves as far as it is dragged on the page."""
     usual = TeleopSettings()
     changes = {name: getattr(usual, name) for name in _MOTION} | {"bindings": _BINDINGS}
     return config.model_copy(update={"teleop": config.teleop.model_copy(update=changes)})
 
 
 class WebInput:
-    """Samples that the page's server sends. Implements :class:`~q2r2_control.inputs.base.Input`.
+    """Gives samples that the page's server sends. Implements :class:`~q2r2_control.inputs.base.Input`.
 
-    Dragging is a dead man. A page that falls silent is found by the teleop layer's gate, as a headset is. A hand is
-    stamped with ``clock`` when it is received.
+    A drag acts as a dead man's switch. If a page sends nothing any more, the teleop layer's gate detects it, as with a
+    headset. ``clock`` stamps each hand when it is received [s].
     """
 
     controls = DeviceControls(buttons=("drag", "gripper"), axes=(), words=_WORDS)
@@ -55,19 +55,19 @@ class WebInput:
         return self._driven and not self._samples.is_cut
 
     def start(self) -> None:
-        """Nothing to do: the page's server runs already."""
+        """Do nothing, since the page's server runs already."""
 
     def receive(
         self, hand: str, position: Sequence[float], quaternion: Sequence[float], controls: Mapping[str, float]
     ) -> None:
-        """A hand at ``position`` [m] and ``quaternion`` x y z w, with its ``controls``; from any thread."""
+        """Take a hand at ``position`` [m] and ``quaternion`` x y z w, with its ``controls``; from any thread."""
         now = self._clock()
         inputs = HandInputs(more=dict(controls))
         self._driven = True
         self._samples.put(HandSample(hand, np.array(position), np.array(quaternion), now, inputs, now))
 
     def lose(self) -> None:
-        """The page that drove is gone; from any thread."""
+        """Note that the page that drove is gone. Any thread may call this."""
         self._samples.cut()
         self._driven = False
 
@@ -75,7 +75,7 @@ class WebInput:
         return self._samples.take()
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
-        """Does nothing: a page has no vibration."""
+        """Do nothing, since a page has no vibration."""
 
     def close(self) -> None:
-        """Nothing to do: the page ends with the run."""
+        """Do nothing, since the page ends with the run."""

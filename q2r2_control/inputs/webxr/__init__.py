@@ -1,5 +1,6 @@
-"""Hands that a web page in a headset's browser sends: nothing is installed there.
+"""Hands that a web page in a headset's browser sends. Nothing has to be installed on the headset.
 
-``webxr`` is the input, the loop's side. ``server`` is the process that serves ``page`` and its socket, and
-``page_messages`` reads what the page sends. ``certificate`` makes what HTTPS needs, ``usb`` leads a cable's port here.
+``webxr`` is the input, on the loop's side. ``server`` is the process that serves ``page`` and its socket, and
+``page_messages`` reads the messages of the page. ``certificate`` makes the certificate and the token that HTTPS needs.
+``usb`` forwards a port of a headset on a cable to this computer.
 """

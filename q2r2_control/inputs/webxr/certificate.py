@@ -1,4 +1,4 @@
-"""A certificate and a token of this installation, made on first use. The key never leaves its folder."""
+"""Make a certificate and a token of this installation on first use. The private key never leaves its folder."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from q2r2_control.extras import install_line
 from q2r2_control.inputs.addresses import NO_NETWORK
 
 _VALID = timedelta(days=365)
-_RENEWED = timedelta(days=7)  # before it expires
+_RENEWED = timedelta(days=7)  # Time before the expiry at which a certificate is renewed.
 
 
 def installation_folder() -> Path:
-    """Where both are kept, for this user only."""
+    """Return the folder of the certificate and the token, which only this user may read."""
     return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "q2r2_control" / "webxr"
 
 
 def installation_token(folder: Path) -> str:
-    """The token, the same in each run, or a headset would have to be given a new URL each time."""
+    """Return the token. It is the same in each run, so that a headset does not need a new URL each time."""
     file = folder / "token"
     try:
         if not file.exists():
@@ -35,10 +35,12 @@ def installation_token(folder: Path) -> str:
 
 
 def own_certificate(folder: Path, addresses: Sequence[str], now: datetime) -> tuple[Path, str | None]:
-    """A PEM file with certificate and key for a server at ``addresses``, and a line where it was made anew.
+    """Return a PEM file with certificate and key for a server at ``addresses``, and a line if it was made anew.
 
-    It is made anew where there is none, where it expires within a week, and for further addresses. Raises
-    :class:`InputError`.
+    The file is made anew if there is none, if the certificate expires within a week, and for further addresses.
+
+    Raises:
+        InputError: If the package cryptography is missing, or if the file cannot be written.
     """
     try:
         from cryptography import x509
@@ -87,7 +89,7 @@ def _made(names: list[str], now: datetime) -> bytes:
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"q2r2_control on {socket.gethostname()}"[:64])])
     made = (
         x509.CertificateBuilder(subject, subject, key.public_key(), x509.random_serial_number())
-        .not_valid_before(now - timedelta(days=1))  # a headset's clock may be behind
+        .not_valid_before(now - timedelta(days=1))  # A headset's clock may be slow.
         .not_valid_after(now + _VALID)
         .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
@@ -108,7 +110,7 @@ def _general_name(name: str) -> object:
 
 
 def _write(file: Path, content: bytes) -> None:
-    """Readable by this user only, and never half written."""
+    """Write a file that only this user can read, and that is never half written."""
     file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     temporary = file.with_suffix(f".{os.getpid()}")
     with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as stream:

@@ -13,13 +13,13 @@ from q2r2_control.inputs.webxr.shown import ShownScene, ShownState
 
 
 class Display(Protocol):
-    """Makes a headset's display of a run; made by the run, used in the process of the page."""
+    """Makes the data that a headset shows of a run. The run makes this object, and the page's process uses it."""
 
     def scene(self) -> ShownScene:
-        """Sent once to each page, as JSON."""
+        """Return the data that is sent once to each page, as JSON."""
 
     def message(self, shown: Any) -> ShownState:
-        """The JSON of what was given to :meth:`DisplayInput.show`."""
+        """Return the JSON data of the state that was given to :meth:`DisplayInput.show`."""
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,20 @@ class HeadsetPageSetup:
     """The first message to the process."""
 
     host: str
-    port: int  # 0: any free one
-    allow: Sequence[Network] | None  # that may connect; None: all
-    addresses: Sequence[str]  # by which others reach it
-    certificate: str | None  # a PEM file with its key; None: http
+    port: int  # The port to listen on; 0 for any free port.
+    allow: Sequence[Network] | None  # Networks that may connect; None for all.
+    addresses: Sequence[str]  # Addresses by which others reach the page.
+    certificate: str | None  # A PEM file with its key; None for HTTP.
     token: str
-    silence: float  # of the page that drives, after which it is dropped [s]
+    silence: float  # A page that drives is dropped if it sends nothing for this time [s].
     display: Display | None
 
 
 class Listening(NamedTuple):
-    """The first answer: it listens."""
+    """The first answer, which says that the process listens."""
 
     port: int
-    urls: tuple[str, ...]  # one for each of its addresses
+    urls: tuple[str, ...]  # One URL for each of its addresses.
 
 
 class Admitted(NamedTuple):

@@ -1,4 +1,4 @@
-"""A page that is connected, and what the process that serves it sends to it."""
+"""A page that is connected, and the data that the server's process sends to it."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from q2r2_control.inputs.webxr.page_messages import PageMessage
 from q2r2_control.inputs.webxr.shown import FromRun, ShownVibration
 from q2r2_control.types import HapticFeedback
 
-MAX_MESSAGES_PER_SECOND = 300  # headsets send up to 120
-_REQUESTS = 0.1  # between two requests of a page that count, but a stop, which always does [s]
-_LONGEST_REASON = 120  # of a closed socket [bytes]
+MAX_MESSAGES_PER_SECOND = 300  # Headsets send up to 120.
+_REQUESTS = 0.1  # Least time between two requests of a page. A stop is never refused [s].
+_LONGEST_REASON = 120  # Greatest length of the reason for which a socket is closed [bytes].
 
 
 class PageClient(Peer):
     """A page that is connected."""
 
     def __init__(self, connection: ServerConnection, host: str, peer: str, page: str, now: float) -> None:
-        # A page keeps its number when it is reloaded, as the app repeats its registrations.
+        # A page keeps its number when it is reloaded. The number thus has the role of the app's registrations.
         super().__init__(peer, host, since=now, last_frame=now, registrations=({"page": page} if page else {}, {}))
         self.connection = connection
-        self.newest: PageMessage | None = None  # that is not passed on yet
-        self.acknowledged = -1  # number of the newest message
+        self.newest: PageMessage | None = None  # The newest message, if it is not passed on yet.
+        self.acknowledged = -1  # Number of the newest message.
         self.refused_hosts: set[str] = set()
         self.due = asyncio.Event()
-        self.vibrations: dict[str, HapticFeedback] = {}  # the newest of each hand
+        self.vibrations: dict[str, HapticFeedback] = {}  # The newest vibration of each hand.
         self.shown: Any = None
         self.picture: bytes | None = None
-        self.driver: str | None = None  # that a page which watches has not been told yet
+        self.driver: str | None = None  # The driver, if a page that watches has not been told yet.
         self.rate, self.requests = RateLimit(MAX_MESSAGES_PER_SECOND), RateLimit(1, _REQUESTS)
-        self.reason = ""  # why this side has ended it
+        self.reason = ""  # Why the server has closed the socket.
         self.closing: asyncio.Future[None] | None = None
 
     def end(self, code: int, reason: str) -> None:
-        """Close the socket, which takes as long as the page likes."""
+        """Begin to close the socket. The page decides how long this takes."""
         self.reason = reason
         shown = reason.encode()[:_LONGEST_REASON].decode(errors="ignore")
         self.closing = asyncio.ensure_future(self.connection.close(code, shown))
 
     async def send_newest(self, scene: str | None, display: Display | None) -> None:
-        """Send the ``scene`` and then the newest only, whenever the page has taken what was sent before."""
+        """Send the ``scene``, and then only the newest data, whenever the page has received the data before."""
         connection = self.connection
         with suppress(ConnectionClosed):
             if scene is not None:

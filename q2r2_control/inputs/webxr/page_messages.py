@@ -1,4 +1,4 @@
-"""The messages of the page, without sockets: JSON of the hands, once a frame of the headset."""
+"""Read the messages of the page: JSON of the hands, once per frame of the headset. This module has no sockets."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from q2r2_control.inputs.messages import HandMessage, HandPose, MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, Reception
 from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandFault, HandInputs
 
-LONGEST = 4096  # of a message [bytes]; those of the page have under 600
-# A pinch of bare fingers, or a touch of a phone's screen: devices without any other button.
+LONGEST = 4096  # Greatest length of a message [bytes]. Those of the page have under 600.
+# A pinch is one of bare fingers, or a touch of a phone's screen. These devices have no other button.
 _NOUNS = {**QUEST_WORDS.nouns, "lower": "A, X or Space", "upper": "B, Y or G", "pinch": "the pinch"}
 _ABSENT = "nothing: no browser drives, open the page"
 CONTROLS = DeviceControls(
@@ -28,9 +28,9 @@ CONTROLS = DeviceControls(
 
 
 class HeadsetRequest(StrEnum):
-    """The requests of the page's buttons. A page that watches may ask for a stop only."""
+    """The requests of the page's buttons. A page that watches may only request a stop."""
 
-    STOP = "stop"  # bring the arms to rest, and end the run
+    STOP = "stop"  # Bring the arms to rest, and end the run.
     HOME = "home"
 
 
@@ -45,29 +45,30 @@ class _PageModel(BaseModel):
 
 
 class HeadsetHand(_PageModel):
-    """One hand. Its numbers may be anything, NaN included: the gate judges them, as those of every headset."""
+    """One hand. Its numbers may have any value, also NaN, since the gate checks them as those of every headset."""
 
-    pose: _Seven | None  # position [m] and quaternion x y z w in the room: x forward, y left, z up; None: not known
+    # Position [m] and quaternion x y z w, in a frame with x forward, y left and z up; None if not known.
+    pose: _Seven | None
     fault: Literal["hand_untracked", "hand_frame_moved"] | None = None
-    buttons: tuple[bool, bool, bool] = (False, False, False)  # upper, lower, pinch
-    axes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # stick to the right and forward, index, middle
+    buttons: tuple[bool, bool, bool] = (False, False, False)  # Upper, lower, pinch.
+    axes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # Stick to the right and forward, index, middle.
 
 
 class PageMessage(_PageModel):
-    """One frame; one without hands says only that the page is alive."""
+    """The message of one frame. A message without hands says only that the page is alive."""
 
     seq: int = Field(ge=0, le=1 << 53)
     hands: dict[_Hand, HeadsetHand] = Field(default_factory=dict)
-    request: HeadsetRequest | None = None  # of its buttons
-    virtual: bool = False  # keys or a gamepad move the hands, which rest without noise
+    request: HeadsetRequest | None = None  # The request of a button of the page.
+    virtual: bool = False  # True if keys or a gamepad move the hands, so that they rest without noise.
 
     @property
     def controls(self) -> dict[str, tuple[bool, ...]]:
-        """Of each hand, the buttons."""
+        """The buttons of each hand."""
         return {name: hand.buttons for name, hand in self.hands.items()}
 
     def receptions(self) -> list[Reception]:
-        """The messages that the Quest2ROS app sends for the same hands."""
+        """Return the messages that the Quest2ROS app would send for the same hands."""
         found = []
         for name, hand in self.hands.items():
             upper, lower, pinch = hand.buttons
@@ -91,7 +92,7 @@ _MESSAGES = TypeAdapter(PageMessage)
 
 
 def read(message: str | bytes) -> PageMessage:
-    """Raises :class:`ProtocolError` for what is no message of the page."""
+    """Read a message of the page; raises :class:`ProtocolError` for anything else."""
     if isinstance(message, bytes):
         raise ProtocolError(f"{len(message)} bytes that are no text; allowed: JSON of the hands")
     try:

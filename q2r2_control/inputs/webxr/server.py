@@ -1,4 +1,4 @@
-"""The process that serves the page and its socket, on one port: who drives, and the newest data in both directions."""
+"""The process that serves the page and its socket on one port. It decides which page drives, and passes on new data."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ from q2r2_control.inputs.webxr.page_client import MAX_MESSAGES_PER_SECOND, PageC
 from q2r2_control.inputs.webxr.page_messages import LONGEST, HeadsetRequest, read
 from q2r2_control.types import HapticFeedback
 
-REFUSED, DROPPED, OVER, FREE = 4001, 4002, 4003, 4004  # codes with which a socket is closed, for the page
+REFUSED, DROPPED, OVER, FREE = 4001, 4002, 4003, 4004  # Codes of a closed socket, which the page reads.
 _MOST_WATCHERS = 8
-_WATCHED = 0.1  # between states for pages that watch [s]
+_WATCHED = 0.1  # Time between two states for pages that watch [s].
 _MOST_SOCKETS = 16
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 _POLICY = "default-src 'self'; connect-src 'self'; style-src 'self'; img-src 'self' blob: data:; base-uri 'none'"
 
 
 class PageServer:
-    """Decides on pages as the TCP server does on headsets, by the same rules."""
+    """Serves pages, and decides which page drives by the same rules as the TCP server does for headsets."""
 
     def __init__(self, setup: HeadsetPageSetup, door: PageDoor, answer: Callable[[Any], None]) -> None:
         self._setup, self._door, self._answer = setup, door, answer
@@ -60,15 +60,15 @@ class PageServer:
         self._log = HostLog(_logger_of(answer))
         self._driver: PageClient | None = None
         self._waiting: list[PageClient] = []
-        self._watchers: list[PageClient] = []  # which never drive
-        self._watched = 0.0  # when they were shown the last state [s]
+        self._watchers: list[PageClient] = []  # Pages that never drive.
+        self._watched = 0.0  # When the last state was shown to them [s].
         self._sockets = 0
         folder = files(__package__).joinpath("page")
         self._files = {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir() if file.is_file()}
         self._scene = json.dumps({"scene": setup.display.scene()}) if setup.display is not None else None
 
     async def run(self, requests: Iterator[Any]) -> None:
-        """Serve until the run closes its end."""
+        """Serve until the run closes its end of the connection to this process."""
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
 
         def pass_on() -> None:
@@ -106,14 +106,14 @@ class PageServer:
         return [*([] if self._driver is None else [self._driver]), *self._waiting, *self._watchers]
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """A file of the page, a refusal, or None for the socket."""
+        """Return a file of the page, a refusal, or None for the socket."""
         path = urlsplit(request.path).path
         name = path.removeprefix("/") or "index.html"
         is_socket = path == "/socket"
         host, _ = _peer_of(connection)
         if not is_allowed(host, self._setup.allow):
             return text_response(http.HTTPStatus.FORBIDDEN, f"{host} is not in headset.allow\n")
-        # The page's other files are in the package, open to all, and no secret.
+        # The page's other files are in the public package, so that they are no secret.
         reason = self._door.refusal(request, with_token=is_socket or name == "index.html")
         if reason is None and is_socket and self._sockets >= _MOST_SOCKETS:
             reason = f"{_MOST_SOCKETS} pages are open"
@@ -155,7 +155,7 @@ class PageServer:
             sending.cancel()
             self._forget(client, client.reason or reason)
             if client.closing is not None:
-                await client.closing  # or the server would close it without the reason
+                await client.closing  # Otherwise the server would close it without the reason.
 
     def _receive(self, client: PageClient, text: str | bytes) -> None:
         now = self._clock()
@@ -171,7 +171,7 @@ class PageServer:
         if client is not self._driver:
             self._settle(now)
             return
-        # Of messages that came together only the newest counts, but none with another button is left out.
+        # If several messages come together, only the newest counts. A message with other buttons is never left out.
         if client.newest is None:
             asyncio.get_running_loop().call_soon(self._pass_on, client)
         elif client.newest.controls != message.controls:
@@ -179,7 +179,7 @@ class PageServer:
         client.newest = message
 
     def _ask(self, client: PageClient, request: HeadsetRequest | None) -> None:
-        """Pass a button's request on: of every page a stop, of the one that drives any."""
+        """Pass on the request of a button: a stop from every page, and any request from the page that drives."""
         is_stop = request is HeadsetRequest.STOP
         is_home = request is HeadsetRequest.HOME and client is self._driver and client.requests.take(self._clock())
         if request is not None and (is_stop or is_home):
@@ -202,7 +202,7 @@ class PageServer:
             client.due.set()
 
     def _take(self, request: Any) -> None:
-        """Store what the driver is to feel and see."""
+        """Store a vibration, a state or a picture for the driver, and a state for pages that watch."""
         driver = self._driver
         if driver is None:
             return
@@ -218,13 +218,13 @@ class PageServer:
                         client.due.set()
             case CameraPicture():
                 driver.picture = request.jpeg
-                return  # it goes after the next pose has come
+                return  # The picture is sent after the next pose has come.
         driver.due.set()
 
     async def _watch(self) -> None:
-        """Look at silent pages, and at those that wait."""
+        """Drop a driver that is silent, and decide on pages that wait."""
         while True:
-            # Data sent before this time are read before anybody is judged by it, as in the TCP server.
+            # All data that were sent before this time are read before a decision about a page, as in the TCP server.
             asked = self._clock()
             await asyncio.sleep(TURN)
             driver = self._driver
@@ -234,7 +234,7 @@ class PageServer:
             self._log.flush(self._clock())
 
     def _settle(self, now: float) -> None:
-        """Decide who drives."""
+        """Decide which page drives."""
         for client, admitted, reason in verdicts(self._waiting, lambda: self._driver, now):
             driver = self._driver
             if admitted:
@@ -256,7 +256,7 @@ class PageServer:
         self._forget(client, reason)
 
     def _forget(self, client: PageClient, reason: str) -> None:
-        """A page is gone, or does not count any more; may be called twice."""
+        """Remove a page that is gone, or that may not drive any more. The method may be called twice."""
         for pages in (self._waiting, self._watchers):
             if client in pages:
                 pages.remove(client)
@@ -272,7 +272,7 @@ class PageServer:
 
 
 def _logger_of(answer: Callable[[Any], None]) -> logging.Logger:
-    """A logger whose lines are the run's."""
+    """Return a logger that sends its lines to the run."""
 
     class Answering(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
@@ -284,14 +284,18 @@ def _logger_of(answer: Callable[[Any], None]) -> logging.Logger:
 
 
 def _peer_of(connection: ServerConnection) -> tuple[str, str]:
-    """Host (IPv4 through IPv6 as IPv4), and with its port for people."""
+    """Return the host (as IPv4 if the connection is IPv4 through IPv6), and host and port in one text for people."""
     address, port = connection.remote_address[:2]
     host = str(getattr(ip_address(address), "ipv4_mapped", None) or address)
     return host, written(host, port)
 
 
 def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
-    """Answer :class:`Listening`, then what the page that drives sends. Raises :class:`ConfigError`."""
+    """Answer with :class:`Listening`, and then with the data of the page that drives.
+
+    Raises:
+        ConfigError: If the address cannot be bound, or if the certificate cannot be used.
+    """
     setup: HeadsetPageSetup | None = next(requests, None)
     if setup is not None:
         door = PageDoor(setup.host, setup.port, "--input webxr", setup.token, setup.certificate, setup.addresses)

@@ -1,6 +1,6 @@
-"""The shapes of what a run tells the page: JSON, whose types for the page's scripts are made of these classes.
+"""The types of the JSON that a run sends to the page. The types for the page's scripts are made from these classes.
 
-Poses are x y z qx qy qz qw in the world, in metres; points are x y z. Colours are r g b, 0 to 255.
+Poses are x y z qx qy qz qw in the world, in metres, and points are x y z. Colours are r g b, from 0 to 255.
 """
 
 from __future__ import annotations
@@ -35,25 +35,28 @@ class ShownScene(TypedDict):
 
     name: str
     meshes: list[ShownMesh]
-    hands: dict[str, list[int]]  # of each arm, joints that go with its tool
+    hands: dict[str, list[int]]  # Joints that move with the tool, by arm.
     parts: dict[str, ShownPart]
     floor: float  # [m]
 
 
 class ShownArm(TypedDict):
-    """An arm. In ``why`` and ``next``, a control stands as its name in braces: the page knows the device in hand."""
+    """An arm. In ``why`` and ``next``, a control has its name in braces, since only the page knows the device.
+
+    ``hand`` is the hand that drives the arm, and ``colour`` is that of the state.
+    """
 
     state: str
-    colour: Colour  # of the state
+    colour: Colour
     why: str
     next: str
-    hand: str  # that drives it
+    hand: str
     tool: Seven
     target: Seven | None
 
 
 class ShownPair(TypedDict):
-    """The pair of bodies with the least to spare."""
+    """The pair of bodies with the least margin."""
 
     ends: tuple[Point, Point]
     margin: float  # [m]
@@ -63,14 +66,14 @@ class ShownState(TypedDict):
     """A moment of a run."""
 
     arms: dict[str, ShownArm]
-    joints: list[Seven]  # by their index in the meshes
+    joints: list[Seven]  # Poses, by the index of the joint in the meshes.
     parts: dict[str, Seven]
     pair: ShownPair | None
     recording: str
 
 
 class ShownVibration(TypedDict):
-    """A vibration, all 0 to 1."""
+    """A vibration, with frequency and amplitude from 0 to 1."""
 
     hand: str
     frequency: float
@@ -78,10 +81,10 @@ class ShownVibration(TypedDict):
 
 
 class FromRun(TypedDict):
-    """A message: any of these."""
+    """A message with any of these fields."""
 
     scene: NotRequired[ShownScene]
     state: NotRequired[ShownState]
-    acknowledged: NotRequired[int]  # with a state: the number of the newest message of the page
+    acknowledged: NotRequired[int]  # Sent with a state: the number of the newest message of the page.
     vibration: NotRequired[ShownVibration]
-    driver: NotRequired[str]  # to a page that watches: who drives
+    driver: NotRequired[str]  # Sent to a page that watches: the page that drives.

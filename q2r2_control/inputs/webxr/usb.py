@@ -1,4 +1,4 @@
-"""A headset on a USB cable: adb leads its own localhost to this machine, so that neither HTTPS nor Wi-Fi is needed."""
+"""A headset on a USB cable: adb forwards the headset's localhost to this machine, without HTTPS and Wi-Fi."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import subprocess
 
 from q2r2_control.errors import InputError
 
-_PATIENCE = 15.0  # for adb, which may start a server of its own [s]
+_PATIENCE = 15.0  # Longest time for adb, which may start a server of its own [s].
 
 
 def reverse(port: int, *, remove: bool = False) -> None:
-    """Lead the headset's ``port`` to the same port here, or no more. Raises :class:`InputError`."""
+    """Forward the headset's ``port`` to the same port here, or end this; raises :class:`InputError` if adb fails."""
     command = ["adb", "reverse", *(["--remove", f"tcp:{port}"] if remove else [f"tcp:{port}"] * 2)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE, check=False)

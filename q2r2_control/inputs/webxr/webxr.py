@@ -1,4 +1,4 @@
-"""The input that a web page in a headset's browser brings: the loop's side."""
+"""The input from a web page in a headset's browser, on the loop's side."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 PORT = 8443
-_READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
-_PATIENCE, _LONGEST = 2.0, 10.0  # for it to end while it does nothing, and while it is busy [s]
-_ROOM = 2  # messages to it that wait; a newer one is better than a queue
+_READY = 120.0  # Longest time until the process is ready before the run, on a busy computer [s].
+_PATIENCE, _LONGEST = 2.0, 10.0  # Longest time for the process to end while it is idle, and while it is busy [s].
+_ROOM = 2  # Number of messages that may wait for the process. The newest data matter more than a long queue.
 _LOG = logging.getLogger(__name__)
 
 
 class WebXrInput:
-    """Hands of a headset's browser. Implements :class:`~q2r2_control.inputs.base.Input`.
+    """Gives the hands of a headset's browser. Implements :class:`~q2r2_control.inputs.base.Input`.
 
-    A process of its own serves page and socket, so neither HTTPS nor JSON takes the interpreter from the loop. From the
-    messages on, samples go the way of those of the Quest2ROS app: :class:`~q2r2_control.inputs.hand_stream.HandStream`.
-    They are stamped with ``clock`` when they come from that process.
+    A process of its own serves page and socket, so that neither HTTPS nor JSON takes the interpreter from the loop. Its
+    messages become samples as those of the Quest2ROS app do: :class:`~q2r2_control.inputs.hand_stream.HandStream`.
+    ``clock`` stamps them when they come from that process [s].
     """
 
     controls = CONTROLS
@@ -73,9 +73,9 @@ class WebXrInput:
         say: Callable[[str], None] = _LOG.info,
         silence: float = SILENCE_ALLOWED,
     ) -> None:
-        """A page that says nothing for ``silence`` [s] is dropped; the gate stops the arms long before."""
-        self.address = host, port  # after ``start`` the port that was bound
-        self.urls: tuple[str, ...] = ()  # after ``start``, one for each address of this computer
+        """A page that sends nothing for ``silence`` [s] is dropped. The gate stops the arms long before."""
+        self.address = host, port  # After ``start``, the port is the one that was bound.
+        self.urls: tuple[str, ...] = ()  # After ``start``, one URL for each address of this computer.
         self._clock, self._allow, self._usb, self._certificate, self._say = clock, allow, by_usb, certificate, say
         self._silence = silence
         self._stream = HandStream(watch or HandsWatch())
@@ -94,7 +94,11 @@ class WebXrInput:
         certificate: Path | None = None,
         say: Callable[[str], None] = _LOG.info,
     ) -> WebXrInput:
-        """At the host of the cell's headset, or another one. Raises :class:`ConfigError`."""
+        """Make an input at the host of the cell's headset, or at another ``host``.
+
+        Raises:
+            ConfigError: If the host is not allowed.
+        """
         headset = HeadsetConfig(**(config.headset.model_dump() | ({} if host is None else {"host": host})))
         if usb and not is_loopback(headset.host):
             raise ConfigError(f"--usb with --host {headset.host}: allowed: 127.0.0.1, which the cable leads to")
@@ -105,24 +109,24 @@ class WebXrInput:
 
     @staticmethod
     def cell(config: Config) -> Config:
-        """The cell with the page's axes, which it knows: x forward, y left, z up."""
+        """Return the cell with the axes of the page's poses: x forward, y left, z up."""
         teleop = config.teleop.model_copy(update={"axes": TeleopSettings().axes})
         return config.model_copy(update={"teleop": teleop})
 
     def show_on(self, display: Display, requests: Mapping[HeadsetRequest, Callable[[], None]]) -> None:
-        """Let pages show a run by ``display``, and ask for ``requests``; before :meth:`start`."""
+        """Let pages show a run by ``display``, and make ``requests``. This is called before :meth:`start`."""
         self._display, self._requests = display, requests
 
     def show(self, content: Any) -> bool:
-        """Show the newest state of the run; False where the last one still waits. Never waits."""
+        """Show the newest state of the run. Return False if the last state still waits. The method never waits."""
         return self._process is not None and self._process.send(Shown(content), 1)
 
     def show_picture(self, jpeg: bytes) -> bool:
-        """Show the newest picture of a camera, as :meth:`show`; from any thread."""
+        """Show the newest picture of a camera, as :meth:`show` does. Any thread may call this."""
         return self._process is not None and self._process.send(CameraPicture(jpeg), 1)
 
     def start(self) -> None:
-        """Serve the page. Raises :class:`InputError` or :class:`ConfigError` where that is not possible."""
+        """Serve the page; raises :class:`InputError` or :class:`ConfigError` if that is not possible."""
         if self._process is not None:
             raise InputError(f"webxr: already serving {self.url}")
         for package in ("websockets", *(("trimesh",) if self._display is not None else ())):
@@ -130,7 +134,7 @@ class WebXrInput:
                 raise InputError(f"--input webxr needs {package}: {install_line('web')}")
         host, port = self.address
         certificate, token, addresses = None, "", reachable_addresses(host)
-        if not is_loopback(host):  # a browser trusts localhost without
+        if not is_loopback(host):  # A browser trusts localhost without a certificate.
             folder = installation_folder()
             token, certificate = installation_token(folder), self._certificate
             if certificate is None:
@@ -161,7 +165,7 @@ class WebXrInput:
 
     @property
     def connected(self) -> bool:
-        """Whether a page drives, and no loss is left that ``poll`` has not shown yet."""
+        """Whether a page drives, and ``poll`` has shown every lost connection."""
         return self._stream.connected and self._process is not None and self._process.alive
 
     @property
@@ -178,7 +182,7 @@ class WebXrInput:
         return self._stream.take()
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
-        """Vibrate, values clipped to 0..1; nothing happens unless a page drives, or when a value is not finite."""
+        """Vibrate with values clipped to 0..1. Nothing happens if no page drives, or if a value is not finite."""
         values = (feedback.frequency, feedback.amplitude)
         if self._process is None or feedback.hand not in SIDES or not all(map(math.isfinite, values)):
             return
@@ -191,7 +195,7 @@ class WebXrInput:
         return self._stream.statistics(self.address, self._clock())
 
     def close(self) -> None:
-        """End the process; may be called twice."""
+        """End the process. The method may be called twice."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -206,7 +210,7 @@ class WebXrInput:
         self._ready.clear()
 
     def _take(self, answer: Any) -> None:
-        """Follow an answer of the process, in a thread of its own."""
+        """Handle an answer of the process. This runs in a thread of its own."""
         match answer:
             case Received(receptions):
                 now = self._clock()
@@ -226,7 +230,7 @@ class WebXrInput:
                 self._ready.set()
 
     def _announce(self) -> None:
-        """Say where the page is, as text and as a code for a camera."""
+        """Tell people the URLs of the page, as text and as codes for a camera."""
         host, port = self.address
         if self._usb:
             self._say(f"webxr: open http://localhost:{port} on the headset")
@@ -245,7 +249,7 @@ class WebXrInput:
 
 
 def _drawn(url: str) -> str:
-    """A code for a camera."""
+    """Return a QR code of ``url`` as text."""
     import segno
 
     drawn = io.StringIO()
