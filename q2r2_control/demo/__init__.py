@@ -1,1 +1,1 @@
-"""Tasks of ``q2r2 demo``, and the judges that say whether the simulated arms did them."""
+"""The tasks of ``q2r2 demo``, and the judges that decide whether the simulated arms did them."""

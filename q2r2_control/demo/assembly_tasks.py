@@ -1,4 +1,4 @@
-"""Small assembly tasks of two arms in simulation, and whether they succeeded, measured by the simulation."""
+"""Small assembly tasks of two arms in simulation, and their results, which the simulation measures."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class TaskResult:
 
     name: str
     succeeded: bool
-    measured: dict[str, float]  # by what it is, with its unit at the end
-    reason: str  # what fell short; empty where it succeeded
+    measured: dict[str, float]  # Numbers by name; the name ends with the unit.
+    reason: str  # The reason of a failure; empty if the task succeeded.
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class AssemblyTask:
     name: str
     about: str
     parts: tuple[str, ...]
-    judges: Callable[[dict[str, float]], tuple[Judge, ...]]  # of parts and their heights [m]
-    pressed: tuple[str, ...] = ()  # parts whose force on the table counts
+    judges: Callable[[dict[str, float]], tuple[Judge, ...]]  # Makes the judges from the heights of the parts [m].
+    pressed: tuple[str, ...] = ()  # The parts whose force on the table counts.
 
 
 _ALL = (
@@ -94,9 +94,10 @@ _TASK_CONTROLS = {"grip": Action.CARRY, "stick_up": Action.PRECISION}
 
 
 def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
-    """The tasks of :data:`TASKS` of these names, ``all`` for every one, in its order: so they can follow each other.
+    """Return the tasks with these names, or every task for ``all``.
 
-    Raises :class:`ConfigError` for a name that is neither.
+    They are in the order of :data:`TASKS`, in which they can follow each other. Raises :class:`ConfigError` for an
+    unknown name.
     """
     wanted = set(names)
     if unknown := sorted(wanted - {*TASKS, ALL_TASKS}):
@@ -105,7 +106,7 @@ def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
 
 
 def with_controls(config: Config) -> Config:
-    """The cell with ``carry`` and ``precision`` bound as tasks have them, where no control is bound to them."""
+    """Return the cell with the tasks' controls for ``carry`` and ``precision``, if the cell binds none to them."""
     bindings = config.teleop.bindings
     given = {control: action for control, action in _TASK_CONTROLS.items() if bindings.words_of(action) is None}
     teleop = config.teleop.model_copy(update={"bindings": bindings.model_copy(update=given)})
@@ -113,7 +114,7 @@ def with_controls(config: Config) -> Config:
 
 
 def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[float, float]) -> Config:
-    """The cell with the parts of ``tasks`` farther along x and y, all by the same ``place`` [m]."""
+    """Return the cell with all parts of ``tasks`` moved by the same ``place`` along x and y [m]."""
     parts = {part for task in tasks for part in task.parts}
     objects = {
         name: item.model_copy(
@@ -127,7 +128,7 @@ def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[fl
 
 
 def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
-    """The same ``results``, all failed where links met, a stop was not certified or a tool did not follow."""
+    """Return the ``results``, but all failed if links met, if a stop was not certified or if a tool did not follow."""
     faults, torque = [], summary.torque
     if torque is not None and torque.met and torque.measured_closest_pair:
         met = " and ".join(torque.measured_closest_pair)
@@ -161,18 +162,18 @@ class TaskWatch:
         self._touches = TouchWatch(plant, robot, parts, tuple(config.mujoco.objects), pressed)
 
     def __call__(self, tick: Tick) -> None:
-        """See what this tick has made of the parts."""
+        """Look at the parts after this tick."""
         self.look(tick.t, tick.dt)
 
     def look(self, t: float, dt: float) -> None:
-        """The same at ``t`` [s], ``dt`` [s] after the last time."""
+        """Look at the parts at ``t`` [s], ``dt`` [s] after the last time."""
         parts = self._touches.look(t)
         for judges in self._judges.values():
             for judge in judges:
                 judge.see(dt, parts)
 
     def results(self) -> tuple[TaskResult, ...]:
-        """Results of all tasks. An arm that touches more than it grasps fails them all."""
+        """Return the results of all tasks. All fail if an arm touches anything except with its fingers on a part."""
         touches = [f"{one} touched {other} at {t:.1f} s" for (one, other), t in self._touches.forbidden.items()]
         results = []
         for name, judges in self._judges.items():

@@ -1,4 +1,4 @@
-"""Judges of work in which a force or a fit counts."""
+"""Judges of tasks in which a force or a fit counts."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Mapping
 
 from q2r2_control.demo.part_judges import FINGERS, HELD_TIME, Judge, PartState, Toucher
 
-_FORCE = (5.0, 15.0)  # [N]
-_MEAN_TIME = 0.05  # over which a force is averaged [s]
-_WIPED, _ASTRAY = 0.3, 0.1  # way with that force [m]; share of the way that may be made with another one
-_DEEP, _BESIDE = 0.003, 0.001  # from the bottom of the hole, and from its middle [m]
+_FORCE = (5.0, 15.0)  # The least and the largest force [N].
+_MEAN_TIME = 0.05  # The time constant of the mean force [s].
+_WIPED, _ASTRAY = 0.3, 0.1  # The least path with that force [m], and the largest other path as a share of it.
+_DEEP, _BESIDE = 0.003, 0.001  # The largest distance from the bottom of the hole, and from its middle [m].
 _STRAIGHT = math.radians(3.0)
 
 
@@ -19,7 +19,7 @@ class WipeJudge(Judge):
 
     def __init__(self, part: str) -> None:
         super().__init__(part)
-        self._place: tuple[float, float] | None = None  # where it was pressed on last
+        self._place: tuple[float, float] | None = None  # The last place at which it was pressed.
         self._force = self._most = self._wiped = self._astray = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
@@ -53,12 +53,12 @@ class WipeJudge(Judge):
 
 
 class PegJudge(Judge):
-    """A part stands straight at the bottom of another one's hole, touched by no finger, for the last second."""
+    """A part stands straight at the bottom of the hole of another part, without a finger on it, for the last second."""
 
     def __init__(self, parts: Mapping[str, float]) -> None:
-        """``parts``: the peg and what has the hole, with the heights of the peg and of the hole's bottom [m]."""
+        """``parts`` are the peg and the part with the hole, and the heights of the peg and of the hole's bottom [m]."""
         super().__init__(*parts)
-        self._rest = 0.5 * sum(parts.values())  # from centre to centre [m]
+        self._rest = 0.5 * sum(parts.values())  # The distance from centre to centre [m].
         self._stood = self._beside = self._above = self._tilt = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:

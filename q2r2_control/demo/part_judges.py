@@ -1,4 +1,4 @@
-"""Judges of work in simulation: they look at the parts alone, so an operator with a headset is judged like a script."""
+"""Judges of tasks in simulation. They look only at the parts, so an operator with a headset is judged like a script."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Toucher:
     """Bodies that may touch a part, as flags."""
 
     NOTHING = 0
-    SURROUNDINGS = 1  # table, floor, and whatever else stands still
+    SURROUNDINGS = 1  # The table, the floor, and everything else that stands still.
     PART = 2
-    ARM = 4  # of either arm all but its fingers
+    ARM = 4  # Either arm without its fingers.
     LEFT_FINGER = 8
     RIGHT_FINGER = 16
 
@@ -34,10 +34,10 @@ _ROBOT = Toucher.ARM | FINGERS
 class PartState:
     """One loose part at one time."""
 
-    place: tuple[float, float, float]  # of its centre in the world [m]
-    tilt: float  # of its own z axis from the world's [rad]
-    touched: int  # by what: flags of :class:`Toucher`
-    pressed: float = 0.0  # on the surroundings, where that is measured [N]
+    place: tuple[float, float, float]  # The place of its centre in the world [m].
+    tilt: float  # The angle between its z axis and that of the world [rad].
+    touched: int  # The bodies that touch it, as flags of :class:`Toucher`.
+    pressed: float = 0.0  # The force on the surroundings, if it is measured [N].
 
 
 class TouchWatch:
@@ -51,7 +51,7 @@ class TouchWatch:
         objects: Sequence[str],
         pressed: Sequence[str] = (),
     ) -> None:
-        """``parts`` are looked at, of those in ``pressed`` the force too; ``objects`` are all that fingers may touch.
+        """Watch ``parts``, and also the force of those in ``pressed``. Fingers may touch all ``objects``.
 
         All are names of ``mujoco.objects``.
         """
@@ -59,23 +59,23 @@ class TouchWatch:
         loose = {self._model.body(name).id for name in objects}
         self._parts = {name: int(self._model.body(name).id) for name in parts}
         self._pressed = {self._parts[name] for name in pressed}
-        self._wrench = np.zeros(6)  # of one contact, the normal first
+        self._wrench = np.zeros(6)  # The wrench of one contact, with the normal force first.
         self._body: list[int] = self._model.geom_bodyid.tolist()
         self._kinds = [Toucher.PART if body in loose else self._kind(body, robot) for body in self._body]
         self._is_grasp = [
             not both & _ROBOT or (both & ~FINGERS) == Toucher.PART for both in range(2 * Toucher.RIGHT_FINGER)
         ]
-        self.forbidden: dict[tuple[str, str], float] = {}  # names of two bodies -> when they touched first [s]
+        self.forbidden: dict[tuple[str, str], float] = {}  # By names of two bodies, the first touch [s].
 
     def look(self, t: float) -> dict[str, PartState]:
-        """Take the pose of every part at ``t`` [s], as it was after the last physics step."""
+        """Return the state of every part at ``t`` [s], as it was after the last physics step."""
         touched, force = dict.fromkeys(self._body, 0), dict.fromkeys(self._body, 0.0)
         kinds, body = self._kinds, self._body
         for contact, (first, second) in enumerate(self._data.contact.geom.tolist()):
             one, other = kinds[first], kinds[second]
             touched[body[first]] |= other
             touched[body[second]] |= one
-            # A finger may touch a part; nothing else of an arm may touch anything, itself and the other arm included.
+            # A finger may touch a part. No other touch of an arm is allowed, also not of itself or of the other arm.
             if not self._is_grasp[one | other]:
                 pair = self._model.body(body[first]).name, self._model.body(body[second]).name
                 self.forbidden.setdefault(pair, t)
@@ -92,7 +92,7 @@ class TouchWatch:
         }
 
     def _kind(self, body: int, robot: Robot) -> int:
-        """Of what is no part: by the joints that move it, from its own up to the world's."""
+        """Return the flag of a body that is not a part, by the joints that move it, from its own up to the world."""
         above = body
         while above:
             for arm, finger in _FINGERS_OF.items():
@@ -109,26 +109,26 @@ class TouchWatch:
         return any(self._model.joint(joint).name in joints for joint in range(first, first + count))
 
 
-HELD_TIME = 1.0  # that a part has to be held, or to rest [s]
-_LIFT = 0.095  # [m]
-_CARRY = 0.1  # [m]
-_FALL = 0.005  # without a finger on it, deeper than a part that is put down [m]
-_PUT_BACK = (0.01, 0.001)  # from where it was, sideways and in height [m]
-_STACKED = (0.01, 0.001)  # from the middle of the part below, sideways and in height [m]
+HELD_TIME = 1.0  # The time for which a part has to be held, or to rest [s].
+_LIFT = 0.095  # The least height to which a part is lifted [m].
+_CARRY = 0.1  # The least distance over which a part is carried [m].
+_FALL = 0.005  # A part without a finger on it falls if it sinks more than this [m]. Putting it down needs less.
+_PUT_BACK = (0.01, 0.001)  # The largest distance from the place at the start, sideways and in height [m].
+_STACKED = (0.01, 0.001)  # The largest distance from the place on the part below, sideways and in height [m].
 _UPRIGHT = math.radians(2.0)
-_LEVEL = math.radians(5.0)  # of what both hands carry
+_LEVEL = math.radians(5.0)  # The limit of the tilt of a part that both hands carry.
 
 
 class Judge:
-    """Follows one task through a run. By itself it says how deep a part fell without a finger on it."""
+    """Follows one task through a run. This base class measures how deep a part fell without a finger on it."""
 
     def __init__(self, *parts: str) -> None:
         self.parts = parts
-        self._held_at: dict[str, float] = {}  # height at which a finger last was on a part [m]
-        self._fell = dict.fromkeys(parts, 0.0)  # deepest [m]
+        self._held_at: dict[str, float] = {}  # The last height of a part with a finger on it [m].
+        self._fell = dict.fromkeys(parts, 0.0)  # The deepest fall of each part [m].
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
-        """Take the state of all parts, ``dt`` [s] after the last."""
+        """Take the state of all parts, ``dt`` [s] after the last one."""
         for name in self.parts:
             height = parts[name].place[2]
             if parts[name].touched & FINGERS:
@@ -136,18 +136,18 @@ class Judge:
             self._fell[name] = max(self._fell[name], self._held_at.get(name, height) - height)
 
     def measured(self) -> dict[str, float]:
-        """Figures so far, by what they are, with the unit at the end."""
+        """Return the figures so far, by name; each name ends with the unit."""
         return {"fall_mm": 1e3 * max(self._fell.values())}
 
     def faults(self) -> list[str]:
-        """Shortcomings so far; empty: success."""
+        """Return the reasons so far why the task is not done; the list is empty after success."""
         return [f"{name}: fell {1e3 * depth:.0f} mm" for name, depth in self._fell.items() if depth > _FALL]
 
 
 class LiftJudge(Judge):
     """A part is lifted, held up for a second and put back to where it lay, without a fall.
 
-    Once it has lain there for a second nobody holds it to this any more: other work may go on with it.
+    After it has lain there for a second, the judge does not watch it any more, since another task may use the part.
     """
 
     _wanted = f"held {1e3 * _LIFT:.0f} mm up"
@@ -156,7 +156,7 @@ class LiftJudge(Judge):
         super().__init__(part)
         self._start: tuple[float, float, float] | None = None
         self._held = self._longest = self._height = self._lain = 0.0
-        self._away = (0.0, 0.0)  # from the start, sideways and in height [m]
+        self._away = (0.0, 0.0)  # The distance from the start, sideways and in height [m].
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
         if self._lain >= HELD_TIME:
@@ -193,7 +193,7 @@ class LiftJudge(Judge):
 
 
 class CarryJudge(LiftJudge):
-    """The same with both hands at once, 100 mm from where it lay, and never inclined by 5 degrees or more."""
+    """The same as :class:`LiftJudge`, with both hands at once, 100 mm away, and always tilted less than 5 degrees."""
 
     _wanted = f"held by both hands, {1e3 * _LIFT:.0f} mm up and {1e3 * _CARRY:.0f} mm away,"
 
@@ -217,12 +217,12 @@ class CarryJudge(LiftJudge):
 
 
 class StackJudge(Judge):
-    """Parts rest on each other, upright and touched by no finger, for the last second."""
+    """Parts rest on each other, upright and without a finger on them, for the last second."""
 
     def __init__(self, parts: Mapping[str, float]) -> None:
-        """``parts``: from the lowest to the highest, with their heights [m]."""
+        """``parts`` are the parts from the lowest to the highest, with their heights [m]."""
         super().__init__(*parts)
-        self._rest = [0.5 * (low + high) for low, high in pairwise(parts.values())]  # from centre to centre [m]
+        self._rest = [0.5 * (low + high) for low, high in pairwise(parts.values())]  # Between centres [m].
         self._stood = self._sideways = self._tilt = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
@@ -255,7 +255,7 @@ class HandoverJudge(Judge):
         super().__init__(part)
         self._giver, self._taker = giver, taker
         self._by_giver = self._by_both = self._alone = self._longest = self._farthest = 0.0
-        self._given: tuple[float, float, float] | None = None  # where the giver let go
+        self._given: tuple[float, float, float] | None = None  # The place where the giver let go.
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
         super().see(dt, parts)

@@ -1,4 +1,4 @@
-"""Tasks tried again and again in simulated time, each by hands that tremble in their own way."""
+"""Repeats tasks many times in simulated time. The hands tremble differently in each trial."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from q2r2_control.process.pools import pool_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 
-_WANTED = 0.95  # of the trials
+_WANTED = 0.95  # The share of trials that have to succeed.
 
 
 @dataclass(frozen=True, slots=True)
 class TrialReport:
-    """Trials of one task, of seeds 0, 1, ..."""
+    """The trials of one task with the seeds 0, 1, ..."""
 
     task: str
     trials: int
-    failures: dict[int, str]  # by seed, what fell short
+    failures: dict[int, str]  # By seed, the reason of the failure.
 
     @property
     def succeeded(self) -> int:
@@ -35,7 +35,7 @@ class TrialReport:
 
     @property
     def is_reliable(self) -> bool:
-        """Whether 19 of 20 trials succeed, or more."""
+        """Return whether at least 19 of 20 trials succeed."""
         return self.succeeded >= _WANTED * self.trials
 
 
@@ -57,7 +57,7 @@ def try_tasks(
                 failures[task][seed] = failure
             progress(f"{task}, seed {seed}: {failure or 'succeeded'}")
     except KeyboardInterrupt:
-        for worker in active_children():  # a trial has nothing to close, and takes a while
+        for worker in active_children():  # A trial takes long and has nothing to close, so it is killed.
             worker.kill()
         raise
     finally:
@@ -66,7 +66,7 @@ def try_tasks(
 
 
 def try_task(config: Config, mode: CommandMode, shaky: bool, job: tuple[str, int]) -> str:
-    """Try a task of a name with a seed; returns what fell short, empty where it succeeded."""
+    """Try the task with the name and the seed of ``job``; returns why it failed, or an empty text after success."""
     name, seed = job
     config, work = with_controls(config), trajectory_named(name)
     work = hurried(work, seed) if shaky else work

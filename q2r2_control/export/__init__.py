@@ -1,1 +1,1 @@
-"""Recordings as datasets that policies are trained on."""
+"""Converts recordings to datasets that policies are trained on."""

@@ -1,4 +1,4 @@
-"""The README of a LeRobotDataset: the units of its numbers, for which the format itself has no place."""
+"""Writes the README of a LeRobotDataset, with the units of its numbers, which the format itself does not store."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 from q2r2_control.export.sampling import units_of
 
 CARD = "README.md"
-POSITION = ".pos"  # which lerobot looks for at the end of names of what a policy sees and commands
-SOURCES = "meta/recordings.json"  # which recording an episode is of; lerobot itself does not read it
+POSITION = ".pos"  # lerobot expects this end of the names of numbers in the state and the action.
+SOURCES = "meta/recordings.json"  # The recording of each episode. lerobot does not read this file.
 
 
 def write_card(info: Mapping[str, Any], sources: Sequence[Mapping[str, Any]], folder: Path) -> None:
-    """Write the README of the dataset in ``folder``, whose ``info.json`` says ``info``, from these ``sources``."""
+    """Write the README of the dataset in ``folder``, which has ``info`` in its ``info.json`` and these ``sources``."""
     vectors = {name: feature["names"] for name, feature in info["features"].items() if _is_vector(feature)}
     ahead = sources[0].get("action_ahead_frames", 0)
     later = f" The row of frame k has `action` and `action.tool` of frame k + {ahead}." if ahead else ""
@@ -36,7 +36,7 @@ def _is_vector(feature: Mapping[str, Any]) -> bool:
 
 
 def _numbers(feature: str, labels: Sequence[str]) -> str:
-    """Labels, and behind those that follow each other with one unit that unit."""
+    """Return the labels as a text; neighbouring labels with the same unit have it once, after them."""
     plain = tuple(label.removesuffix(POSITION) for label in labels)
     units = units_of({feature: plain})[feature]
     runs = groupby(zip(labels, units, strict=True), key=lambda pair: pair[1])

@@ -1,4 +1,7 @@
-"""Episodes of recordings as vectors at a fixed rate and pictures, made by several processes and kept until all are."""
+"""Converts episodes of recordings to vectors and pictures at a fixed rate.
+
+Several processes do the work. Finished episodes are kept until all are finished.
+"""
 
 from __future__ import annotations
 
@@ -25,19 +28,19 @@ from q2r2_control.recording.reader import BROKEN, WHOLE, EpisodeSpan, read_spans
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
 
-FASTEST = 1000  # [frames/s]
-_FORMAT = 7  # of kept episodes; those of another one are made again
+FASTEST = 1000  # The highest rate of frames [Hz].
+_FORMAT = 7  # The version of kept episodes. Episodes of another version are made again.
 
 
 @dataclass(frozen=True)
 class FrameSampling:
-    """Which ticks become frames, and how many, and what comes with them."""
+    """Settings for the frames that are made of the ticks, and for the data that is exported with them."""
 
     fps: int = 30
-    trim: bool = False  # to the time in which arms are engaged or moving
+    trim: bool = False  # Only the time in which arms are engaged or moving is exported.
     pictures: bool = False
-    anonymous: bool = False  # without notes that tell of a person or of a computer's name
-    ahead: int = 0  # frames by which actions that are positions come earlier
+    anonymous: bool = False  # Notes that identify a person or a computer are left out.
+    ahead: int = 0  # The number of frames by which actions that are positions come earlier.
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= FASTEST:
@@ -48,23 +51,23 @@ class FrameSampling:
 
 @dataclass(frozen=True)
 class EpisodeVectors:
-    """One recording as vectors, (n, size) float32 by feature."""
+    """One episode as vectors, (n, size) float32 by feature."""
 
-    recording: str  # name of its file
+    recording: str  # The name of the file.
     cell: str
     task: str
     fps: int
-    names: Names  # of the numbers of each feature
-    notes: dict[str, str]  # program, machine, operator and the like, as recorded
+    names: Names  # The names of the numbers of each feature.
+    notes: dict[str, str]  # The recorded notes, such as program, machine and operator.
     vectors: Vectors
-    success: bool | None = None  # None: nobody said
-    ahead: int = 0  # frames by which actions that are positions come earlier: row k has those of frame k + ahead
-    part: int = 0  # which of the episodes in the file, from 1 on; 0: the whole
-    cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # pictures by camera, one a frame
+    success: bool | None = None  # None if it is not known.
+    ahead: int = 0  # Row k has the actions that are positions of frame k + ahead.
+    part: int = 0  # The number of the episode in the file, from 1 on; 0 for the whole file.
+    cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # By camera, one picture for each frame.
 
     @property
     def units(self) -> Names:
-        """The unit of each number, by feature as ``names`` are."""
+        """Return the unit of each number, by feature, in the order of ``names``."""
         return units_of(self.names)
 
     @property
@@ -72,13 +75,13 @@ class EpisodeVectors:
         return len(next(iter(self.vectors.values())))
 
     def outcome(self) -> dict[str, npt.NDArray[np.bool_]]:
-        """(n,) whether a frame is the last one, and whether it is the last one of a success."""
+        """Return flags (n,) that are True for the last frame, and for the last frame of a success."""
         done = np.arange(self.frames) == self.frames - 1
         return {"next.done": done, "next.success": done & bool(self.success)}
 
 
 def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None = None) -> EpisodeVectors:
-    """An episode of a recording, or the whole. Raises :class:`RecordingError`, which names the file."""
+    """Make an episode of a recording, or the whole recording. Raises :class:`RecordingError`, which names the file."""
     recording = open_recording(file)
     span = span or replace(WHOLE, success=recording.conclusion.success)
     frames = sample(recording, sampling.fps, sampling.trim, span)
@@ -87,7 +90,7 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         vectors, labels = features(frames, robot)
     except RecordingError as error:
         raise RecordingError(f"{recording.file}: {error}") from error
-    for action in (ActionSpace.JOINTS, ActionSpace.TOOL):  # a motion leads to the next frame already
+    for action in (ActionSpace.JOINTS, ActionSpace.TOOL):  # The action of motions leads to the next frame already.
         vectors[action] = _earlier(vectors[action], sampling.ahead)
     notes = dict(recording.about.notes)
     notes = anonymous(notes) if sampling.anonymous else notes
@@ -109,22 +112,22 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
 
 
 def _earlier(rows: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:
-    """``rows`` (n, size) so many ``frames`` earlier; the last one is repeated."""
+    """Return ``rows`` (n, size) moved by ``frames`` to an earlier time; the last row is repeated at the end."""
     return rows[np.minimum(np.arange(len(rows)) + frames, len(rows) - 1)]
 
 
 def spans_to_export(file: Path) -> list[EpisodeSpan]:
-    """The episodes of a recording but those that its operator discarded; of a file that cannot be read the whole."""
+    """Return the episodes of a recording that its operator did not discard, or the whole file if it cannot be read."""
     try:
         return [span for span in read_spans(open_recording(file)) if not span.discarded]
     except RecordingError:
-        return [WHOLE]  # make_episode says what is wrong with it
+        return [WHOLE]  # The error of make_episode tells later why the file cannot be read.
 
 
-Write = Callable[[EpisodeVectors, Path], None]  # an episode as a new file or folder; importable, for other processes
-# Of a file, with or without its pictures: why episodes are discarded, by their number; importable as well.
+Write = Callable[[EpisodeVectors, Path], None]  # Writes an episode as a new file or folder; importable by processes.
+# Returns why episodes of a file are discarded, by their number, judged with pictures or not; importable as well.
 Verdicts = Callable[[Path, bool], Mapping[int, str]]
-_LONGEST_REASON = 300  # [characters]
+_LONGEST_REASON = 300  # The longest text of a reason [characters].
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,15 +141,15 @@ class _Job:
 
     @property
     def name(self) -> str:
-        """Of the recording, and of an episode in it."""
+        """Return the name of the recording, with the number of an episode in it."""
         return str(self.file) + (f" #{self.span.number}" if self.span.number else "")
 
 
 @dataclass(frozen=True)
 class Exported:
-    kept: list[Path]  # episodes, in the order of their recordings
-    left_out: list[str]  # that are discarded, with the reasons, a line each
-    unreadable: list[str]  # recordings that cannot be exported, and why, a line each
+    kept: list[Path]  # The episodes, in the order of their recordings.
+    left_out: list[str]  # One line for each discarded episode, with the reasons.
+    unreadable: list[str]  # One line for each recording that cannot be exported, with the reason.
 
 
 def keep_episodes(
@@ -159,11 +162,11 @@ def keep_episodes(
     verdicts: Verdicts | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
-    """``write`` the episodes of recordings into ``folder``; those that are there already are not made again.
+    """Call ``write`` for each episode of recordings, into ``folder``; episodes that exist are not made again.
 
-    Episodes that ``verdicts`` discards are left out, and so are recordings that cannot be read. The same comes out for
-    any number of ``workers``. ``progress`` is called with how many are through. Raises :class:`ConfigError` where
-    nothing can be written or a worker was killed.
+    Episodes that ``verdicts`` discards are left out, and so are recordings that cannot be read. The result is the same
+    for any number of ``workers``. ``progress`` is called with the number of finished episodes. Raises
+    :class:`ConfigError` if nothing can be written or if a worker was killed.
     """
     jobs = [
         _Job(file, sampling, span, write, folder / _name(file, sampling, span, write, verdicts), verdicts)
@@ -184,14 +187,14 @@ def keep_episodes(
 
 
 def _results(jobs: Sequence[_Job], workers: int) -> Generator[tuple[str | None, str | None]]:
-    """The results that :func:`_keep` returns of each job, in their order."""
+    """Yield the results of :func:`_keep` for all jobs, in their order."""
     if workers <= 1:
         yield from map(_keep, jobs)
         return
     pool = pool_of(workers)
     try:
         yield from pool.map(_keep, jobs)
-    except (BrokenProcessPool, OSError) as error:  # OSError: of a pool that breaks while it is given its jobs
+    except (BrokenProcessPool, OSError) as error:  # A pool raises OSError if it breaks while it gets its jobs.
         raise ConfigError(
             "a process of --workers was killed, as for want of memory; the same command goes on with what is made"
         ) from error
@@ -200,9 +203,9 @@ def _results(jobs: Sequence[_Job], workers: int) -> Generator[tuple[str | None, 
 
 
 def _keep(job: _Job) -> tuple[str | None, str | None]:
-    """Write one episode unless it is there, where a whole one only ever is.
+    """Write one episode unless it exists; only a complete episode is ever stored under its name.
 
-    Returns the verdict that leaves it out, or else None, and what is wrong with the recording, or else None.
+    Returns the verdict that leaves it out, or None, and the reason why the recording cannot be exported, or None.
     """
     target = job.target
     if target.exists():
@@ -220,7 +223,7 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
         for path in (unfinished, *unfinished.rglob("*")):
             if path.is_file():
                 with path.open("rb") as stream:
-                    os.fsync(stream.fileno())  # no half of it is kept where power fails
+                    os.fsync(stream.fileno())  # Thus a power failure leaves no incomplete episode.
         unfinished.replace(target)
     except RecordingError as error:  # Pictures are read from the recording only while they are written to the dataset.
         return None, _reason(error, job)
@@ -234,7 +237,7 @@ def _reason(error: Exception, job: _Job) -> str:
 
 
 def _name(file: Path, sampling: FrameSampling, span: EpisodeSpan, write: Write, verdicts: Verdicts | None) -> str:
-    """Of a kept episode; another one after any change of the recording or of what is asked for."""
+    """Return the name of a kept episode; it changes with the recording and with the settings of the export."""
     try:
         status = file.stat()
     except OSError as error:
@@ -246,9 +249,9 @@ def _name(file: Path, sampling: FrameSampling, span: EpisodeSpan, write: Write, 
 
 
 class Output:
-    """The new folder of an export. Episodes of one that was interrupted stay in ``OUT.partial`` for the next.
+    """The new folder of an export. Episodes of an interrupted export stay in ``OUT.partial`` for the next one.
 
-    Raises :class:`ConfigError` for an output that exists and one that cannot be written.
+    Raises :class:`ConfigError` if the output exists or cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -257,7 +260,7 @@ class Output:
         self._partial = path.with_name(f"{path.name}.partial")
 
     def episodes(self) -> Path:
-        """The folder in which episodes are kept until the output is whole."""
+        """Make and return the folder in which episodes are kept until the output is complete."""
         folder = self._partial / "episodes"
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -266,13 +269,13 @@ class Output:
         return folder
 
     def tidy(self) -> None:
-        """Remove what is kept for the next export, if that is nothing."""
+        """Remove the folder of kept episodes if it is empty."""
         with suppress(OSError):
             (self._partial / "episodes").rmdir()
             self._partial.rmdir()
 
     def write(self, write: Callable[[Path], None]) -> None:
-        """Let ``write`` make the folder, and put it into its place."""
+        """Let ``write`` make the folder under another name, and then move it to its place."""
         made = self._partial / "output"
         try:
             shutil.rmtree(made, ignore_errors=True)

@@ -11,16 +11,16 @@ from q2r2_control.export.episodes import EpisodeVectors
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """How episodes are written one by one, and then joined in the output.
+    """The functions that write episodes one by one, and then join them in the output.
 
     ``write(episode, path)`` makes a file or a folder of one :class:`EpisodeVectors`. It is a function of a module,
-    since other processes call it, and it may find half of an earlier attempt at ``path``. ``join(paths, folder)`` makes
-    the new ``folder`` of these, in their order, and may move them. Both raise :class:`RecordingError` for episodes that
-    the format cannot have, with the name of the recording.
+    since other processes call it. A part of an earlier attempt may exist at ``path``. ``join(paths, folder)`` makes the
+    new ``folder`` from these paths, in their order, and may move them. Both raise :class:`RecordingError`, with the
+    name of the recording, for episodes that the format cannot store.
     """
 
     write: Callable[[EpisodeVectors, Path], None]
     join: Callable[[Sequence[Path], Path], None]
-    require: Callable[[], object] = lambda: None  # raises ConfigError where a package is not installed
-    advice: Callable[[Path], str] | None = None  # what a trainer wants to be told of the output
-    ahead: int = 0  # frames by which actions come earlier unless --ahead says otherwise
+    require: Callable[[], object] = lambda: None  # Raises ConfigError if a package is not installed.
+    advice: Callable[[Path], str] | None = None  # Returns a text that tells how to train on the output.
+    ahead: int = 0  # The number of frames by which actions come earlier if --ahead is not given.

@@ -1,8 +1,8 @@
 """The formats of ``q2r2 export``: CSV, HDF5 and two LeRobotDatasets, and those that other packages declare.
 
-CSV and HDF5 have a file for each episode; HDF5 is laid out as ``record_sim_episodes.py`` in
-https://github.com/tonyzhaozh/act does it. A further file shows all episodes as https://github.com/ARISE-Initiative/robomimic
-reads them.
+CSV and HDF5 have a file for each episode. HDF5 has the layout of ``record_sim_episodes.py`` in
+https://github.com/tonyzhaozh/act. A further file links to all episodes in the layout of
+https://github.com/ARISE-Initiative/robomimic.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from q2r2_control.export.lerobot_v21 import join_v21, openpi_config, require_v21
 from q2r2_control.extras import install_line
 from q2r2_control.plugins import EXPORTS, load_class, names_of
 
-# Name in the HDF5 file, name of the feature.
+# The name in the HDF5 file, and the name of the feature.
 _DATA = (
     ("observations/qpos", "observation.state"),
     ("observations/qvel", "observation.velocity"),
     ("action", "action"),
 )
-_COMPRESSION = 1  # of gzip's levels, the fastest
-ROBOMIMIC = "robomimic.h5"  # not .hdf5: some trainers of ACT read each file of that name
-# Where robomimic looks in a demonstration, and what it finds there: a link, so numbers and pictures are kept once.
+_COMPRESSION = 1  # The fastest level of gzip.
+ROBOMIMIC = "robomimic.h5"  # The name does not end with .hdf5, because some trainers of ACT read all such files.
+# The names that robomimic reads in a demonstration, and the data that they link to, which is stored once.
 _LINKS = {
     **{"actions": "action", "rewards": "rewards", "dones": "dones"},
     **{"obs/qpos": "observations/qpos", "obs/qvel": "observations/qvel"},
@@ -40,7 +40,7 @@ _LINKS = {
 
 
 def write_table(episode: EpisodeVectors, path: Path) -> None:
-    """Write one episode as CSV, a line a frame."""
+    """Write one episode as CSV, with one line for each frame."""
     frames = np.arange(episode.frames)
     columns: dict[str, npt.NDArray[Any]] = {
         f"{name}.{label}": episode.vectors[name][:, at]
@@ -57,7 +57,10 @@ def write_table(episode: EpisodeVectors, path: Path) -> None:
 
 
 def gather_tables(files: Sequence[Path], folder: Path) -> None:
-    """Move tables into a new ``folder``, named as recordings. Raises :class:`RecordingError` for one name twice."""
+    """Move tables into a new ``folder``. They have the names of the recordings.
+
+    Raises :class:`RecordingError` if two recordings have the same name.
+    """
     folder.mkdir()
     for file in files:
         path = folder / f"{file.stem}.csv"
@@ -67,7 +70,7 @@ def gather_tables(files: Sequence[Path], folder: Path) -> None:
 
 
 def require_h5py() -> Any:
-    """The module h5py. Raises :class:`ConfigError` where it is not installed."""
+    """Return the module h5py. Raises :class:`ConfigError` if it is not installed."""
     try:
         import h5py
     except ImportError as error:
@@ -78,8 +81,8 @@ def require_h5py() -> Any:
 def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
     """Write one episode as HDF5."""
     with require_h5py().File(path, "w") as file:
-        file.attrs["sim"] = True  # trainers take the action of the same row then
-        file.attrs["compress"] = False  # pictures are pixels, however the file packs them
+        file.attrs["sim"] = True  # With this, trainers take the action of the same row.
+        file.attrs["compress"] = False  # Readers get pixels, although the file compresses them.
         file.attrs["fps"] = episode.fps
         file.attrs["action_ahead_frames"] = episode.ahead
         for name in ("recording", "cell", "task"):
@@ -96,7 +99,7 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
             file.create_dataset(name, data=flags.astype(np.float32))
         images = file.create_group("observations/images")
         for camera, pictures in episode.cameras.items():
-            # Each picture is packed by itself, so that one can be read without the others.
+            # Each picture is compressed by itself, so that one can be read without the others.
             packing = {"chunks": (1, *pictures.size), "compression": "gzip", "compression_opts": _COMPRESSION}
             data = images.create_dataset(camera, (episode.frames, *pictures.size), "uint8", **packing)
             data.attrs["axes"] = ["frame", "row", "column", "r g b"]
@@ -105,7 +108,7 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
 
 
 def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
-    """Move HDF5 files into a new ``folder``, as ``episode_0.hdf5`` and so on, and link to all of them for robomimic."""
+    """Move HDF5 files into a new ``folder``, as ``episode_0.hdf5`` and so on, and write the file of links to them."""
     h5py, total = require_h5py(), 0
     folder.mkdir()
     with h5py.File(folder / ROBOMIMIC, "w") as joined:
@@ -122,7 +125,7 @@ def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
                 demo[name] = h5py.ExternalLink(moved.name, target)
             demo.attrs["num_samples"] = frames
             total += frames
-        # Of an environment it wants to be told, also where it trains without one: type 2 is Gym's.
+        # robomimic needs the description of an environment, even for training without one. Type 2 stands for Gym.
         demos.attrs["env_args"] = json.dumps({"env_name": cell, "type": 2, "env_kwargs": {}})
         demos.attrs["total"] = total
 
@@ -136,7 +139,7 @@ FORMATS = {
 
 
 def format_named(name: str) -> ExportFormat:
-    """The format called ``name``, of this package or another one. Raises :class:`ConfigError` where there is none."""
+    """Return the format called ``name``, of this package or another one. Raises :class:`ConfigError` if none exists."""
     if (own := FORMATS.get(name)) is not None:
         return own
     others = names_of(EXPORTS)

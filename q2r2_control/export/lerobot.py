@@ -1,6 +1,6 @@
-"""LeRobotDataset in the format of the package https://github.com/huggingface/lerobot, which writes it itself.
+"""Writes a LeRobotDataset with the package https://github.com/huggingface/lerobot, in the format of that package.
 
-It makes a dataset of each episode, and joins them.
+Each episode becomes a dataset, and then these are joined.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.policy import ActionSpace
 
-_NAME = "q2r2/recordings"  # datasets have one on the hub, where these are never sent
-# The package asks no hub, and what it and the encoder of videos print are no results of a command.
+_NAME = "q2r2/recordings"  # The package needs a name on the hub, but the datasets are never sent there.
+# The package makes no requests to the hub, and neither the package nor the encoder of videos prints its progress.
 _ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1", "SVT_LOG": "1"}
-_CAP_SYS_NICE, _CAPABILITY_VERSION = 23, 0x20080522  # linux/capability.h
+_CAP_SYS_NICE, _CAPABILITY_VERSION = 23, 0x20080522  # From linux/capability.h.
 
 
 def require_lerobot() -> None:
-    """Raises :class:`ConfigError` where lerobot is not installed; it is not imported, which takes seconds."""
+    """Raises :class:`ConfigError` if lerobot is not installed; does not import it, since that takes seconds."""
     if find_spec("lerobot") is None:
         raise ConfigError(f"export lerobot needs lerobot: {install_line('lerobot')}")
 
@@ -38,7 +38,7 @@ def video_key(camera: str) -> str:
 
 
 def source_of(episode: EpisodeVectors) -> dict[str, Any]:
-    """The entry of an episode in :data:`SOURCES`, without its number."""
+    """Return the entry of an episode in :data:`SOURCES`, without its number."""
     part = {"part": episode.part} if episode.part else {}
     ahead = {"action_ahead_frames": episode.ahead} if episode.ahead else {}
     return {"recording": episode.recording, **part, "success": episode.success, **ahead, **episode.notes}
@@ -50,7 +50,7 @@ def write_sources(sources: Sequence[dict[str, Any]], folder: Path) -> None:
 
 
 def write_shard(episode: EpisodeVectors, folder: Path) -> None:
-    """Write a dataset of one episode into a new ``folder``; what is there is removed."""
+    """Write a dataset of one episode into a new ``folder``; an old folder is removed."""
     shutil.rmtree(folder, ignore_errors=True)
     os.environ.update(_ENVIRONMENT)
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -73,7 +73,7 @@ def write_shard(episode: EpisodeVectors, folder: Path) -> None:
         values: dict[str, Any] = {name: rows[frame] for name, rows in (episode.vectors | outcome).items()}
         values |= {name: next(shown) for name, shown in pictures.items()}
         dataset.add_frame({**values, "task": episode.task})
-    dataset.save_episode(parallel_encoding=False)  # there are processes enough
+    dataset.save_episode(parallel_encoding=False)  # The export already uses several processes.
     dataset.finalize()
     (folder / SOURCES).write_text(json.dumps([source_of(episode)]), encoding="utf-8")
 
@@ -84,7 +84,7 @@ def _as_lerobot(feature: str, labels: Sequence[str]) -> list[str]:
 
 
 def join_shards(shards: Sequence[Path], folder: Path) -> None:
-    """Join datasets, at least one, in a new ``folder``. Raises :class:`RecordingError` where their features differ."""
+    """Join one or more datasets in a new ``folder``. Raises :class:`RecordingError` if their features differ."""
     sources = [source for shard in shards for source in json.loads((shard / SOURCES).read_text())]
     infos = [json.loads((shard / "meta/info.json").read_text()) for shard in shards]
     check_alike(infos, sources)
@@ -92,7 +92,7 @@ def join_shards(shards: Sequence[Path], folder: Path) -> None:
     import datasets
     from lerobot.datasets.aggregate import aggregate_datasets
 
-    # The package datasets keeps copies of tables, which are not for the user's cache.
+    # The package datasets keeps copies of tables. They must not stay in the user's cache.
     cache, datasets.config.HF_DATASETS_CACHE = datasets.config.HF_DATASETS_CACHE, folder.with_name("cache")
     try:
         aggregate_datasets([_NAME] * len(shards), _NAME, roots=list(shards), aggr_root=folder)
@@ -104,7 +104,7 @@ def join_shards(shards: Sequence[Path], folder: Path) -> None:
 
 
 def check_alike(infos: Sequence[dict[str, Any]], sources: Sequence[dict[str, Any]]) -> None:
-    """Raises :class:`RecordingError` for episodes, as their ``info.json`` is, of different cells or features."""
+    """Raises :class:`RecordingError` if episodes, given by their ``info.json``, differ in their cells or features."""
     first, first_recording = infos[0], sources[0]["recording"]
     for info, source in zip(infos, sources, strict=True):
         cell, recording = info["robot_type"], source["recording"]
@@ -122,7 +122,7 @@ def check_alike(infos: Sequence[dict[str, Any]], sources: Sequence[dict[str, Any
 
 
 def _renounce_real_time() -> None:
-    """Keep threads of the AV1 encoder from SCHED_FIFO, also of root: a control loop must not wait for a video."""
+    """Prevent SCHED_FIFO for threads of the AV1 encoder, also for root: a control loop must not wait for a video."""
     if sys.platform != "linux":
         return
     import resource
@@ -130,7 +130,8 @@ def _renounce_real_time() -> None:
     resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
     libc = ctypes.CDLL(None)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION, 0)
-    sets = (ctypes.c_uint32 * 6)()  # effective, permitted and inheritable, of capabilities 0 to 31 and of the others
+    # The effective, permitted and inheritable sets, of capabilities 0 to 31 and then of the others.
+    sets = (ctypes.c_uint32 * 6)()
     if libc.capget(header, sets) == 0:
         sets[0] &= ~(1 << _CAP_SYS_NICE)
         sets[1] &= ~(1 << _CAP_SYS_NICE)

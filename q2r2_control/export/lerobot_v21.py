@@ -1,6 +1,6 @@
-"""LeRobotDataset v2.1, the layout that openpi and Isaac GR00T train on; the package lerobot itself writes a newer one.
+"""Writes LeRobotDataset v2.1, the layout that openpi and Isaac GR00T train on; the package lerobot writes a newer one.
 
-Cameras have the names of openpi. ``meta/modality.json`` and the column of task descriptions are what GR00T asks for.
+Cameras have the names of openpi. GR00T needs ``meta/modality.json`` and the column of task descriptions.
 """
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ from q2r2_control.export.lerobot import check_alike, source_of, video_key, write
 from q2r2_control.export.sampling import CameraFrames, Names
 from q2r2_control.extras import install_line
 
-DESCRIPTION = "annotation.human.action.task_description"  # the number of a task, under GR00T's name
+DESCRIPTION = "annotation.human.action.task_description"  # GR00T's name of the column with the number of the task.
 OPENPI_CAMERAS = ("cam_high", "cam_left_wrist", "cam_right_wrist")
-_CHUNK = 1000  # episodes in a folder
+_CHUNK = 1000  # The number of episodes in a folder.
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
 _COUNTED = ("frame_index", "episode_index", "index", "task_index", DESCRIPTION)
-_PACKED, _ABOUT = "frames.parquet", "about.json"  # of one episode, before it has a number
-# H.264, which all decoders of trainers know. Every second picture stands alone, so any one is found soon.
+_PACKED, _ABOUT = "frames.parquet", "about.json"  # The files of one episode before it has a number.
+# The decoders of all trainers know H.264. Every second picture is a key frame, so each picture is found quickly.
 _CODEC, _CODING = "libx264", {"crf": "20", "g": "2", "bf": "0"}
 
 
 def require_v21() -> None:
-    """Raises :class:`ConfigError` where pyarrow or av is not installed."""
+    """Raises :class:`ConfigError` if pyarrow or av is not installed."""
     if find_spec("pyarrow") is None or find_spec("av") is None:
         raise ConfigError(f"export lerobot-v2.1 needs pyarrow and av: {install_line('export')}")
 
 
 def openpi_names(cameras: Mapping[str, CameraFrames]) -> dict[str, str]:
-    """The name in the dataset of each camera: openpi's of those on the arms and of one other, else its own.
+    """Return the name of each camera in the dataset.
 
-    A camera is on an arm if its link's name begins with the arm's, or its own name where it is a ROS topic.
+    One camera on each arm and one other camera get the names of openpi. All others keep their names. A camera is on an
+    arm if the name of its link begins with the arm's name. For a camera of a ROS topic, its own name counts.
     """
     names = {name: name for name in cameras}
     for name, frames in cameras.items():
@@ -56,7 +57,7 @@ def openpi_names(cameras: Mapping[str, CameraFrames]) -> dict[str, str]:
 
 
 def write_v21(episode: EpisodeVectors, folder: Path) -> None:
-    """Write the numbers and videos of one episode into a new ``folder``; what is there is removed."""
+    """Write the numbers and videos of one episode into a new ``folder``; an old folder is removed."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -90,7 +91,7 @@ def write_v21(episode: EpisodeVectors, folder: Path) -> None:
 
 
 def join_v21(shards: Sequence[Path], folder: Path) -> None:
-    """Join episodes, at least one, in a new ``folder``. Raises :class:`RecordingError` where their features differ."""
+    """Join one or more episodes in a new ``folder``. Raises :class:`RecordingError` if their features differ."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -144,7 +145,7 @@ def join_v21(shards: Sequence[Path], folder: Path) -> None:
 
 
 def openpi_config(folder: Path) -> str:
-    """The entry for openpi's ``src/openpi/training/config.py`` that trains on the dataset in ``folder``."""
+    """Return the entry for openpi's ``src/openpi/training/config.py`` that trains on the dataset in ``folder``."""
     features = json.loads((folder / "meta" / "info.json").read_text())["features"]
     grippers = [label.endswith("_gripper") for label in features["action"]["names"]]
     mask = ", ".join(str(-len(run) if closes else len(run)) for closes, run in _runs(grippers))
@@ -182,7 +183,7 @@ def _scalar(dtype: str) -> dict[str, Any]:
 
 
 def _column(values: npt.NDArray[Any]) -> Any:
-    """Rows (n, size) as a column, of plain numbers where there is one a row."""
+    """Return rows (n, size) as a column of lists, or of plain numbers if size is 1."""
     import pyarrow as pa
 
     flat = pa.array(values.ravel())
@@ -196,12 +197,12 @@ def _stats(values: npt.NDArray[Any]) -> dict[str, list[float]]:
 
 
 def _runs(values: Sequence[Any]) -> list[tuple[Any, list[int]]]:
-    """Values that follow each other, and where they stand."""
+    """Return each run of equal values that follow each other, with the indices of the run."""
     return [(value, list(places)) for value, places in groupby(range(len(values)), key=values.__getitem__)]
 
 
 def _modality(names: Names, cameras: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Which numbers of state and action are which part of the robot."""
+    """Return which part of the robot the numbers of state and action belong to, as GR00T's ``modality.json``."""
 
     def part(label: str) -> str:
         arm = next((arm for arm in names.get("intervention", ()) if label.startswith(f"{arm}_")), None)
@@ -226,7 +227,7 @@ def _video_feature(size: tuple[int, int, int], fps: int) -> dict[str, Any]:
 
 
 def _write_video(shown: CameraFrames, fps: int, path: Path) -> dict[str, Any]:
-    """Encode the pictures of one camera; returns statistics of each colour, of which 1 is full."""
+    """Encode the pictures of one camera; returns the statistics of each colour, from 0 to 1."""
     import av
 
     height, width, _ = shown.size

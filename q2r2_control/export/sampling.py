@@ -1,8 +1,8 @@
-"""Frames at a fixed rate out of the ticks of a recording, and the features that a dataset has of them.
+"""Samples frames at a fixed rate from the ticks of a recording, and makes the features of a dataset from them.
 
-Frame k is at t_k = t_0 + k / fps, to the nanosecond, where t_0 is the time of the first tick. Observations are of the
-newest tick at or before t_k, commands of the first tick at or after it. An observation never knows the future, and a
-command was decided on no earlier than the observation.
+Frame k is at t_k = t_0 + k / fps, to the nanosecond, where t_0 is the time of the first tick. Observations are those of
+the newest tick at or before t_k. Commands are those of the first tick at or after t_k. Thus an observation never
+contains the future, and a command was not made before the observation.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from q2r2_control.types import Array
 Columns = dict[str, npt.NDArray[Any]]
 Vectors = dict[str, npt.NDArray[np.float32]]
 Names = dict[str, tuple[str, ...]]
-Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b
+Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b.
 
 OBSERVED = ("position", "velocity", "effort", "opening")
 COMMANDED = ("reference", "gripper", "target", "reference_tool", "intervention")
@@ -44,26 +44,27 @@ _JOINT_UNITS = {
 }
 _FLAGS = ("intervention",)
 OPENING_UNIT = "0 closed .. 1 open"
-_MOVING = 0.01  # fastest joint of a reference that moves [rad/s]
-_OLDEST = 2  # periods of the camera: one picture may be lost
+_MOVING = 0.01  # A reference moves if its fastest joint is faster than this [rad/s].
+_OLDEST = 2  # The largest age of a picture in periods of the camera, so that one picture may be lost.
 
 
 def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan = WHOLE) -> dict[str, Array]:
-    """The observations and commands at each of n frames of the ``span``, whose first tick gives t_0.
+    """Return the observations and commands at each of n frames of the ``span``, whose first tick gives t_0.
 
     Measured are ``position``, ``velocity``, ``effort`` (n, joints) [rad, rad/s, Nm] and ``opening`` (n, arms), 0 closed
-    .. 1 open, -inf: not measured. Commanded are ``reference`` (n, joints) and ``gripper`` (n, arms). ``reference_tool``
-    and the operator's ``target``, or else that tool, are poses x y z qx qy qz qw in the world (n, arms, 7).
-    ``intervention`` (n, arms) is 1 where a hand moves the arm in the place of a policy. ``time`` (n,) [s] is since t_0,
-    ``stamp`` (n,) the time of day [ns]. ``trim``: from the first to the last tick at which an arm is engaged or the
-    reference moves. Raises :class:`RecordingError` for a damaged file, one without a tick to
-    take, one in which ticks were lost for longer than a frame, and a ``span`` in which a clock was set.
+    .. 1 open, or -inf if not measured. Commanded are ``reference`` (n, joints) [rad] and ``gripper`` (n, arms).
+    ``reference_tool`` and ``target`` are poses x y z [m] qx qy qz qw in the world (n, arms, 7). Without a target of the
+    operator, ``target`` is ``reference_tool``. ``intervention`` (n, arms) is 1 where a hand moves the arm instead of a
+    policy. ``time`` (n,) [s] is since t_0, and ``stamp`` (n,) is the time of day [ns]. With ``trim``, frames are from
+    the first to the last tick at which an arm is engaged or the reference moves. Raises :class:`RecordingError` for a
+    damaged file, for one without a usable tick, for one in which ticks were lost for longer than a frame, and for a
+    ``span`` in which a clock was set.
     """
     picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("stamp", *OBSERVED, *COMMANDED)}
     start, end, count = None, 0, 0
     known: Columns = {}
     for columns in _ticks(recording, fps, span):
-        # With the last tick of the chunk before, which may be the newest one of a frame in this chunk.
+        # The last tick of the chunk before is kept, because it may be the newest tick for a frame in this chunk.
         known = {name: np.concatenate((known.get(name, values[:0])[-1:], values)) for name, values in columns.items()}
         passed = (columns["time"] - recording.about.epoch) / NANOSECONDS
         inside = (span.start <= passed) & (passed <= span.end)
@@ -93,7 +94,7 @@ def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan
 
 
 def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArray[np.int64]:
-    """Times [ns] of the frames from ``first_frame`` on that are not after ``last``, rounded."""
+    """Return the rounded times [ns] of the frames from ``first_frame`` on that are not after ``last``."""
     beyond = max((last - start) * fps // NANOSECONDS + 2, first_frame)
     frames = np.arange(first_frame, beyond, dtype=np.int64)
     times = start + (frames * NANOSECONDS + fps // 2) // fps
@@ -101,9 +102,9 @@ def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArr
 
 
 def _ticks(recording: Recording, fps: int, span: EpisodeSpan) -> Iterator[Columns]:
-    """Columns of the ticks, some at a time; checks that none are missing for longer than a frame.
+    """Yield the columns of the ticks in chunks; checks that no ticks are missing for longer than a frame.
 
-    Checks too that no clock was set within the ``span``.
+    It also checks that no clock was set within the ``span``.
     """
     numbers = times = np.empty(0, dtype=np.int64)
     dts = np.empty(0)
@@ -138,7 +139,7 @@ def _ticks(recording: Recording, fps: int, span: EpisodeSpan) -> Iterator[Column
 
 
 def _check_clock(recording: Recording, span: EpisodeSpan, numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> None:
-    """Raises :class:`RecordingError` where a clock was set in the ``span``, or back to a time in it."""
+    """Raises :class:`RecordingError` if a clock was set in the ``span``, or set back to a time in it."""
     steps = clock_steps(numbers, t, dt)
     for at in np.flatnonzero(steps):
         first, last = sorted(t[at - 1 : at + 1])
@@ -150,10 +151,10 @@ def _check_clock(recording: Recording, span: EpisodeSpan, numbers: npt.NDArray[n
 
 
 def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]:
-    """The vectors (n, size) of the n ``frames`` of :func:`sample` by feature, and the names of their numbers.
+    """Return the vectors (n, size) of the n ``frames`` of :func:`sample` by feature, and the names of their numbers.
 
     Grippers that the plant does not measure, or that are not commanded, are left out. Raises :class:`RecordingError`,
-    without the file's name, for what is not a number, and where the robot is not the recorded one.
+    without the file's name, for numbers that are not finite, and if the robot is not the recorded one.
     """
     arms, joints = tuple(robot.arms), robot.joint_names
     check_tools(frames["reference"][0], frames["reference_tool"][0], robot)
@@ -192,7 +193,7 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
 
 
 def units_of(names: Names) -> Names:
-    """The unit of each number of the features, whose ``names`` are those of :func:`features`."""
+    """Return the unit of each number of the features, given the ``names`` that :func:`features` returns."""
     return {feature: tuple(_unit(feature, label) for label in labels) for feature, labels in names.items()}
 
 
@@ -208,7 +209,7 @@ def _unit(feature: str, label: str) -> str:
 
 
 def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> list[int]:
-    """Arms of which there is an opening at every frame; those of which there never is one have no gripper."""
+    """Return the arms with a known opening at every frame; an arm without any known opening has no gripper."""
     unknown = frames[what] == NOT_MEASURED
     for index, arm in enumerate(arms):
         if unknown[:, index].any() and not unknown[:, index].all():
@@ -217,9 +218,9 @@ def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> lis
 
 
 def continuous(poses: Array, first: Array | None = None) -> Array:
-    """Poses (n, arms, 7) whose quaternions do not change sign from frame to frame.
+    """Return poses (n, arms, 7) whose quaternions do not change sign from frame to frame.
 
-    The first has the sign of ``first`` (arms, 7), or else its largest number is positive.
+    The first quaternion has the sign of that in ``first`` (arms, 7). Without ``first``, its largest number is positive.
     """
     quaternions = poses[..., 3:]
     if first is None:
@@ -233,7 +234,7 @@ def continuous(poses: Array, first: Array | None = None) -> Array:
 
 
 def _to_next(poses: Array) -> Array:
-    """Motion (n, arms, 6) [m, rad] from each pose to that of the next frame, in the former; zeros for the last."""
+    """Return the motion (n, arms, 6) [m, rad] from each pose to the next, in the former's frame; zeros for the last."""
     motions = np.zeros((*poses.shape[:2], 6))
     for index in range(poses.shape[1]):
         placements = [pin.XYZQUATToSE3(pose) for pose in poses[:, index]]
@@ -245,19 +246,19 @@ def _to_next(poses: Array) -> Array:
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """Pictures of one camera, one for each frame of an episode."""
+    """The pictures of one camera, one for each frame of an episode."""
 
     recording: Recording
     name: str
     config: CameraConfig
-    stamps: Sequence[int]  # times of day of the frames [ns], ascending
+    stamps: Sequence[int]  # Ascending times of day of the frames [ns].
 
     @property
     def size(self) -> tuple[int, int, int]:
         return (self.config.height, self.config.width, 3)
 
     def __iter__(self) -> Iterator[Pixels]:
-        """Raises :class:`RecordingError` for a frame whose newest picture is older than two of the camera's periods."""
+        """Yield each frame's newest picture. Raises :class:`RecordingError` if it is older than two camera periods."""
         pictures = self.recording.pictures(self.name)
         newest, coming = None, next(pictures, None)
         pixels: Pixels | None = None

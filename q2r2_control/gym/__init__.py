@@ -1,6 +1,6 @@
-"""Tasks of ``q2r2 demo`` as environments: ``gymnasium.make("q2r2_control.gym:q2r2/Stack-v0")``.
+"""The tasks of ``q2r2 demo`` as environments: ``gymnasium.make("q2r2_control.gym:q2r2/Stack-v0")``.
 
-Importing this package registers them. The simulation is imported when the first one is made.
+The import of this package registers the environments. The simulation is imported with the first environment.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import gymnasium
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 TASKS = ("carry", "clash", "grasp", "handover", "meet", "peg", "stack", "wipe")
-_MOST_STEPS = 900  # half a minute at 30 Hz
+_MOST_STEPS = 900  # Half a minute at 30 Hz.
 
 for _task in TASKS:
     gymnasium.register(
@@ -32,12 +32,12 @@ def make_env(
     cfg: object = None,
     **options: Any,
 ) -> AsyncVectorEnv | SyncVectorEnv:
-    """``n_envs`` environments of a task, each in a process of its own where ``use_async_envs``.
+    """Make ``n_envs`` environments of a task, each in a process of its own if ``use_async_envs`` is True.
 
-    ``space`` and ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`. By default actions are those of a
-    dataset's ``action``, as policies of lerobot answer. ``cfg`` is what lerobot's EnvHub tells besides, of which
-    nothing is used.
+    ``space`` and ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`. By default an action has the
+    numbers of a dataset's ``action``, which policies of lerobot return. ``cfg`` is the configuration that lerobot's
+    EnvHub passes; it is not used.
     """
     made = [partial(gymnasium.make, f"{__name__}:q2r2/{task.capitalize()}-v0", space=space, **options)] * n_envs
-    # Spawned: a copy of this process would share its graphics with it.
+    # The processes are spawned, since a forked process would share the graphics of this one.
     return AsyncVectorEnv(made, context="spawn") if use_async_envs else SyncVectorEnv(made)

@@ -1,4 +1,4 @@
-"""The distances that the controller kept in one step of an environment, and why it held something back."""
+"""Collects the distances that the controller kept in one step of an environment, and why it did less than asked."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from q2r2_control.wording import sentence
 
 
 class StepPromises:
-    """A listener of a run, whose steps :meth:`begin`."""
+    """A listener of a run. Call :meth:`begin` at the beginning of each step."""
 
     def __init__(self) -> None:
-        self._why: dict[str, str] = {}  # arm -> its last event
-        self._held: dict[str, None] = {}  # arms and grippers in this step, in the order of time
-        self._limits: dict[str, dict[str, None]] = {}  # of what kind -> joints or pairs
+        self._why: dict[str, str] = {}  # By arm, its last event.
+        self._held: dict[str, None] = {}  # The arms and grippers that did less in this step, in the order of time.
+        self._limits: dict[str, dict[str, None]] = {}  # By kind of limit, the joints or pairs that reached it.
         self.begin()
 
     def begin(self) -> None:
@@ -40,7 +40,7 @@ class StepPromises:
             self._limits.setdefault(str(limit.kind), {})[" and ".join(limit.names)] = None
 
     def as_info(self) -> dict[str, Any]:
-        """As :class:`q2r2_control.gym.task_env.TaskEnv` says."""
+        """Return the entries that :class:`q2r2_control.gym.task_env.TaskEnv` describes."""
         limits = [f"{kind}: {', '.join(names)}" for kind, names in self._limits.items()]
         return {
             "nearest_distance": self._distance,

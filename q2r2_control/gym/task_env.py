@@ -1,4 +1,4 @@
-"""One task of the demo in MuJoCo, stepped by actions that go through the door of policies and no other."""
+"""One task of the demo in MuJoCo as an environment. Its actions go only through the input for policies."""
 
 from __future__ import annotations
 
@@ -30,28 +30,30 @@ from q2r2_control.types import Array, is_number
 
 CELL = "config/dual_iiwa7.yaml"
 _FRONT = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=320, height=240)
-_REACH = 2.0  # from the world's origin, of any tool along any axis [m]
+_REACH = 2.0  # The largest coordinate of a tool in the world [m].
 
-_LOOP_RATES = 50.0, 1000.0  # [Hz]
+_LOOP_RATES = 50.0, 1000.0  # The lowest and the highest rate of the control loop [Hz].
 
 Observed = dict[str, npt.NDArray[Any]]
 
 
 class TaskEnv(gymnasium.Env):
-    """A task of :data:`q2r2_control.demo.assembly_tasks.TASKS`, with 1 as reward when its judge says that it is done.
+    """A task of :data:`q2r2_control.demo.assembly_tasks.TASKS`. The reward is 1 when its judge reports success, else 0.
 
-    Observations and actions have the numbers of the datasets' features, in their order: ``action_names`` has those of
-    the ``space``, openings of grippers behind. An action is followed for 1 / ``rate`` [s], and the observation after n
-    steps is frame n of a dataset at this rate. An agent that has learned nothing moves the arms in the default space,
-    ``action.tool_delta``. In the others it would ask for jumps, which are refused. ``spread`` [m]: how far the task's
-    parts lie from their places at most, along x and y, as the seed has it. ``pictures``: with those of the cell's
-    cameras, or of one in front of it. ``loop_rate`` [Hz] is the control loop's, None: the cell's. A step at 100 Hz
-    takes a quarter of the time that it takes at 1 kHz; physics have the cell's own steps at every rate.
+    Observations and actions have the numbers of the datasets' features, in their order. ``action_names`` has the names
+    of the numbers of the ``space``, followed by the openings of grippers. An action is followed for 1 / ``rate`` [s],
+    and the observation after n steps is frame n of a dataset at this rate. An untrained agent can move the arms in the
+    default space, ``action.tool_delta``. In the others it would command jumps, which are refused.
 
-    No action breaks a limit or a distance. ``info["promises"]`` has what a step came to: ``nearest_distance`` [m] of
-    any pair, ``nearest_pair``, ``margin`` [m] to the distance that a pair keeps, ``certified``, and in ``held_back``
-    why arms or grippers do less than was asked, and limits that were reached. ``info["measured"]`` has the figures of
-    the judge, ``info["reason"]`` what they lack. A fault that stops the arms ends the episode, with its reason.
+    ``spread`` [m] is the largest random offset of the task's parts, along x and along y; the seed decides it. With
+    ``pictures``, observations have those of the cell's cameras, or of one in front of the cell. ``loop_rate`` [Hz] is
+    the rate of the control loop; None stands for that of the cell. A step at 100 Hz takes a quarter of the time that it
+    takes at 1 kHz. The physics have the steps of the cell at every rate.
+
+    No action breaks a limit or a distance. ``info["promises"]`` describes a step: ``nearest_distance`` [m] of any pair,
+    ``nearest_pair``, ``margin`` [m] to the distance that a pair keeps, ``certified``, and ``held_back``: why arms or
+    grippers did less than was asked, and which limits were reached. ``info["measured"]`` has the figures of the judge,
+    and ``info["reason"]`` says why the task is not done. A fault that stops the arms ends the episode, with its reason.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
@@ -89,7 +91,7 @@ class TaskEnv(gymnasium.Env):
         self._pipeline = Pipeline(config, self._robot, self._policy, self._plant)
         self._camera: CellPictures | None = None
         self._tools: Array | None = (
-            None  # (arms, 7) of the last observation, whose quaternions the next ones go on from
+            None  # (arms, 7) Tools of the last observation, which give the signs of the next quaternions.
         )
         grippers = tuple(f"{arm}_gripper" for arm in self._robot.arms if arm in self._plant.gripper_openings())
         self.action_names = (*action_names(self._robot, self._policy.space), *grippers)
@@ -99,7 +101,7 @@ class TaskEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
-        """Both arms at home, and the parts where the seed lays them."""
+        """Move both arms home, and put the parts to the places that the seed decides."""
         super().reset(seed=seed)
         self._pipeline.end()
         self._watch = TaskWatch(self.tasks, self._plant, self._robot, self._config)
@@ -125,7 +127,7 @@ class TaskEnv(gymnasium.Env):
         return self._observed(), float(done), done or bool(fault), False, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:
-        """The picture (height, width, 3) of the first camera; None without ``render_mode``."""
+        """Return the picture (height, width, 3) of the first camera; None without ``render_mode``."""
         return None if self.render_mode is None else self._take([next(iter(self._config.cameras))])[0]
 
     def close(self) -> None:
@@ -177,7 +179,7 @@ class TaskEnv(gymnasium.Env):
         elif self._policy.space is ActionSpace.TOOL:
             high = np.tile([_REACH] * 3 + [1.0] * 4, len(robot.arms))
             low = -high
-        else:  # as far as one action may be from the next
+        else:  # The largest allowed motion from one action to the next.
             most = min(gate.max_jump, gate.max_speed / self._rate) / math.sqrt(3.0)
             most_angle = min(gate.max_rotation_jump, gate.max_angular_speed / self._rate) / math.sqrt(3.0)
             high = np.tile([most] * 3 + [most_angle] * 3, len(robot.arms))
@@ -198,7 +200,7 @@ class TaskEnv(gymnasium.Env):
 
 
 def _with_loop_rate(config: Config, rate: float) -> Config:
-    """The cell with another rate of its loop [Hz], whose steps the controller does not split."""
+    """Return the cell with another ``rate`` of its loop [Hz]; the controller does not split the longer steps."""
     if not is_number(rate) or not _LOOP_RATES[0] <= rate <= _LOOP_RATES[1]:
         raise ConfigError(f"loop_rate = {shown(rate)}: allowed: {_LOOP_RATES[0]:g} to {_LOOP_RATES[1]:g} Hz, or None")
     control = config.control.model_copy(update={"max_substep": max(config.control.max_substep, 1.0 / rate)})

@@ -1,1 +1,1 @@
-"""Whether a recorded episode is fit to be learned from, and why not."""
+"""Decides whether a recorded episode is fit for learning, and gives the reasons if it is not."""

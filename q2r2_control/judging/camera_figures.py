@@ -1,4 +1,4 @@
-"""Whether a camera's pictures came in time, can be seen, and move when the arms do."""
+"""Checks whether a camera's pictures came in time, are not black or damaged, and change when the arms move."""
 
 from __future__ import annotations
 
@@ -14,43 +14,47 @@ from q2r2_control.judging.pictures import Pictures
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Flags
 
-_DARK = 8.0  # mean brightness of a black picture, of 255
-_PLAIN = 1.0  # standard deviation of the brightness of a picture of one colour, of 255
-_TRAVEL = 0.01  # of an arm's joints between two pictures, from which on the picture has to change [rad]
-_ODD, _ODD_RATIO = 10.0, 3.0  # brightness by which a part of a damaged picture is unlike its neighbours, beyond theirs
-_PARTS = (4, 6, 4, 8)  # of a view: rows of parts, rows in each; columns of parts, columns in each
-_QUICK = 10.0  # rate from which on nothing passes a part of the picture between two pictures [Hz]
-LARGEST_LAG = 0.4  # that is looked for [s]
-_LAG_STEP = 0.02  # [s]
-_IN_TIME = 0.1  # a lag up to this one is believed where it explains the motion nearly as well as the best one [s]
-_NEARLY = 0.05  # of the motion in the pictures
-_LEFT = 0.65  # of the motion that lags near zero leave unexplained, another lag leaves this share at most
-_LEAST_FIT = 0.35  # of the motion in the pictures that the arms' explains
-_FEWEST = 20  # pictures of which a lag or an arm can be told
-_LEAST_TRAVEL = 0.5  # of an arm's joints in the whole episode, of which its camera can be told [rad]
-_CORRELATES = 0.4  # the change of pictures with the arm that carries their camera, at least
-_OTHER_ARM = 0.2  # by which the pictures of two swapped cameras correlate more with the other's arm, together
-_STILL = 3.0  # change of brightness of what stands still, of 255
-_MOSTLY, _HARDLY = 0.5, 0.35  # of what a camera sees stands still: a fixed camera, one that an arm carries
+# Brightness is from 0 to 255.
+_DARK = 8.0  # A black picture has a mean brightness below this.
+_PLAIN = 1.0  # A picture of one colour has a standard deviation of its brightness below this.
+_TRAVEL = 0.01  # If the joints of an arm move more than this between two pictures, the picture has to change [rad].
+# A part of a picture is damaged if its brightness differs from the pictures before and after by more than the first
+# number, plus the second number times the difference between these two.
+_ODD, _ODD_RATIO = 10.0, 3.0
+_PARTS = (4, 6, 4, 8)  # The parts of a view: rows of parts, rows in each; columns of parts, columns in each.
+_QUICK = 10.0  # From this rate on, nothing moves through a part of the picture between two pictures [Hz].
+LARGEST_LAG = 0.4  # The largest lag that is searched for [s].
+_LAG_STEP = 0.02  # The step between two lags that are compared [s].
+_IN_TIME = 0.1  # A lag up to this is preferred if it explains the motion nearly as well as the best lag [s].
+_NEARLY = 0.05  # Share of the motion in the pictures by which a larger lag has to explain more.
+_LEFT = 0.65  # A larger lag leaves at most this share of the motion that the small lags leave unexplained.
+_LEAST_FIT = 0.35  # The least share of the motion in the pictures that the motion of the arms has to explain.
+_FEWEST = 20  # The least number of pictures from which a lag or an arm can be found.
+_LEAST_TRAVEL = 0.5  # The least travel of an arm's joints in an episode from which its camera can be found [rad].
+_CORRELATES = 0.4  # The least correlation of the change of pictures with the motion of the arm that carries the camera.
+_OTHER_ARM = 0.2  # The sum of correlations of two swapped cameras is larger by this with the arm of the other camera.
+_STILL = 3.0  # The brightness of a place that stands still changes by less than this.
+# The share of the view that stands still is above the first for a fixed camera, below the second for one on an arm.
+_MOSTLY, _HARDLY = 0.5, 0.35
 
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """One camera, until the run begins to end; None: there is nothing to tell it by."""
+    """Figures of one camera, until the run begins to end. None means that a figure cannot be computed."""
 
-    arm: str | None  # the arm that carries the camera; None if none does
+    arm: str | None  # The arm that carries the camera; None if none does.
     pictures: int
-    rate_share: float | None  # pictures by those that were due
-    longest_gap_periods: float | None  # longest time without a picture, in the camera's periods
-    frozen_share: float | None  # pictures like the one before, of those between which the arms moved
-    black_share: float | None  # share of the pictures that are black or have one colour only
-    bad_pictures: int  # number of pictures that are damaged, or have another size than the cell says
-    lag_ms: float | None  # delay of the motion in the pictures behind the motion of the joints
-    swapped_with: str | None  # the camera whose place it has
+    rate_share: float | None  # The number of pictures divided by the number that was due.
+    longest_gap_periods: float | None  # The longest time without a picture, in the camera's periods.
+    frozen_share: float | None  # The share of equal pictures among those between which the arms moved.
+    black_share: float | None  # The share of the pictures that are black or have one colour only.
+    bad_pictures: int  # The number of pictures that are damaged, or have another size than the cell says.
+    lag_ms: float | None  # The delay of the motion in the pictures behind the motion of the joints.
+    swapped_with: str | None  # The camera with which it was swapped.
 
 
 def camera_figures(episode: Episode) -> dict[str, CameraFigures]:
-    """Figures of all cameras whose pictures can be looked at, by name."""
+    """Return the figures of all cameras whose pictures can be read, by name."""
     if not episode.ticks.following.any():
         return {}
     looks = {name: _CameraLook(episode, name, pictures) for name, pictures in episode.pictures.items()}
@@ -59,13 +63,13 @@ def camera_figures(episode: Episode) -> dict[str, CameraFigures]:
 
 
 class _CameraLook:
-    """Pictures of a camera beside the motion of the arms."""
+    """Compares the pictures of a camera with the motion of the arms."""
 
     def __init__(self, episode: Episode, name: str, pictures: Pictures) -> None:
         camera = episode.config.cameras[name]
         t = episode.ticks.t[episode.ticks.following]
         self._start, self._end = float(t[0]), float(t[-1])
-        self._rate = min(camera.rate, episode.config.nominal_rate_hz)  # a picture a tick, at most
+        self._rate = min(camera.rate, episode.config.nominal_rate_hz)  # At most one picture in a tick.
         self._pictures = pictures.between(self._start, self._end, 0.0)
         self.fixed = camera.topic is None and camera.link is None
         self.arm = None if camera.link is None else arm_of_link(episode.robot, camera.link)
@@ -94,14 +98,14 @@ class _CameraLook:
         )
 
     def _frozen_share(self) -> float | None:
-        """A camera on an arm sees that arm's motion for certain, any other that of some arm."""
+        """Return the share of equal pictures while the camera's own arm moves, or any arm if no arm carries it."""
         arms: Collection[str] = self._joints if self.arm is None else (self.arm,)
         moved = np.max([self.travel(arm) for arm in arms], axis=0) > _TRAVEL
         same = self._pictures.repeated[1:] | (self._change == 0.0)
         return float(same[moved].mean()) if moved.any() else None
 
     def _odd(self, views: Array) -> Flags:
-        """Pictures with a part unlike before and after, which are like each other: what damaged pixels look like."""
+        """Return which pictures seem damaged: a part differs from the pictures before and after, which are alike."""
         odd = np.zeros(len(views), dtype=bool)
         if len(views) > 2 and self._rate >= _QUICK:
             change, across = _by_part(np.diff(views, axis=0)), _by_part(views[2:] - views[:-2])
@@ -109,17 +113,18 @@ class _CameraLook:
         return odd
 
     def travel(self, arm: str, lag: float = 0.0) -> Array:
-        """(k - 1,) by how much an arm's joints moved between two pictures, ``lag`` [s] before them [rad]."""
+        """Return how far an arm's joints moved (k - 1,) [rad] between two pictures, ``lag`` [s] before their times."""
         if not len(self._t):
             return np.zeros(max(len(self._pictures.t) - 1, 0))
         q = np.stack([np.interp(self._pictures.t - lag, self._t, self._q[:, at]) for at in self._joints[arm]], axis=1)
         return np.asarray(np.linalg.norm(np.diff(q, axis=0), axis=1))
 
     def _lag(self) -> float | None:
-        """The lag at which the arms' speeds explain the change of the pictures best, as c_1 s_1 + c_2 s_2 + c_0 >= 0.
+        """Return the lag [s] at which the arms' speeds s explain the change of the pictures best.
 
-        Other lags are believed only where they explain it clearly better than those near zero: an arm that goes to and
-        fro has the same speed again later, and one that goes round looks faster where it is nearer to the camera.
+        The model is c_1 s_1 + c_2 s_2 + c_0, with all c >= 0. A lag that is not near zero counts only if it explains
+        the change clearly better than those near zero: an arm that moves to and fro has the same speed again later, and
+        an arm that moves round looks faster when it is nearer to the camera.
         """
         change, lags = self._change, np.arange(-LARGEST_LAG, LARGEST_LAG + _LAG_STEP, _LAG_STEP)
         energy = float(np.sum((change - change.mean()) ** 2)) if len(change) >= _FEWEST else 0.0
@@ -135,7 +140,7 @@ class _CameraLook:
         return float(lags[np.argmax(best)]) if fits.max() >= _LEAST_FIT else None
 
     def correlation(self, arm: str) -> float:
-        """Of the change of the pictures with the motion of an arm."""
+        """Return the correlation of the change of the pictures with the motion of an arm."""
         travel = self.travel(arm)
         if len(travel) < _FEWEST or not (travel.std() > 0.0 and self._change.std() > 0.0):
             return 0.0
@@ -143,12 +148,12 @@ class _CameraLook:
 
     @property
     def moves(self) -> bool:
-        """Whether the arm that carries it moves far enough to tell."""
+        """Return whether the arm that carries the camera moves far enough for a comparison."""
         return self.arm is not None and float(self.travel(self.arm).sum()) > _LEAST_TRAVEL
 
     @property
     def still_share(self) -> float:
-        """How much of what the camera sees stands still for nine tenths of the time."""
+        """Return the share of the view that stands still for nine tenths of the time."""
         views = self._pictures.views[~self._pictures.damaged].astype(np.float64)
         if len(views) < _FEWEST:
             return float("nan")
@@ -157,10 +162,11 @@ class _CameraLook:
 
 
 def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
-    """Cameras whose pictures are those of another one, by name, with that other one.
+    """Return the cameras that were swapped, by name, each with the other one.
 
-    Two on different arms: the pictures of each go with the other's arm. A fixed one and one on an arm: hardly anything
-    stands still before the former, most of it before the latter.
+    Two cameras on different arms are swapped if the pictures of each change with the arm of the other. A fixed camera
+    and a camera on an arm are swapped if hardly anything stands still in the view of the fixed one, and most things
+    stand still in the view of the other one.
     """
     found: dict[str, str] = {}
     for (one, first), (two, second) in combinations(looks.items(), 2):
@@ -179,12 +185,12 @@ def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
 
 
 def _by_part(change: Array) -> Array:
-    """(k, parts) mean change of the parts of views (k, rows, columns)."""
+    """Return the mean change (k, parts) of the parts of views (k, rows, columns)."""
     return np.asarray(np.abs(change).reshape(-1, *_PARTS).mean(axis=(2, 4)).reshape(len(change), -1))
 
 
 def arm_of_link(robot: Robot, link: str) -> str | None:
-    """The arm that moves a link; None if none does, or several do."""
+    """Return the arm that moves a link; None if none does, or several do."""
     joints = {frame.parentJoint - 1 for frame in robot.model.frames if frame.name == link}
     arms = [name for name, arm in robot.arms.items() if joints & set(arm.joints.tolist())]
     return arms[0] if len(arms) == 1 else None

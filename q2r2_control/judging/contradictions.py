@@ -1,4 +1,4 @@
-"""Contradictions between parts of an episode's file, of which one cannot be true."""
+"""Finds contradictions between parts of an episode's file, of which one cannot be true."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from q2r2_control.judging.figures import EpisodeFigures
 from q2r2_control.judging.thresholds import Rejection
 from q2r2_control.recording.clock_steps import clock_step_text
 
-_CONSTANT = 0.05  # of a gripper's stroke, less than which is no motion of it
-_CLOSES = 0.5  # of the stroke, a command over which every gripper follows by some of it
+_CONSTANT = 0.05  # Share of a gripper's stroke: a smaller range is no motion of the gripper.
+_CLOSES = 0.5  # Share of the stroke: a gripper has to move if its commands have a larger range.
 _GRASPS = re.compile(
     r"\b(grasp|grip(?!per)|pick|place|stack|lift|carr(y|ies)|insert|hand(s|ed|ing)? .*\b(over|to) |handover|"
     r"put (.* )?(in|into|on|onto)\b)",
@@ -20,7 +20,7 @@ _GRASPS = re.compile(
 
 
 def contradictions(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
-    """Reasons to discard an episode that are no limit of a number, and that no setting but ``needs_task`` changes."""
+    """Yield reasons to discard an episode that are not limits of numbers. Their only setting is ``needs_task``."""
     if figures.timing.repeated_stamps:
         count = figures.timing.repeated_stamps
         yield Rejection("repeated_stamps", f"{count} ticks have the time of the tick before")

@@ -1,4 +1,4 @@
-"""A recording as arrays: what is needed of every tick, and poses some hundred times a second."""
+"""Reads a recording into arrays: some numbers of every tick, and poses about a hundred times a second."""
 
 from __future__ import annotations
 
@@ -21,77 +21,77 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, targets_or_too
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, Flags
 
-FRAME = 0.01  # the time between two frames, at least [s]
-SPEED_OVER = 0.02  # a measured speed is taken over so long at least, since ticks come unevenly [s]
+FRAME = 0.01  # The time from one frame to the next [s].
+SPEED_OVER = 0.02  # A measured speed is an average over at least this time, since ticks are not evenly spaced [s].
 
 
 @dataclass(frozen=True)
 class Ticks:
     """One row for each of n ticks that are in the file."""
 
-    number: npt.NDArray[np.int64]  # (n,) from 0 on; those that were lost are left out
-    t: Array  # (n,) since the run began [s]
-    dt: Array  # (n,) since the loop's last tick, whether that is in the file or not [s]
-    compute_time: Array  # (n,) [s]
-    following: Flags  # (n,) False: the run ends, and the arms come to rest
-    certified: Flags  # (n,) a certified stop is known
-    fallback: Flags  # (n,) it was executed
-    distance: Array  # (n,) of the nearest pair [m]
-    margin: Array  # (n,) of the tightest pair, less the distance that it keeps [m]
-    engaged: Flags  # (n, arms)
-    by_policy: Flags  # (n, arms) engaged, and a policy moves the arm
-    rejected: Flags  # (n, arms) the target was not usable
-    slip: Array  # (n, arms) how far the leash has dragged the target since engaging [m]
-    slip_angle: Array  # (n, arms) [rad]
-    gripper: Array  # (n, arms) opening that is wanted, 0 closed .. 1 open
-    now: Array  # (n,) by the loop's own clock [s]
-    unmeasured: Flags  # (n, arms) a measured number, or a number of the reference, is not finite
-    joint_speed: Array  # (n, arms) of the measured joint that is nearest to its limit of speed, by that limit
+    number: npt.NDArray[np.int64]  # (n,) Numbers from 0 on, without those of lost ticks.
+    t: Array  # (n,) Time since the run began [s].
+    dt: Array  # (n,) Time since the loop's last tick, even if that one is not in the file [s].
+    compute_time: Array  # (n,) [s].
+    following: Flags  # (n,) False while the run ends and the arms come to rest.
+    certified: Flags  # (n,) A certified stop is known.
+    fallback: Flags  # (n,) The certified stop was executed.
+    distance: Array  # (n,) Distance of the nearest pair [m].
+    margin: Array  # (n,) Distance of the tightest pair minus the distance that it has to keep [m].
+    engaged: Flags  # (n, arms).
+    by_policy: Flags  # (n, arms) The arm is engaged, and a policy moves it.
+    rejected: Flags  # (n, arms) The target was not usable.
+    slip: Array  # (n, arms) Distance by which the leash has dragged the target since engaging [m].
+    slip_angle: Array  # (n, arms) The same as an angle [rad].
+    gripper: Array  # (n, arms) The wanted opening, 0 closed .. 1 open.
+    now: Array  # (n,) Time of the loop's own clock [s].
+    unmeasured: Flags  # (n, arms) A measured number, or a number of the reference, is not finite.
+    joint_speed: Array  # (n, arms) Largest ratio of a measured joint speed and the speed limit of that joint.
 
 
 @dataclass(frozen=True)
 class Frames:
     """One row for each of m ticks that are :data:`FRAME` apart. Poses are x y z [m] qx qy qz qw in the world."""
 
-    at: npt.NDArray[np.int64]  # (m,) rows of the ticks
-    q: Array  # (m, joints) measured [rad]
-    target: Array  # (m, arms, 7) of the operator; where there is none, the tool at the reference
-    reference: Array  # (m, arms, 7) tools at the controller's reference
-    v: Array  # (m, joints) measured [rad/s]
-    reference_q: Array  # (m, joints) the controller's reference [rad]
-    opening: Array  # (m, arms) measured of grippers, 0 closed .. 1 open; -inf: not measured
-    commanded: Array  # (m, arms) the same as commanded
+    at: npt.NDArray[np.int64]  # (m,) Rows of the ticks.
+    q: Array  # (m, joints) Measured positions [rad].
+    target: Array  # (m, arms, 7) Targets of the operator, or the tool at the reference where there is no target.
+    reference: Array  # (m, arms, 7) Tools at the controller's reference.
+    v: Array  # (m, joints) Measured velocities [rad/s].
+    reference_q: Array  # (m, joints) The controller's reference [rad].
+    opening: Array  # (m, arms) Measured openings of grippers, 0 closed .. 1 open; -inf if not measured.
+    commanded: Array  # (m, arms) Commanded openings of grippers.
 
 
 @dataclass(frozen=True)
 class Hand:
-    """The received samples of one hand: k samples, whose poses need not be numbers."""
+    """The k received samples of one hand. Their poses may not be finite."""
 
-    arm: str  # that it leads
-    received: Array  # (k,) receipt of the pose [s]
-    polled: Array  # (k,) time of the tick that took it [s]
-    position: Array  # (k, 3) in the input's frame [m]
+    arm: str  # The arm that the hand leads.
+    received: Array  # (k,) Time of the receipt of the pose [s].
+    polled: Array  # (k,) Time of the tick that took the sample [s].
+    position: Array  # (k, 3) Position in the input's frame [m].
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording, or an episode in it. Times are since it began."""
+    """One recording, or one episode of a recording. Times are since its beginning [s]."""
 
     recording: Recording
     config: Config
     robot: Robot
     ticks: Ticks
     frames: Frames
-    tools: Array  # (m, arms, 7) measured, at the frames
-    hands: dict[str, Hand]  # those that lead an arm
+    tools: Array  # (m, arms, 7) Measured poses of the tools at the frames.
+    hands: dict[str, Hand]  # The hands that lead an arm.
     events: list[Event]
-    damage: str | None  # why the file could be read no farther
-    pictures: dict[str, Pictures] = field(default_factory=dict)  # of cameras whose pictures can be looked at
-    ended_by: str | None = None  # the fault that ended the run
-    success: bool | None = None  # by the task's own check or the operator; None: nobody said
-    part: int | None = None  # of the recording's episodes, from 1 on; None: the whole
-    discarded: bool = False  # by its operator
-    ended_by_operator: bool = False  # while the run went on
+    damage: str | None  # The reason why the file cannot be read to its end.
+    pictures: dict[str, Pictures] = field(default_factory=dict)  # By camera, if its pictures can be read.
+    ended_by: str | None = None  # The fault that ended the run.
+    success: bool | None = None  # The success by the task's own check or the operator; None if it is not known.
+    part: int | None = None  # The number of the episode, from 1 on; None for the whole recording.
+    discarded: bool = False  # The operator discarded it.
+    ended_by_operator: bool = False  # The operator ended it while the run went on.
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -99,27 +99,27 @@ class Episode:
 
     @property
     def frame_t(self) -> Array:
-        """(m,) times of the frames [s]."""
+        """Return the times (m,) of the frames [s]."""
         return self.ticks.t[self.frames.at]
 
     @property
     def engaged(self) -> Flags:
-        """(m, arms) at the frames, as long as the run does not end."""
+        """Return which arms are engaged (m, arms) at the frames; False while the run ends."""
         at = self.frames.at
         return np.asarray(self.ticks.engaged[at] & self.ticks.following[at, None])
 
     @property
     def ended(self) -> bool:
-        """Whether the run came to its end and the file was closed, or the operator ended the episode before."""
+        """Return whether the run came to its end and the file was closed, or the operator ended the episode before."""
         if self.ended_by_operator:
             return True
         return self.recording.closed and bool(len(self.ticks.t)) and not self.ticks.following[-1]
 
 
 def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:
-    """Read a recording, up to where it is damaged, with or without its ``pictures``.
+    """Read a recording, up to the place where it is damaged, with or without its ``pictures``.
 
-    Raises :class:`RecordingError` where its cell cannot be built.
+    Raises :class:`RecordingError` if its cell cannot be built, or if the robot is not the recorded one.
     """
     config, robot = cell_and_robot_of(recording)
     read = _Read(recording, robot)
@@ -151,7 +151,7 @@ def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:
 
 
 def _pictures(recording: Recording, config: Config, damage: str | None) -> tuple[dict[str, Pictures], str | None]:
-    """Pictures of all cameras, and what is damaged; of a damaged file none, whose end nobody knows."""
+    """Return the pictures of all cameras, and the damage of the file; no pictures if the file is damaged."""
     chosen = {name: config.cameras[name] for name in recording.about.cameras if name in config.cameras}
     chosen = {name: camera for name, camera in chosen.items() if camera.topic is None or is_compressed(camera.topic)}
     if damage is not None or not chosen:
@@ -169,7 +169,7 @@ class _Read:
         self._joints = [arm.joints for arm in robot.arms.values()]
         # A joint that can turn a full circle may be measured modulo that circle.
         self._wraps = robot.position_upper - robot.position_lower >= 2.0 * np.pi
-        self._last: tuple[float, Array] | None = None  # time [s] and measured joints of the newest tick
+        self._last: tuple[float, Array] | None = None  # Time [s] and measured joints of the newest tick.
         self.ticks: list[Ticks] = []
         self.frames: list[Frames] = []
         self.events: list[Event] = []
@@ -177,13 +177,13 @@ class _Read:
         self.first_reference: Array = np.empty(0)
         self._samples: list[Array] = []
         self._count, self._slot = 0, -1
-        self._origin = 0.0  # of the loop's clock [s]
+        self._origin = 0.0  # Time of the loop's clock at the beginning of the recording [s].
         about = recording.about
         rows, times = np.empty(0, tick_type(len(about.arms), len(about.joints))), np.empty(0, np.int64)
-        self._add(TickChunk(rows, times, np.empty((0, len(SAMPLE_FIELDS))), {}))  # for a recording without a tick
+        self._add(TickChunk(rows, times, np.empty((0, len(SAMPLE_FIELDS))), {}))  # A recording may have no tick.
 
     def all_chunks(self) -> str | None:
-        """All there is; returns what is damaged."""
+        """Read all chunks; returns the damage of the file, or None."""
         try:
             for chunk in self._recording.chunks():
                 self._add(chunk)
@@ -233,14 +233,17 @@ class _Read:
         self._count, self._slot = self._count + len(t), int(slots.max(initial=self._slot))
 
     def _unmeasured(self, rows: Rows) -> Flags:
-        """(n, arms) Torques do not count, of which NaN says that nothing measures them; an opening of -inf neither."""
+        """Return which arms (n, arms) have a number that is not finite.
+
+        Torques do not count, since NaN means that they are not measured, and neither does an opening of -inf.
+        """
         finite = np.all([np.isfinite(rows[name]) for name in ("q", "v", "reference_q", "reference_v")], axis=0)
         openings = rows["arms"]["opening"]
         bad = [~finite[:, joints].all(axis=1) for joints in self._joints]
         return np.stack(bad, axis=1) | np.isnan(openings) | (openings == np.inf)
 
     def _joint_speed(self, t: Array, q: Array) -> Array:
-        """(n, arms) where a number is missing, 0."""
+        """Return the column ``joint_speed`` (n, arms) of :class:`Ticks`; numbers that are not finite count as 0."""
         if not len(t):
             return np.empty((0, len(self._joints)))
         before_t, before_q = self._last if self._last is not None else (t[0], q[0])
@@ -267,6 +270,6 @@ def _joined(kind: type[_Table], parts: list[_Table]) -> _Table:
 
 
 def stretches(flags: Flags) -> list[tuple[int, int]]:
-    """Beginning and end (exclusive) of each run of true ``flags`` (n,)."""
+    """Return the beginning and the end (exclusive) of each run of true ``flags`` (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False]))))
     return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]

@@ -1,4 +1,4 @@
-"""Verdicts on episodes of a recording, as soon as each has ended."""
+"""Judges each episode of a recording as soon as it has ended, while the run goes on."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.summary.tick import Tick
 from q2r2_control.wording import sentence
 
-LONGEST_LINE = 300  # of a verdict [characters]
-_NICENESS = 10  # as the writer: the loop goes first
-_LOOKS = 0.3  # between two looks at the file, which grows twice a second [s]
-_PATIENCE = 30.0  # with a recorder that is behind [s]
-_BEFORE = 1_000_000_000  # of the beginning, where reading begins [ns]
-_TICKS_BETWEEN_LOOKS = 64  # between two looks at whether a verdict is there
+LONGEST_LINE = 300  # The longest text of a verdict [characters].
+_NICENESS = 10  # The same as that of the writer: the loop has a higher priority.
+_LOOKS = 0.3  # Time between two readings of the file, which grows twice a second [s].
+_PATIENCE = 30.0  # Time to wait for a recorder that is behind [s].
+_BEFORE = 1_000_000_000  # Reading begins this long before the episode [ns].
+_TICKS_BETWEEN_LOOKS = 64  # The number of ticks between two checks for a verdict.
 _OF_EPISODES = {
     *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED),
     *(ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
@@ -38,7 +38,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Question:
-    """Which episode of a ``file`` is to be judged; ``timed``: times of its ``span`` are those of ticks in the file."""
+    """An episode of a ``file`` to judge. If ``timed``, the times of its ``span`` are those of ticks in the file."""
 
     file: str
     span: EpisodeSpan
@@ -60,7 +60,7 @@ def main(requests: Iterator[Question], answer: Callable[[Reason], None]) -> None
 
 
 def _verdict(question: Question, run: int) -> tuple[bool | None, str]:
-    """``run``: the process that asks, as long as there is somebody to answer."""
+    """Return the verdict. ``run`` is the id of the process that asks; its end also ends the waiting for the file."""
     until = time.monotonic() + _PATIENCE
     problem = f"it was not written within {_PATIENCE:g} s"
     while time.monotonic() < until and os.getppid() == run:
@@ -68,33 +68,37 @@ def _verdict(question: Question, run: int) -> tuple[bool | None, str]:
             if (episode := written_episode(question)) is not None:
                 verdict = judge_episode(episode).verdict
                 return verdict.keep, verdict.line
-        except RecordingError as error:  # of a file whose beginning is not written yet, too
+        except RecordingError as error:  # The beginning of the file may be not written yet.
             problem = str(error)
         time.sleep(_LOOKS)
     return None, f"not judged: {problem}"
 
 
 def written_episode(question: Question) -> Episode | None:
-    """The episode, without its pictures, which may come seconds later; None where it is not in the file as a whole."""
+    """Return the episode; None if the file does not have all of it yet.
+
+    The episode has no pictures, because they may be written seconds later.
+    """
     recording, span = open_recording(Path(question.file)), question.span
     if not question.timed:
         found = parts_of(read_episode(recording, pictures=False))[span.number - 1 : span.number]
         return found[0] if found and found[0].ended_by_operator else None
-    recording.since = recording.about.epoch + round(span.start * 1e9) - _BEFORE  # no more has to be read
+    recording.since = recording.about.epoch + round(span.start * 1e9) - _BEFORE  # Earlier data is not needed.
     whole = read_episode(recording, pictures=False)
     return part_of(whole, span) if len(whole.ticks.t) and whole.ticks.t[-1] > span.end else None
 
 
 class EpisodeJudge:
-    """A listener of a recorded run, as a context around it. It raises nothing: what fails is logged once.
+    """A listener of a recorded run, as a context around it. It raises nothing: a failure is logged once.
 
-    Others call :meth:`record_event` and :meth:`report_verdicts`. The work is done by a process of low priority.
+    A caller that has no ticks calls :meth:`record_event` and :meth:`report_verdicts` itself. A process of low priority
+    does the work.
     """
 
     def __init__(
         self, file: Callable[[], Path | None], report: Callable[[Reason], None], *, timed: bool = True
     ) -> None:
-        """``timed``: times of events are those of ticks in the ``file``, so only an episode's have to be read."""
+        """If ``timed``, times of events are those of ticks in the ``file``, and only the episode's ticks are read."""
         self._file, self._report, self._timed = file, report, timed
         self._events: list[Event] = []
         self._asked: Question | None = None
@@ -104,7 +108,7 @@ class EpisodeJudge:
         self._started = False
 
     def start(self) -> None:
-        """Start the process, which takes some milliseconds, unless the first question shall."""
+        """Start the process, which takes some milliseconds; otherwise the first question starts it."""
         self._started = True
         try:
             work = "q2r2_control.judging.episode_judge"
@@ -117,7 +121,7 @@ class EpisodeJudge:
         return None if self._process is None else self._process.pid
 
     def __call__(self, tick: Tick) -> None:
-        """Take one tick; never raises, and waits for nothing."""
+        """Take one tick. It never raises an error and never waits."""
         for event in tick.events:
             self.record_event(event)
         self._count += 1
@@ -125,7 +129,7 @@ class EpisodeJudge:
             self.report_verdicts()
 
     def record_event(self, event: Event) -> None:
-        """Learn of an event; one that ends an episode asks for the verdict on it."""
+        """Take an event. If it ends an episode, ask the process for a verdict."""
         if event.kind not in _OF_EPISODES:
             return
         self._events.append(event)
@@ -143,14 +147,14 @@ class EpisodeJudge:
         while self._answers:
             verdict = self._answers.popleft()
             if spans_of(self._events)[verdict.detail["episode"] - 1].discarded:
-                continue  # its operator has been faster
+                continue  # The operator discarded the episode before the verdict came.
             _logger.info(sentence(verdict))
             self._report(verdict)
         if self._process is not None and self._process.fault is not None:
             self._fail(self._process.fault)
 
     def close(self) -> None:
-        """End the process, whatever it does; it is not started any more."""
+        """Kill the process; it is not started again."""
         self._started = True
         if self._process is not None:
             self._process.kill()

@@ -1,4 +1,4 @@
-"""All numbers of an episode."""
+"""Computes all numbers of an episode."""
 
 from __future__ import annotations
 
@@ -19,33 +19,34 @@ from q2r2_control.teleop.arm_states import is_fault, is_refusal
 from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 
-_SURELY = 100  # frames, a second, with a target, so that its topic has one whatever its rate
-_SHORTEST = 1e-3  # of a time in which an arm counts as engaged [s]
+_SURELY = 100  # After this number of frames with a target, one second, the topic has a message at any rate.
+_SHORTEST = 1e-3  # The shortest time for which an arm counts as engaged [s].
 
 
 @dataclass(frozen=True, slots=True)
 class HandFigures:
-    """One hand, over the time for which it leads its engaged arm; None: that never is."""
+    """Figures of one hand while it leads its engaged arm. Rates, shares and times are None if it never does."""
 
     arm: str
-    pose_rate_hz: float | None  # poses received, by the time
-    dropouts: int  # times between two poses that are longer than a dropout
-    dropout_share: float | None  # of the time that is within them
-    longest_gap_s: float | None  # between two poses
-    unusable_poses: int  # that are no numbers
-    sample_age_ms_p50: float | None  # from the receipt of a pose to the tick that took it
+    pose_rate_hz: float | None  # The number of received poses divided by the time.
+    dropouts: int  # The number of times between two poses that are too long.
+    dropout_share: float | None  # The share of the time that is within dropouts.
+    longest_gap_s: float | None  # The longest time between two poses.
+    unusable_poses: int  # The number of poses that are not finite numbers.
+    sample_age_ms_p50: float | None  # The time from the receipt of a pose to the tick that took it.
     sample_age_ms_p99: float | None
 
 
 def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
-    """Figures of a hand's samples; ``dropout`` [s] is the longest time between poses that is none.
+    """Return the figures of a hand's samples. A time between poses is a dropout if it is longer than ``dropout`` [s].
 
-    A time between poses, or from the last one to the end, counts as far as it leads its arm and no tick was lost.
+    Times between poses, and the time from the last pose to the end, count while the hand leads its arm and no tick was
+    lost.
     """
     ticks, samples = episode.ticks, episode.hands[hand]
     engaged = (ticks.engaged & ~ticks.by_policy)[:, episode.arms.index(samples.arm)] & ticks.following
     steps = np.where(engaged, ticks.dt, 0.0)
-    passed = np.cumsum(steps)  # while engaged [s]
+    passed = np.cumsum(steps)  # The time for which the arm was engaged so far [s].
     total = float(passed[-1]) if len(passed) else 0.0
     unusable = ~np.isfinite(samples.position).all(axis=1)
     if total < _SHORTEST:
@@ -57,7 +58,7 @@ def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
     ends = np.concatenate(([ticks.t[engaged][0]], received, [ticks.t[engaged][-1]]))
     ends = np.maximum.accumulate(ends)
     gaps, inside = np.diff(ends), np.diff(np.interp(ends, ticks.t, passed))
-    lost = np.flatnonzero(np.diff(ticks.number) > 1)  # samples may be lost with the ticks after these
+    lost = np.flatnonzero(np.diff(ticks.number) > 1)  # Ticks, and maybe samples, were lost after these.
     with_lost = np.searchsorted(ticks.t[lost + 1], ends[:-1]) < np.searchsorted(ticks.t[lost], ends[1:], side="right")
     counting = (inside > _SHORTEST) & ~with_lost
     long = counting & (gaps > dropout)
@@ -74,70 +75,71 @@ def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
 
 
 def _at(t: Array, flags: Flags, when: Array) -> Flags:
-    """The newest of ``flags`` (n,), of times ``t`` (n,), at or before each of the times ``when``."""
+    """Return the newest of ``flags`` (n,), which have times ``t`` (n,), at or before each of the times ``when``."""
     at = np.searchsorted(t, when, side="right") - 1
     return np.asarray((at >= 0) & flags[np.maximum(at, 0)])
 
 
-_LATE = 1.5  # periods
+_LATE = 1.5  # A tick is late after more than this number of periods.
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A pause that no operator asked for."""
+    """A pause of an arm that the operator did not request."""
 
-    t: float  # since the run began [s]
+    t: float  # Time since the run began [s].
     arm: str
-    kind: str  # of the event's reason
-    reason: str  # in words
+    kind: str  # The kind of the event's reason.
+    reason: str  # The reason in words.
 
 
 @dataclass(frozen=True, slots=True)
 class TimingFigures:
-    """Of all ticks, the end of the run included; None: there are none."""
+    """Figures of all ticks, the end of the run included. Shares and maxima are None if there are no ticks."""
 
-    ticks: int  # that are in the file
-    lost_ticks: int  # Number of ticks between the first and the last one that the recording lacks.
+    ticks: int  # The number of ticks that are in the file.
+    lost_ticks: int  # The number of ticks up to the last one that the recording lacks.
     lost_share: float | None
-    longest_lost_s: float  # of which no tick is in the file
-    late_ticks: int  # more than 1.5 periods after the one before
-    missed_ticks: int  # whole periods that passed meanwhile
-    missed_share: float | None  # of those that were due
-    longest_tick_s: float | None  # between two ticks of the loop
+    longest_lost_s: float  # The longest time of which no tick is in the file.
+    late_ticks: int  # The number of ticks that come more than 1.5 periods after the one before.
+    missed_ticks: int  # The number of whole periods that passed without a tick.
+    missed_share: float | None  # The share of missed ticks among those that were due.
+    longest_tick_s: float | None  # The longest time between two ticks of the loop.
     compute_time_us_p99: float | None
-    ended: bool  # the arms came to rest and the file was closed
-    repeated_stamps: int | None  # ticks with a time that the one before had; None of nodes, whose receipts may coincide
-    clock_step_s: float  # the largest by which a clock was set meanwhile; negative: back; 0: none was
-    begins_again: bool  # the run goes on after it has begun to end: there are two in one file
+    ended: bool  # The arms came to rest and the file was closed.
+    # The number of ticks with the time of the tick before. None for ROS nodes, whose messages may arrive together.
+    repeated_stamps: int | None
+    clock_step_s: float  # The largest step by which a clock was set; negative if back, 0 if no clock was set.
+    begins_again: bool  # The run goes on after it has begun to end, so two runs are in one file.
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeFigures:
-    """The numbers of one episode. Shares are from 0 to 1; None: there is nothing to tell it by."""
+    """The numbers of one episode. Shares are from 0 to 1. None means that a number cannot be computed."""
 
     file: str
-    part: int | None  # which episode of the file, from 1 on; None: the whole
-    task: str | None  # in words; None: nobody said
-    duration_s: float  # until the run begins to end
-    engaged_s: float  # of any arm
+    part: int | None  # The number of the episode in the file, from 1 on; None for the whole file.
+    task: str | None  # The task in words; None if it is not known.
+    duration_s: float  # The time until the run begins to end.
+    engaged_s: float  # The time for which any arm is engaged.
     idle_share: float | None
     hands: dict[str, HandFigures]
     arms: dict[str, ArmFigures]
-    measured: dict[str, MeasuredFigures]  # by arm
+    measured: dict[str, MeasuredFigures]  # By arm.
     cameras: dict[str, CameraFigures]
-    empty_topics: list[str]  # without a message, of those that every run has
+    empty_topics: list[str]  # The topics without a message among those that should have one.
     faults: list[Fault]
     fallback_ticks: int
     fallback_share: float | None
     uncertified_ticks: int
     uncertified_share: float | None
-    min_distance_mm: float | None  # of the nearest monitored pair, by the controller's reference
-    min_margin_mm: float | None  # of the tightest one, less the distance that it keeps
+    min_distance_mm: float | None  # The distance of the nearest monitored pair, at the controller's reference.
+    min_margin_mm: float | None  # The distance of the tightest pair minus the distance that it has to keep.
     timing: TimingFigures
-    damage: str | None  # why the file could be read no farther
-    ended_by: str | None  # the fault that ended the run
-    discarded: bool  # by the operator
-    success: bool | None  # by the task's own check or the operator; None: nobody said
+    damage: str | None  # The reason why the file cannot be read to its end.
+    ended_by: str | None  # The fault that ended the run.
+    discarded: bool  # The operator discarded the episode.
+    success: bool | None  # The success by the task's own check or the operator; None if it is not known.
 
     @property
     def name(self) -> str:
@@ -145,7 +147,7 @@ class EpisodeFigures:
 
 
 def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
-    """The numbers of an episode; ``dropout`` [s] is the longest time between a hand's poses that is none."""
+    """Return the numbers of an episode. A time between a hand's poses above ``dropout`` [s] is a dropout."""
     ticks, following, count = episode.ticks, episode.ticks.following, len(episode.ticks.t)
     engaged = ticks.engaged.any(axis=1) & following
     return EpisodeFigures(
@@ -160,7 +162,7 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
         measured={arm: measured_figures(episode, arm) for arm in episode.arms},
         cameras=camera_figures(episode),
         empty_topics=_empty_topics(episode),
-        # Refused presses are none, since nothing moved; nor is the other arm's pause that follows from a fault.
+        # A refused press is no fault, since nothing moved. The pause of the other arm after a fault is no fault either.
         faults=[
             Fault(event.t, event.arm, str(event.reason.root.kind), sentence(event.reason))
             for event in episode.events
@@ -181,11 +183,16 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
 
 
 def _empty_topics(episode: Episode) -> list[str]:
-    """Topics without a message; of a file without an index nobody knows, and nodes may have published nothing."""
+    """Return the topics without a message that should have one.
+
+    The list is empty for a file without an index, where the counts are not known, and for a recording of ROS nodes,
+    which may have published nothing.
+    """
     about, counts = episode.recording.about, episode.recording.counts
     if about.source != LOOP or counts is None or not len(episode.ticks.t):
         return []
-    asked = (episode.frames.target != episode.frames.reference).any(axis=2).sum(axis=0)  # frames with a target
+    # The number of frames with a target, by arm.
+    asked = (episode.frames.target != episode.frames.reference).any(axis=2).sum(axis=0)
     expected = list(loop_topics(about.arms))
     expected += [target(arm) for arm, count in zip(about.arms, asked.tolist(), strict=True) if count > _SURELY]
     expected += [hand_pose(name) for name, hand in episode.hands.items() if len(hand.received)]
@@ -198,12 +205,12 @@ def _least_mm(distances: Array) -> float | None:
 
 
 def timing_figures(episode: Episode) -> TimingFigures:
-    """Figures of ticks; missed are those between which more time passed, by what each tick says, than a period."""
+    """Return the figures of all ticks. The missed ticks follow from the time that each tick counts since the last."""
     ticks, count = episode.ticks, len(episode.ticks.t)
     if not count:
         return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended, 0, 0.0, False)
     period = 1.0 / episode.config.nominal_rate_hz
-    lost = np.diff(ticks.number, prepend=-1) - 1  # the first tick of a run is number 0
+    lost = np.diff(ticks.number, prepend=-1) - 1  # The first tick of a run has number 0.
     gaps = np.diff(ticks.t, prepend=0.0) - ticks.dt
     steps = clock_steps(ticks.number, ticks.t, ticks.dt)
     missed = int(np.maximum(np.round(ticks.dt / period) - 1, 0).sum())

@@ -1,4 +1,4 @@
-"""Judges the episodes of recordings, and keeps verdicts beside them."""
+"""Judges the episodes of recordings, and writes the verdicts into a file beside each recording."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from q2r2_control.recording.ros_recording import open_recording
 
 VERDICT_FILE = "verdict.json"
 _FORMAT = 2
-_LONGEST_REASON = 300  # why a file cannot be read [characters]
+_LONGEST_REASON = 300  # The longest reason why a file cannot be read [characters].
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Kept, or discarded for all of the ``reasons``."""
+    """The verdict on an episode: it is discarded for all of the ``reasons``, or kept if there are none."""
 
     reasons: tuple[Rejection, ...]
 
@@ -49,7 +49,7 @@ class Verdict:
 
 
 def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
-    """Hold an episode's numbers to thresholds; a number that is None is not judged."""
+    """Compare an episode's numbers with thresholds; a number that is None is not judged."""
     reasons = list(_unreadable(figures, settings))
     if not figures.engaged_s > 0.0:
         return Verdict((*reasons, Rejection("never_engaged", "no arm was ever engaged")))
@@ -90,15 +90,15 @@ def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Re
 
 
 def parts_of(episode: Episode) -> list[Episode]:
-    """The episodes of a recording in their order; where the operator told of none, the whole."""
+    """Return the episodes of a recording in their order, or the whole recording if the operator marked none."""
     spans = spans_of(episode.events, episode.success)
     return [part_of(episode, span) if span.number else replace(episode, success=span.success) for span in spans]
 
 
 def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
-    """An episode of a recording. Times are since it began, and its first tick is number 0."""
+    """Return an episode of a recording. Times are since the episode began, and its first tick has number 0."""
     ticks, frames = episode.ticks, episode.frames
-    # Not a search in sorted times: where the clock was set back, times repeat.
+    # A search in sorted times is not possible, because times repeat after the clock was set back.
     inside = np.flatnonzero((span.start <= ticks.t) & (ticks.t <= span.end))
     first, end = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
     cut = {name: values[first:end] for name, values in vars(ticks).items()}
@@ -140,7 +140,7 @@ class Judged:
     settings: JudgeSettings
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data; what is not finite is None."""
+        """Return plain data; numbers that are not finite become None."""
         reasons = [asdict(reason) for reason in self.verdict.reasons]
         data = {"verdict": self.verdict.word, "reasons": reasons, "figures": asdict(self.figures)}
         return dict(json.loads(json.dumps(data), parse_constant=lambda name: None))
@@ -148,10 +148,10 @@ class Judged:
 
 @dataclass(frozen=True)
 class Unreadable:
-    """A file of which nothing can be said but that it is discarded."""
+    """A file that cannot be read, so it is discarded."""
 
     file: Path
-    why: str  # in one line, without the file's name
+    why: str  # The reason in one line, without the name of the file.
 
     @property
     def line(self) -> str:
@@ -163,7 +163,10 @@ class Unreadable:
 
 
 def judge(recording: Recording, settings: JudgeSettings | None = None, *, pictures: bool = True) -> list[Judged]:
-    """Judge a recording's episodes, by its cell's thresholds or these. Raises as :func:`read_episode` does."""
+    """Judge a recording's episodes by ``settings``, or by the thresholds of its cell if None.
+
+    Raises the same errors as :func:`read_episode`.
+    """
     return [judge_episode(episode, settings) for episode in parts_of(read_episode(recording, pictures=pictures))]
 
 
@@ -175,7 +178,7 @@ def judge_episode(episode: Episode, settings: JudgeSettings | None = None) -> Ju
 
 
 def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> Iterator[Judged | Unreadable]:
-    """Judge recordings, one after the other; a file that cannot be read says why, and the next one follows."""
+    """Judge recordings, one after the other. A file that cannot be read gives an :class:`Unreadable`."""
     for file in files:
         try:
             yield from judge(open_recording(file), settings)
@@ -183,18 +186,21 @@ def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> I
             yield Unreadable(file, reason_of(error).removeprefix(f"{file}: ")[:_LONGEST_REASON])
 
 
-@lru_cache(maxsize=1)  # the episodes of one file are asked for one after the other
+@lru_cache(maxsize=1)  # The episodes of one file are requested one after the other.
 def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
-    """Why episodes of a recording are discarded, by their number; 0: the whole. With or without its ``pictures``.
+    """Return why episodes of a recording are discarded, by their number; 0 is the whole recording.
 
-    Raises :class:`RecordingError`.
+    The pictures are judged if ``pictures`` is True. Raises :class:`RecordingError`.
     """
     judged = judge(open_recording(file), pictures=pictures)
     return {one.figures.part or 0: one.verdict.line for one in judged if not one.verdict.keep}
 
 
 def keep_verdicts(judged: Sequence[Judged]) -> Path:
-    """Write the verdicts on a recording's episodes beside it, whole or not at all. Raises :class:`RecordingError`."""
+    """Write the verdicts on a recording's episodes into a file beside it, completely or not at all.
+
+    Raises :class:`RecordingError`.
+    """
     recording = judged[0].episode.recording
     target = recording.file.with_name(VERDICT_FILE)
     part = target.with_suffix(".part")

@@ -1,4 +1,4 @@
-"""Whether what was measured of an arm can be true: finite, no faster than its joints, and as its reference says."""
+"""Checks whether measurements of an arm are plausible: finite, not faster than its joints, and near its reference."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.motion import Track, best_delay
 from q2r2_control.types import Array
 
-_SPEED_FRAMES = 10  # number of frames that a joint's speed is averaged over
-_MOVES = 0.02  # RMS speed from which on a joint's measured velocity is held against its positions [rad/s]
-_LONGEST_GAP = 0.05  # between the frames that a velocity is compared over [s]
-_LARGEST_LAG = 0.35  # that is looked for [s]
-_STEP = 0.005  # of lags, and of the times that are compared [s]
+_SPEED_FRAMES = 10  # The number of frames over which a joint's speed is averaged.
+_MOVES = 0.02  # The least RMS speed at which a joint's measured velocity is compared with its positions [rad/s].
+_LONGEST_GAP = 0.05  # The longest time between the frames over which a velocity is compared [s].
+_LARGEST_LAG = 0.35  # The largest lag that is searched for [s].
+_STEP = 0.005  # The step of lags, and of the times that are compared [s].
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredFigures:
-    """One arm, until the run begins to end; None: there is nothing to tell it by."""
+    """Figures of one arm, until the run begins to end. None means that a figure cannot be computed."""
 
-    unmeasured_ticks: int  # with a position, velocity, opening or reference that is no finite number
-    joint_speed_share: float  # largest of the joints: mean speed over 20 ms divided by the speed limit
-    velocity_mismatch: float | None  # of the joint whose measured velocity is least the slope of its positions
-    reference_lag_ms: float | None  # of the measured joints behind the reference
-    opening_range: float | None  # measured of the gripper; None: it is not measured
-    commanded_range: float | None  # commanded of the gripper; None: the arm has none
+    unmeasured_ticks: int  # The number of ticks with a position, velocity, opening or reference that is not finite.
+    joint_speed_share: float  # The largest of the joints: mean speed over 20 ms or 10 frames, divided by the limit.
+    velocity_mismatch: float | None  # The largest of the joints: |k - 1|, where velocity = k * slope of the position.
+    reference_lag_ms: float | None  # The lag of the measured joints behind the reference.
+    opening_range: float | None  # The range of measured openings; None if they are not measured.
+    commanded_range: float | None  # The range of commanded openings; None if the arm has no gripper.
 
 
 def measured_figures(episode: Episode, arm: str) -> MeasuredFigures:
-    """Figures of an arm; torques are left out, which not every plant measures."""
+    """Return the figures of an arm. They leave torques out, since not every plant measures them."""
     index, ticks = episode.arms.index(arm), episode.ticks
     joints, at = episode.robot.arms[arm].joints, episode.frames.at
     following = ticks.following[at]
@@ -48,18 +48,18 @@ def measured_figures(episode: Episode, arm: str) -> MeasuredFigures:
 
 
 def _lasting_speed(t: Array, q: Array, limits: Array) -> float:
-    """Greatest speed over ten frames, a tenth of a second, by the limits."""
+    """Return the largest speed over ten frames, a tenth of a second, divided by the limit of the joint."""
     if len(t) <= _SPEED_FRAMES:
         return 0.0
     passed = np.maximum(t[_SPEED_FRAMES:] - t[:-_SPEED_FRAMES], 1e-9)
     steps = np.abs(q[_SPEED_FRAMES:] - q[:-_SPEED_FRAMES])
-    steps = np.where(steps > np.pi, 0.0, steps)  # a joint that turns on for ever begins anew
+    steps = np.where(steps > np.pi, 0.0, steps)  # A joint without limits of position starts again after a turn.
     return float(np.nan_to_num(steps / passed[:, None] / limits, posinf=0.0).max())
 
 
 def _velocity_mismatch(t: Array, q: Array, v: Array) -> float | None:
-    """|k - 1| of the worst joint, where v = k dq/dt fits best; -1 is the slope of a velocity of the wrong sign."""
-    if len(t) < 3 or not np.nan_to_num(v).any():  # not measured
+    """Return |k - 1| of the worst joint, where v = k dq/dt fits best; k is -1 for velocities of the wrong sign."""
+    if len(t) < 3 or not np.nan_to_num(v).any():  # Velocities are not measured.
         return None
     slope, measured = (q[2:] - q[:-2]) / np.maximum(t[2:] - t[:-2], 1e-9)[:, None], v[1:-1]
     usable = np.isfinite(slope).all(axis=1) & np.isfinite(measured).all(axis=1) & (t[2:] - t[:-2] < _LONGEST_GAP)
@@ -72,7 +72,7 @@ def _velocity_mismatch(t: Array, q: Array, v: Array) -> float | None:
 
 
 def _reference_lag(t: Array, q: Array, reference: Array) -> float | None:
-    """By how many ms the measured joints lag behind the reference, as :func:`delays` tells it; negative: they lead."""
+    """Return the lag [ms] of the measured joints behind the reference, as in :func:`delays`; negative if they lead."""
     usable = np.isfinite(q).all(axis=1) & np.isfinite(reference).all(axis=1)
     t, q, reference = t[usable], q[usable], reference[usable]
     if len(t) < 2 or t[-1] - t[0] < 3.0 * _LARGEST_LAG:

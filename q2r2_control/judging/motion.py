@@ -1,4 +1,4 @@
-"""How well the arms followed, how smoothly and how late, and whether they moved at all."""
+"""Measures how well the arms followed, how smooth and how late their motion was, and whether they moved at all."""
 
 from __future__ import annotations
 
@@ -15,41 +15,44 @@ from q2r2_control.judging.episode import FRAME, Episode, stretches
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array, Flags
 
-PIECE = 1.0  # of a motion, for its smoothness [s]
-_HOP = 0.25  # from one piece to the next [s]
-_FEWEST = 8  # pieces
-_SLOWEST = 0.02  # mean speed of a piece that counts [m/s]
-_LONGEST_GAP = 0.05  # between two frames [s]
-_SMOOTHING = 0.02  # standard deviation of the Gaussian before jerk is taken, which halves the power at 6.6 Hz [s]
-LONGEST = 0.5  # delay that is looked for [s]
-_STEP = 0.005  # of delays, and of the times that are compared [s]
-_DIFFERENCE = 0.025  # to either side, over which a motion is a difference [s]
-_LEAST_MOTION = 0.01  # a hand that moves less has no delay [m/s], RMS
-_LEAST_FIT = 0.5  # of the tool's motion that the hand's explains
-_ALIKE = 0.01  # fit by which a delay that is a second longer has to be better: a motion may repeat itself
-_LOOK = 0.5  # what moves is elsewhere so much earlier or later [s]
-_MOVED, _TURNED = 2e-3, 0.02  # at least [m, rad]
+PIECE = 1.0  # The duration of a piece of a motion, for which smoothness is computed [s].
+_HOP = 0.25  # The time from the start of one piece to the start of the next [s].
+_FEWEST = 8  # The least number of pieces.
+_SLOWEST = 0.02  # The least mean speed of a piece that counts [m/s].
+_LONGEST_GAP = 0.05  # The longest time between two frames of a piece [s].
+# The standard deviation of the Gaussian that smooths positions before the jerk [s]. It halves the power at 6.6 Hz.
+_SMOOTHING = 0.02
+LONGEST = 0.5  # The longest delay that is searched for [s].
+_STEP = 0.005  # The step of delays, and of the times that are compared [s].
+_DIFFERENCE = 0.025  # A velocity is a difference of positions over this time before and after [s].
+_LEAST_MOTION = 0.01  # A hand that moves more slowly has no delay [m/s], RMS.
+_LEAST_FIT = 0.5  # The least share of the tool's motion that the hand's motion has to explain.
+_ALIKE = 0.01  # A delay that is a second longer needs a better fit by this, since a motion may repeat itself.
+_LOOK = 0.5  # The place of a tool is compared with its place this much earlier and later [s].
+_MOVED, _TURNED = 2e-3, 0.02  # The least distance and angle between these places of a tool that moves [m, rad].
 
 
 def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:
-    """Median of :func:`ldlj`, of smoothed positions, over the pieces of a tool's motion.
+    """Return the median of :func:`ldlj`, of smoothed positions, over the pieces of a tool's motion.
 
-    ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. None: fewer than eight pieces move at 20 mm/s on average.
+    ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. The result is None if fewer than eight pieces have a mean
+    speed above 20 mm/s.
     """
     moving = []
     for begin, end in stretches(engaged & np.isfinite(position).all(axis=1)):
         moving += _pieces(t[begin:end], position[begin:end])
     if len(moving) < _FEWEST:
         return None
-    # A tick that comes a millisecond late measures a tool at 0.3 m/s 0.3 mm off, and in real time there are many. Three
-    # derivatives of that would be more than those of the motion. The ends, which the smoothing changes, are cut off.
+    # In real time many ticks come a millisecond late, and measure a tool of 0.3 m/s with an error of 0.3 mm. The third
+    # derivative of that error is larger than that of the motion, so positions are smoothed. The smoothing changes the
+    # ends, so they are cut off.
     cut = round(2.0 * _SMOOTHING / FRAME)
     smoothed = [gaussian_filter1d(piece, _SMOOTHING / FRAME, axis=0)[cut:-cut] for piece in moving]
     return float(np.median([ldlj(piece, FRAME) for piece in smoothed]))
 
 
 def _pieces(t: Array, position: Array) -> list[Array]:
-    """Positions (k, 3) of all pieces that move, at even times :data:`FRAME` apart."""
+    """Return the positions (k, 3) of each piece that moves, at even times that are :data:`FRAME` apart."""
     count, hop = round(PIECE / FRAME) + 1, round(_HOP / FRAME)
     if len(t) < count // 2 or t[-1] - t[0] < PIECE:
         return []
@@ -67,12 +70,12 @@ def _pieces(t: Array, position: Array) -> list[Array]:
 
 
 def ldlj(position: Array, dt: float) -> float:
-    """Log dimensionless jerk along positions (k, 3) [m] that are ``dt`` [s] apart.
+    """Return the log dimensionless jerk along positions (k, 3) [m] that are ``dt`` [s] apart.
 
     LDLJ = -ln(T^3 / v_peak^2 * integral of |d^3 x / dt^3|^2 dt) over the duration T (Balasubramanian,
     Melendez-Calderon, Roby-Brami, Burdet, On the analysis of movement smoothness, JNER 2015). The dimensionless jerk is
-    that of Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009. About -5.3 for one reach
-    of minimum jerk.
+    that of Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009. A single reach of minimum
+    jerk has about -5.3.
     """
     velocity = np.diff(position, axis=0) / dt
     jerk = np.diff(velocity, n=2, axis=0) / dt**2
@@ -83,13 +86,13 @@ def ldlj(position: Array, dt: float) -> float:
 
 
 class Track(NamedTuple):
-    t: Array  # (n,) [s], rising
-    position: Array  # (n, 3) [m], or (n, joints) [rad]
+    t: Array  # (n,) Ascending times [s].
+    position: Array  # (n, 3) [m], or (n, joints) [rad].
 
     def velocity(self, when: Array) -> Array:
-        """(m, 3) [m/s], or (m, joints) [rad/s], at times ``when`` (m,) [s], as a difference over 50 ms.
+        """Return the velocity (m, 3) [m/s], or (m, joints) [rad/s], at times ``when`` (m,) [s].
 
-        Before and after the track it rests.
+        The velocity is a difference of positions over 50 ms. The positions before and after the track are constant.
         """
         ahead, behind = (
             np.stack([np.interp(when + shift, self.t, column) for column in self.position.T], axis=1)
@@ -99,12 +102,13 @@ class Track(NamedTuple):
 
 
 def delays(episode: Episode, hand: str) -> list[float | None]:
-    """Delays [s] of the target, and of the measured tool, behind a hand's poses as they were received.
+    """Return the delays [s] of the target, and of the measured tool, behind a hand's poses as they were received.
 
     A delay is the tau that maximises the squared correlation of v(t) with M v_hand(t - tau) over all times t at which
-    the arm is engaged. Here v is the velocity of target or tool, M (3, 3) how the teleoperation maps the hand's axes to
-    the world. Neither anchors nor the scale matter, nor for how long the hand rests. None: the hand moves less than 10
-    mm/s RMS, only turns, or explains less than half of that motion; or no maximum is within (0, 0.5) s.
+    the arm is engaged. Here v is the velocity of the target or tool, and M (3, 3) maps the hand's axes to the world, as
+    the teleoperation does. The anchors, the scale and the time for which the hand rests do not matter. A delay is None
+    if the hand moves less than 10 mm/s RMS, only turns, or explains less than half of that motion, or if no maximum is
+    within (0, 0.5) s.
     """
     samples = episode.hands[hand]
     arm = episode.arms.index(samples.arm)
@@ -114,7 +118,7 @@ def delays(episode: Episode, hand: str) -> list[float | None]:
         return [None, None]
     motion = RelativeMotion(episode.config.teleop.stance, axes=episode.config.teleop.axes)
     motion.anchor(pin.SE3.Identity(), pin.SE3.Identity())
-    axes = np.array([motion.target(pin.SE3(np.eye(3), axis)).translation for axis in np.eye(3)])  # M'
+    axes = np.array([motion.target(pin.SE3(np.eye(3), axis)).translation for axis in np.eye(3)])  # The transpose of M.
     position = samples.position[usable][first] @ axes
     t = episode.frame_t
     times = [
@@ -129,19 +133,22 @@ def delays(episode: Episode, hand: str) -> list[float | None]:
 
 
 def delays_behind(hand: Track, followers: Sequence[Track], when: Array) -> list[float | None]:
-    """Delay [s] of each of ``followers`` behind ``hand``, of times ``when`` (n,) [s]; None as of :func:`delays`."""
+    """Return the delay [s] of each follower behind ``hand``, at times ``when`` (n,) [s]; None as in :func:`delays`."""
     lags = np.arange(0.0, LONGEST + _STEP, _STEP)
     by_hand = [hand.velocity(when - lag) for lag in lags]
     return [_best(lags, by_hand, follower.velocity(when)) for follower in followers]
 
 
 def best_delay(leader: Track, follower: Track, when: Array, lags: Array) -> float | None:
-    """The one of ``lags`` [s], 5 ms apart, by which a motion follows another; None as of :func:`delays`."""
+    """Return by which of ``lags`` [s], 5 ms apart, a motion follows another; None as in :func:`delays`."""
     return _best(lags, [leader.velocity(when - lag) for lag in lags], follower.velocity(when))
 
 
 def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:
-    """The delay of the highest correlation, between two steps too; of those that fit alike the one nearest to zero."""
+    """Return the delay of the highest correlation, also between two steps.
+
+    Among delays with nearly the same correlation it is the one nearest to zero.
+    """
     energy = float(np.sum(moved * moved))
     fits = np.zeros(len(lags))
     for index, hand in enumerate(by_hand):
@@ -158,25 +165,25 @@ def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class ArmFigures:
-    """One arm, over the time for which it is engaged; None: there is nothing to tell it by."""
+    """Figures of one arm over the time for which it is engaged. None means that a figure cannot be computed."""
 
     engaged_s: float
-    position_error_mm_rms: float | None  # target to measured tool
+    position_error_mm_rms: float | None  # Errors are from the target to the measured tool.
     position_error_mm_p99: float | None
     rotation_error_deg_rms: float | None
     rotation_error_deg_p99: float | None
     hand_to_target_ms: float | None
     hand_to_tool_ms: float | None
-    rejected_share: float | None  # of the ticks: the target was not usable
-    leashed_share: float | None  # of the ticks: the leash dragged the target
-    slip_mm: float  # by how much, in all
-    slip_deg: float
+    rejected_share: float | None  # The share of ticks with a target that is not usable.
+    leashed_share: float | None  # The share of ticks in which the leash dragged the target.
+    slip_mm: float  # The total distance by which the leash dragged the target.
+    slip_deg: float  # The total angle by which the leash dragged the target.
     ldlj: float | None
-    gripper_changes: int  # of the opening that is wanted
+    gripper_changes: int  # The number of changes of the wanted opening.
 
 
 def arm_figures(episode: Episode, arm: str) -> ArmFigures:
-    """Figures of an arm; delays and smoothness are those of :func:`delays` and :func:`smoothness`."""
+    """Return the figures of an arm; delays and smoothness are those of :func:`delays` and :func:`smoothness`."""
     index = episode.arms.index(arm)
     ticks = episode.ticks
     engaged = ticks.engaged[:, index] & ticks.following
@@ -202,7 +209,10 @@ def arm_figures(episode: Episode, arm: str) -> ArmFigures:
 
 
 def tracking_errors(episode: Episode, arm: int) -> tuple[Array, Array]:
-    """(m,) distance [m] and angle [rad] of the measured tool from the target at the frames; NaN while not engaged."""
+    """Return the distance (m,) [m] and angle (m,) [rad] of the measured tool from the target at the frames.
+
+    They are NaN while the arm is not engaged.
+    """
     tools, targets, engaged = episode.tools[:, arm], episode.frames.target[:, arm], episode.engaged[:, arm]
     position = np.linalg.norm(tools[:, :3] - targets[:, :3], axis=1)
     rotation = _angles(tools[:, 3:], targets[:, 3:])
@@ -210,11 +220,11 @@ def tracking_errors(episode: Episode, arm: int) -> tuple[Array, Array]:
 
 
 def idle_share(episode: Episode) -> float | None:
-    """Share of the run, until it begins to end, in which no arm is engaged or none of those moves.
+    """Return the share of the run, until it begins to end, in which no engaged arm moves.
 
-    An arm moves where its tool, at the controller's reference, is more than 2 mm or 0.02 rad from its place half a
-    second earlier or later. It also moves where its gripper is told to open or close in that time. A hand that trembles
-    does not move, a stop between two motions is not idle. None: no tick is in the file.
+    An arm moves if its tool, at the controller's reference, is more than 2 mm or 0.02 rad from its place half a second
+    earlier or later. It also moves if its gripper gets another command in that time. Thus a trembling hand is idle, and
+    a short stop between two motions is not. The result is None if no tick is in the file.
     """
     t, at = episode.frame_t, episode.frames.at
     moving = np.zeros(len(t), dtype=bool)
@@ -230,12 +240,12 @@ def idle_share(episode: Episode) -> float | None:
 
 
 def _angles(a: Array, b: Array) -> Array:
-    """(n,) between rotations given as quaternions (n, 4) [rad]."""
+    """Return the angles (n,) [rad] between rotations that are given as quaternions (n, 4)."""
     return np.asarray(2.0 * np.arccos(np.clip(np.abs(np.sum(a * b, axis=1)), 0.0, 1.0)))
 
 
 def _rise(values: Array, engaged: Flags) -> Array:
-    """(n,) by how much ``values`` rise from one tick to the next, in both of which the arm is engaged."""
+    """Return the rise (n,) of ``values`` since the tick before; 0 unless the arm is engaged in both ticks."""
     rise = np.diff(values, prepend=values[:1])
     return np.where(engaged & np.concatenate(([False], engaged[:-1])), np.maximum(rise, 0.0), 0.0)[: len(values)]
 

@@ -1,4 +1,4 @@
-"""One HTML page of judged episodes that needs nothing else: styles and pictures are in it."""
+"""Makes one HTML page of judged episodes that needs no other files: it contains its styles and pictures."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLOURS = {"left": "#1f6fb2", "right": "#d9722b"}
-_LINE_STYLES: dict[str, Any] = {"left": "-", "right": (0, (4, 3))}  # where both share a plot, the right lies on top
-_POINTS = 500  # of a line, at most
-_SPEED_OVER = 5  # frames
+_LINE_STYLES: dict[str, Any] = {"left": "-", "right": (0, (4, 3))}  # The right line is drawn on top, so it is dashed.
+_POINTS = 500  # The largest number of points of a line.
+_SPEED_OVER = 5  # The number of frames over which a speed is averaged.
 _SHADE: dict[str, Any] = {"color": "#b0b0b0", "alpha": 0.35, "linewidth": 0.0}
 _LOST: dict[str, Any] = {"color": "#b3202c", "alpha": 0.4, "linewidth": 0.0}
 _FAULT: dict[str, Any] = {"color": "#6a4c93", "linestyle": "-.", "linewidth": 1.4}
@@ -32,7 +32,7 @@ _LIMIT: dict[str, Any] = {"color": "#b3202c", "linestyle": "--", "linewidth": 1.
 
 @dataclass(frozen=True, slots=True)
 class FigureColumn:
-    """A number of the table of episodes; of several hands or arms the worst one."""
+    """A column of the table of episodes. With several hands or arms, it has the worst of their numbers."""
 
     name: str
     unit: str
@@ -83,7 +83,7 @@ def page_of(
     progress: Callable[[int], None] = lambda done: None,
     unreadable: Sequence[Unreadable] = (),
 ) -> str:
-    """The page, with ``unreadable`` files below; ``progress`` is told how many episodes are drawn."""
+    """Return the page, with ``unreadable`` files at its end. ``progress`` gets the number of episodes drawn so far."""
     rows, sections = [], []
     for number, judged in enumerate(episodes, 1):
         plain, word = escape(judged.figures.name), judged.verdict.word
@@ -93,7 +93,7 @@ def page_of(
         rows.append(f'<tr><th><a href="#episode-{number}">{name}</a></th><td>{badge}</td>{cells}</tr>')
         reasons = "".join(f"<li>{escape(reason.text)}</li>" for reason in judged.verdict.reasons)
         about = f"<p>{escape(judged.figures.task or '')}</p><ul>{reasons}</ul>"
-        # Each picture is an image of its own, since names of elements are the same in all of them.
+        # Each picture is a separate image, since the same names of elements occur in all of them.
         data = b64encode(draw_episode(judged).encode()).decode()
         size = 'width="1248" height="806"'
         picture = f'<img alt="plots of {plain}" {size} src="data:image/svg+xml;base64,{data}">'
@@ -113,8 +113,8 @@ def page_of(
 
 
 def draw_episode(judged: Judged) -> str:
-    """Plots over time as the text of an SVG file, which does not grow with the episode."""
-    # Imported here, since it takes longer than all else that a command without plots needs.
+    """Return plots over time as the text of an SVG file, whose size does not grow with the episode."""
+    # The import stands here because it takes longer than all other work of a command without plots.
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -140,7 +140,7 @@ def draw_episode(judged: Judged) -> str:
 
 
 def thinned(t: Array, values: Array, extreme: np.ufunc) -> tuple[Array, Array]:
-    """At most 500 points of a line: of pieces of equal length the ``extreme``, ``np.fmax`` or ``np.fmin``."""
+    """Return at most 500 points of a line: the ``extreme``, ``np.fmax`` or ``np.fmin``, of pieces of equal length."""
     if len(t) <= _POINTS:
         return t, values
     starts = np.unique(np.linspace(0, len(t), _POINTS, endpoint=False).astype(int))
@@ -148,7 +148,7 @@ def thinned(t: Array, values: Array, extreme: np.ufunc) -> tuple[Array, Array]:
 
 
 def _draw_speed(axes: Axes, judged: Judged) -> None:
-    """Measured tools, and while no arm is engaged a grey ground."""
+    """Draw the speeds of the measured tools, and a grey background while no arm is engaged."""
     episode, t = judged.episode, judged.episode.frame_t
     for index, arm in enumerate(episode.arms):
         position = episode.tools[:, index, :3]
@@ -160,7 +160,7 @@ def _draw_speed(axes: Axes, judged: Judged) -> None:
         axes.axvspan(t[begin], t[min(stop, len(t) - 1)], label=None if number else "no arm engaged", **_SHADE)
     for number, fault in enumerate(judged.figures.faults):
         axes.axvline(fault.t, label=None if number else "fault", **_FAULT)
-    axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))  # of arms at rest not the rounding
+    axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))  # Arms at rest show no rounding errors.
 
 
 def _draw_errors(axes: Axes, judged: Judged) -> None:
@@ -172,7 +172,7 @@ def _draw_errors(axes: Axes, judged: Judged) -> None:
 
 
 def _draw_hands(axes: Axes, judged: Judged) -> None:
-    """Each time between two poses at its end, so that a dropout is as high as it is long."""
+    """Draw each time between two poses, at the time of the second pose, so that a long dropout is a high peak."""
     for name, hand in judged.episode.hands.items():
         received = np.unique(hand.received[np.isfinite(hand.received)])
         if len(received) > 1:
@@ -193,7 +193,7 @@ def _draw_margin(axes: Axes, judged: Judged) -> None:
 
 
 def _draw_leash(axes: Axes, judged: Judged) -> None:
-    """The way that the leash dragged, and the ticks at which the controller did not do as it was asked."""
+    """Draw how far the leash dragged the target, and the ticks at which the controller did not follow the target."""
     ticks = judged.episode.ticks
     for index, arm in enumerate(judged.episode.arms):
         _draw(axes, arm, ticks.t, 1e3 * ticks.slip[:, index])
@@ -210,10 +210,10 @@ def _draw_leash(axes: Axes, judged: Judged) -> None:
 
 
 def _draw_timing(axes: Axes, judged: Judged) -> None:
-    """Time between ticks, and where some are not in the file a red ground."""
+    """Draw the time between ticks, and a red background where ticks are missing in the file."""
     ticks = judged.episode.ticks
     axes.plot(*thinned(ticks.t, 1e3 * ticks.dt, np.fmax), color="#555555", linewidth=1.0, label="between ticks")
-    if judged.episode.recording.about.realtime:  # in simulated time it is nobody's matter
+    if judged.episode.recording.about.realtime:  # In simulated time the computing time does not matter.
         compute = thinned(ticks.t, 1e3 * ticks.compute_time, np.fmax)
         axes.plot(*compute, color=_COLOURS["left"], linewidth=0.8, alpha=0.7, label="computing")
     for number, at in enumerate(np.flatnonzero(np.diff(ticks.number) > 1)[:_POINTS]):

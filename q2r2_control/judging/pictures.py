@@ -1,4 +1,4 @@
-"""Looks at the pictures of a recording's cameras, and keeps of each so little that a whole episode has room."""
+"""Reads the pictures of a recording's cameras, and keeps a small view of each, so that an episode fits into memory."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from q2r2_control.recording.messages import NANOSECONDS
 from q2r2_control.recording.reader import BROKEN, Picture, Recording
 from q2r2_control.types import Array, Flags
 
-VIEW = (24, 32)  # rows and columns of a picture as it is kept
-_SCAN, _END = b"\xff\xda", b"\xff\xd9"  # markers before and after the coded pixels of a JPEG
-# Within coded pixels a byte 0xFF is followed by 0, by a restart marker, by the end, or by more of the same (ITU T.81,
-# B.1.1.2 and F.1.2.3). A decoder goes on after any other, with pixels that the camera never saw.
+VIEW = (24, 32)  # The rows and columns of a view.
+_SCAN, _END = b"\xff\xda", b"\xff\xd9"  # The markers before and after the coded pixels of a JPEG.
+# Within coded pixels a byte 0xFF is followed by 0, by a restart marker, by the end marker, or by another 0xFF (ITU
+# T.81, B.1.1.2 and F.1.2.3). A decoder goes on after any other byte, with pixels that the camera never saw.
 _FOREIGN_MARKER = re.compile(rb"\xff[\x01-\xcf\xda-\xfe]")
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """k pictures of one camera, in the order of time."""
+    """The k pictures of one camera, in the order of time."""
 
-    t: Array  # (k,) of the tick that they show, since the recording began [s]
-    views: npt.NDArray[np.uint8]  # (k, *VIEW) brightness, averaged; zeros where it could not be decoded
-    repeated: Flags  # (k,) every pixel is as in the picture before
-    damaged: Flags  # (k,) it could not be decoded, or only in part
-    other_size: Flags  # (k,) its size is not that of the cell's camera
+    t: Array  # (k,) The time of the tick that a picture shows, since the recording began [s].
+    views: npt.NDArray[np.uint8]  # (k, *VIEW) The averaged brightness; zeros if a picture could not be decoded.
+    repeated: Flags  # (k,) Every pixel is the same as in the picture before.
+    damaged: Flags  # (k,) The picture could not be decoded, or only in part.
+    other_size: Flags  # (k,) The size of the picture is not that of the cell's camera.
 
     def between(self, start: float, end: float, origin: float) -> Pictures:
-        """Those from ``start`` to ``end`` [s], with times since ``origin`` [s]."""
+        """Return the pictures from ``start`` to ``end`` [s], with times since ``origin`` [s]."""
         inside = (start <= self.t) & (self.t <= end)
         cut = {name: values[inside] for name, values in vars(self).items()}
         return Pictures(**cut | {"t": cut["t"] - origin})
@@ -51,7 +51,7 @@ class _Look(NamedTuple):
 
 
 def read_pictures(recording: Recording, cameras: dict[str, CameraConfig]) -> dict[str, Pictures]:
-    """Look at all pictures of ``cameras``, by name. Raises :class:`RecordingError` for a damaged file."""
+    """Read all pictures of ``cameras``, by name. Raises :class:`RecordingError` for a damaged file."""
     looks: dict[str, list[_Look]] = {name: [] for name in cameras}
     last: defaultdict[str, bytes] = defaultdict(bytes)
     for name, picture in recording.pictures_of(cameras):
@@ -75,7 +75,7 @@ def _look_at(picture: Picture, t: float, camera: CameraConfig) -> _Look:
     try:
         image = Image.open(io.BytesIO(picture.jpeg))
         other_size = image.size != (camera.width, camera.height)
-        image.draft("L", (2 * VIEW[1], 2 * VIEW[0]))  # a decoder that has to make few pixels is several times as fast
+        image.draft("L", (2 * VIEW[1], 2 * VIEW[0]))  # The decoder is several times as fast with few pixels.
         view = image.convert("L").resize(VIEW[::-1], Image.Resampling.BOX)
     except (OSError, SyntaxError, Image.DecompressionBombError, *BROKEN):
         return _Look(t, np.zeros(VIEW, np.uint8), damaged=True)
@@ -83,8 +83,8 @@ def _look_at(picture: Picture, t: float, camera: CameraConfig) -> _Look:
 
 
 def _has_foreign_marker(jpeg: bytes) -> bool:
-    """True if the coded pixels of a JPEG were overwritten: they contain a marker that has no place in them."""
-    scan = jpeg.rfind(_SCAN)  # the last one: a smaller picture, with a scan of its own, may stand before
+    """Return whether the coded pixels of a JPEG were overwritten: they contain a marker that is not allowed there."""
+    scan = jpeg.rfind(_SCAN)  # The last one, since a preview picture with its own scan may stand before it.
     if scan < 0:
         return False
     begin = scan + len(_SCAN) + int.from_bytes(jpeg[scan + 2 : scan + 4], "big")

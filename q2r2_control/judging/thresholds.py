@@ -1,4 +1,4 @@
-"""Limits of the numbers of an episode, and what is said of a number that is beyond its own."""
+"""The limits of the numbers of an episode, and the texts about numbers that are beyond them."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from typing import Literal, NamedTuple
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """Why an episode is discarded."""
+    """A reason why an episode is discarded."""
 
-    name: str  # of the threshold, or of what no threshold says: never_engaged, no_ticks, damaged ...
+    name: str  # The name of the threshold, or of a reason without one: never_engaged, no_ticks, damaged ...
     text: str
 
 
 class _Unit(NamedTuple):
     name: str = ""
-    scale: float = 1.0  # from the threshold's own unit, of the SI
+    scale: float = 1.0  # The factor from the SI unit of the threshold to this unit.
 
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
     """A limit of a number of an episode, or of each of its hands, arms or cameras."""
 
-    name: str  # min_...: at least; max_...: at most
+    name: str  # min_... is a lower limit, and max_... is an upper limit.
     of: Literal["episode", "hand", "arm", "measured", "camera", "timing"]
     figure: str
     words: str
     unit: _Unit
-    figure_in_unit: bool = False  # and not in the threshold's
-    size_only: bool = False  # whatever the number's sign
+    figure_in_unit: bool = False  # The number is in ``unit`` and not in the SI unit of the threshold.
+    size_only: bool = False  # The sign of the number does not matter.
 
     def reason(self, value: float | None, limit: float | None, whose: str) -> Rejection | None:
-        """Why a value is beyond the limit; what is None is not judged."""
+        """Return why a value is beyond the limit, or None if it is not. A value or limit of None is not judged."""
         if value is None or limit is None:
             return None
         scale, at_least = self.unit.scale, self.name.startswith("min_")

@@ -1,1 +1,1 @@
-"""Runs, or what ROS nodes publish, as MCAP files: a writer in a process of its own, readers, and replay."""
+"""Recordings of runs, or of messages of ROS nodes, as MCAP files: a writer in its own process, readers, and replay."""

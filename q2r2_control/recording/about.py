@@ -1,4 +1,4 @@
-"""Facts that a recording states once: cell, robot, program, machine, and how the run was asked for."""
+"""Facts that a recording states once: the cell, the robot, the program, the machine, and the settings of the run."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ import yaml
 
 from q2r2_control.recording.messages import Topic, run_topics
 
-if TYPE_CHECKING:  # the writer's process does without them
+if TYPE_CHECKING:  # The process of the writer does not import these modules.
     from q2r2_control.config.cell import Config
     from q2r2_control.pipeline.pipeline import Pipeline
     from q2r2_control.robot.robot import Robot
 
-FORMAT = "4"  # of topics and fields; another one cannot be replayed
-LOOP, ROS = "loop", "ros"  # sources: one loop's ticks, or what nodes published
-ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # metadata records
+FORMAT = "4"  # The version of topics and fields. A recording of another version cannot be read.
+LOOP, ROS = "loop", "ros"  # The sources of a recording: the ticks of one loop, or the messages of ROS nodes.
+ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # Names of metadata records.
 CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"
-_PERSONAL = ("operator", "host", "certificate")  # notes; of the last one, the path
-_GIT_TIME = 2.0  # [s]
+_PERSONAL = ("operator", "host", "certificate")  # Names of notes. The certificate is a path.
+_GIT_TIME = 2.0  # The longest time that git may take [s].
 
 
 @dataclass(frozen=True)
 class About:
-    """Facts that a run states at its beginning, in a metadata record of texts."""
+    """Facts that a run states at its beginning, stored as texts in a metadata record."""
 
     arms: tuple[str, ...]
     joints: tuple[str, ...]
-    mode: str  # of driving
-    plant_modes: tuple[str, ...]  # that the plant follows
-    epoch: int  # time of day at which the run began [ns]
+    mode: str  # The mode in which the pipeline drives the plant.
+    plant_modes: tuple[str, ...]  # The command modes that the plant follows.
+    epoch: int  # The time of day at which the run began [ns].
     realtime: bool
-    cell: str  # the YAML of the cell with all its defaults
-    robot: str  # URDF
-    cameras: tuple[str, ...] = ()  # of which there are pictures
-    notes: dict[str, str] = field(default_factory=dict)  # program, machine, task and the like, for people
+    cell: str  # The YAML of the cell with all its defaults.
+    robot: str  # The URDF of the robot.
+    cameras: tuple[str, ...] = ()  # The cameras whose pictures are recorded.
+    notes: dict[str, str] = field(default_factory=dict)  # Texts for people, such as program, machine and task.
     source: str = LOOP
 
     @classmethod
     def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str], cameras: Sequence[str] = ()) -> About:
-        """Describe a run that is about to begin; ``notes`` are added to those on program and machine.
+        """Describe a run that is about to begin; ``notes`` are added to the notes on program and machine.
 
-        In real time the pipeline chooses its rate now, since the recorded cell has to name it for a replay.
+        In real time the pipeline chooses its rate here, because a replay reads the rate from the recorded cell.
         """
         if realtime:
             pipeline.fit_rate()
@@ -73,7 +73,10 @@ class About:
 
     @classmethod
     def from_texts(cls, texts: Mapping[str, str], cell: str, robot: str) -> About:
-        """Raises :class:`KeyError`, :class:`ValueError` and :class:`TypeError` for what is not one."""
+        """Read the result of :meth:`texts`.
+
+        Raises :class:`KeyError`, :class:`ValueError` and :class:`TypeError` for other texts.
+        """
         notes = dict(texts)
         if notes.pop("format") != FORMAT:
             raise ValueError(f"its format is {texts['format']}, this version reads {FORMAT}")
@@ -88,10 +91,10 @@ class About:
 
 @dataclass(frozen=True)
 class Conclusion:
-    """Facts that a run states at its end; none of one that was killed."""
+    """Facts that a run states at its end. A run that was killed states none."""
 
-    success: bool | None = None  # by the task's own check; None: there was none
-    ended_by: str | None = None  # the fault that ended it
+    success: bool | None = None  # The result of the task's own check; None if there was no check.
+    ended_by: str | None = None  # The fault that ended the run.
 
     def texts(self) -> dict[str, str]:
         success = {} if self.success is None else {"success": json.dumps(self.success)}
@@ -99,18 +102,18 @@ class Conclusion:
 
     @classmethod
     def from_texts(cls, texts: Mapping[str, str]) -> Conclusion:
-        """Raises :class:`ValueError` for what is not one."""
+        """Read the result of :meth:`texts`. Raises :class:`ValueError` for other texts."""
         success = texts.get("success")
         return cls(None if success is None else bool(json.loads(success)), texts.get("ended_by"))
 
 
 def as_yaml(config: Config) -> str:
-    """The cell with all its defaults, so that a later version's defaults change nothing."""
+    """Return the cell with all its defaults, so that other defaults of a later version change nothing."""
     return str(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
 
 
 def program() -> dict[str, str]:
-    """Version, machine, and of a checkout the git revision, with a mark where it was changed."""
+    """Return notes on version, machine and libraries, and for a checkout its git revision, marked if it was changed."""
     notes = {"version": _version("q2r2_control"), "machine": f"{platform.node()}, {platform.platform()}"}
     notes["libraries"] = ", ".join(f"{name} {_version(name)}" for name in ("numpy", "pin", "numba", "daqp", "mujoco"))
     checkout = Path(__file__).resolve().parents[2]
@@ -123,15 +126,15 @@ def program() -> dict[str, str]:
 
 
 def anonymous(notes: Mapping[str, str]) -> dict[str, str]:
-    """The notes without those that tell of a person or of a computer's name and address."""
+    """Return the notes without those that identify a person or contain the name or address of a computer."""
     kept = {name: text for name, text in notes.items() if name not in _PERSONAL}
     if "machine" in kept:
-        kept["machine"] = kept["machine"].partition(", ")[2]  # only the operating system
+        kept["machine"] = kept["machine"].partition(", ")[2]  # Only the operating system is kept.
     return kept
 
 
 def changes(about: About, config: Config, robot: Robot) -> list[str]:
-    """The changes since a run was recorded: program, libraries, cell, robot; a line each."""
+    """Return the changes of program, libraries, cell and robot since a run was recorded, one line for each."""
     now = program()
     found = [
         f"{name}: {about.notes[name]} when recorded, now {now.get(name, 'unknown')}"

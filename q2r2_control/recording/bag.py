@@ -1,7 +1,8 @@
-"""A bag of rosbag2: an MCAP file, written by the package ``mcap``, and the ``metadata.yaml`` beside it, version 9.
+"""Write a bag of rosbag2: an MCAP file, by the package ``mcap``, and the ``metadata.yaml`` beside it, version 9.
 
-ROS is not needed; the rules are those of metadata_io.cpp in https://github.com/ros2/rosbag2. Types are from rosbags.
-Its own writer (0.11) has no numbers of messages and no attachments, and ends a chunk in the middle of a tick.
+ROS is not needed. The rules are those of metadata_io.cpp in https://github.com/ros2/rosbag2. Message types are from
+rosbags. The writer of rosbags (0.11) is not used: it writes no numbers of messages and no attachments, and may end a
+chunk in the middle of a tick.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, FIELDS, ROBOT,
 from q2r2_control.recording.messages import STORE, Message, Topic
 
 METADATA_FILE = "metadata.yaml"
-_LARGEST_CHUNK = 4 << 20  # [bytes]
+_LARGEST_CHUNK = 4 << 20  # A chunk is written when its messages are larger than this [bytes].
 _VERSION = 9
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 _QOS = {
@@ -41,22 +42,23 @@ _QOS = {
 
 
 class BagWriter(AbstractContextManager["BagWriter"]):
-    """Writes a bag, as a context that :meth:`close` makes whole.
+    """Writes a bag, as a context. :meth:`close` completes the file.
 
-    Without that it has all that was flushed, and no index; after a kill it just ends, which ``mcap recover`` mends.
-    An error, of a full disk say, leaves the end of a file: rosbags then reads all 2,000 of 2,000 messages, else none.
-    A file in which no message was written by then is removed.
+    Without :meth:`close` the file has all that was flushed, and no index. A file of a killed process stops without an
+    end record, which ``mcap recover`` repairs. After an error, for example of a full disk, the end record is written
+    without an index: rosbags then reads all 2,000 of 2,000 messages, and would read none without the record. The file
+    is removed if no message was written before the error.
     """
 
     def __init__(self, path: Path, topics: Iterable[Topic], about: About) -> None:
         """Create the file ``path``. Raises :class:`OSError`, as all methods do."""
         self._path, self._topics, self._about = path, tuple(topics), about
-        self._counts: Counter[int] = Counter()  # messages of each channel
-        self._first = self._last = about.epoch  # times of messages [ns]
+        self._counts: Counter[int] = Counter()  # The number of messages of each channel.
+        self._first = self._last = about.epoch  # Times of the first and the last message [ns].
         self._stream = path.open("xb")
-        self._whole = 0  # bytes that were flushed
-        self._empty = True  # no message was flushed
-        # The writer would end a chunk between two messages of one tick, and a killed run would lose that tick.
+        self._whole = 0  # The number of bytes that were flushed.
+        self._empty = True  # No message was flushed.
+        # With a smaller limit the writer may end a chunk inside a tick, and a run that is killed would lose that tick.
         self._writer, self._unflushed = Writer(self._stream, chunk_size=sys.maxsize), 0
         try:
             self._channels = self._begin()
@@ -65,7 +67,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             raise
 
     def _begin(self) -> dict[int, int]:
-        """Write all that comes before the first message; returns the number of each topic's channel in the file."""
+        """Write all that comes before the first message; returns the id in the file of each topic's channel."""
         about = self._about
         self._writer.start("ros2", "q2r2_control")
         self._writer.add_metadata(ABOUT, about.texts())
@@ -81,14 +83,14 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         return channels
 
     def _remove(self) -> None:
-        with suppress(OSError):  # the same again
+        with suppress(OSError):  # The disk may fail again.
             self._stream.close()
         with suppress(OSError):
             self._path.unlink()
-            self._path.parent.rmdir()  # which was made for it
+            self._path.parent.rmdir()  # The folder was made for this file.
 
     def write(self, messages: Iterable[Message]) -> None:
-        """Write messages of whole ticks, in the order of time; the file has them after :meth:`flush`."""
+        """Write messages of whole ticks, in the order of time; :meth:`flush` writes them to the file."""
         for channel, number, time, sent, payload in messages:
             self._writer.add_message(self._channels[channel], time, payload, sent, number)
             self._first = min(self._first, time) if self._counts else time
@@ -99,14 +101,14 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             self.flush()
 
     def flush(self) -> None:
-        """Write what was added, as one chunk."""
+        """Write the messages that were added to the file, as one chunk."""
         self._writer.flush()
         self._stream.flush()
         self._unflushed = 0
         self._whole, self._empty = self._stream.tell(), not self._counts
 
     def close(self, conclusion: Conclusion) -> None:
-        """Write what is left, the ``conclusion``, the index and ``metadata.yaml``."""
+        """Write the remaining messages, the ``conclusion``, the index and ``metadata.yaml``."""
         self.flush()
         texts = conclusion.texts()
         if texts:
@@ -116,7 +118,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._write_metadata({**self._about.notes, **texts})
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        with suppress(OSError):  # the same again
+        with suppress(OSError):  # The disk may fail again.
             self._stream.close()
         if error is None:
             return
@@ -127,12 +129,12 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         DataEnd(0).write(end)
         Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(end)
         with suppress(OSError):
-            os.truncate(self._path, self._whole)  # without what was written in part
+            os.truncate(self._path, self._whole)  # A chunk that was written in part is removed.
             with self._path.open("ab") as stream:
                 stream.write(end.end() + MCAP0_MAGIC)
 
     def _register(self) -> dict[int, int]:
-        """Declare the topics; returns the number of each one's channel in the file."""
+        """Declare the topics; returns the id in the file of each topic's channel."""
         qos = {"offered_qos_profiles": str(yaml.safe_dump([_QOS], sort_keys=False)).strip()}
         schemas: dict[str, int] = {}
         for kind in dict.fromkeys(topic.type for topic in self._topics):
@@ -175,6 +177,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         }
         target = self._path.with_name(METADATA_FILE)
         part = target.with_suffix(".part")
-        plain = json.loads(json.dumps({"rosbag2_bagfile_information": information}))  # nothing twice, so no references
+        # A copy by JSON shares no objects, so the YAML has no references.
+        plain = json.loads(json.dumps({"rosbag2_bagfile_information": information}))
         part.write_text(yaml.safe_dump(plain, sort_keys=False), encoding="utf-8")
         os.replace(part, target)

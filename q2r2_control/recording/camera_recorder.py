@@ -1,4 +1,4 @@
-"""Takes the pictures of a recording in a process of its own; the loop only copies where everything is."""
+"""Takes the pictures of a recording in a process of its own; the loop only copies the positions of all bodies."""
 
 from __future__ import annotations
 
@@ -22,32 +22,33 @@ from q2r2_control.summary.tick import Tick
 if TYPE_CHECKING:
     from q2r2_control.plants.mujoco import MujocoPlant
 
-ROOM = 128 << 10  # for copies that wait [bytes]; of the shipped cell, some seconds of a camera at 30 Hz
-_NICENESS = 19  # loop and writer go first
-_QUALITY = 90  # of JPEG
-_ROUNDING = 1e-6  # of a period: a picture that is due but for the rounding of times is due
-_READY = 10.0  # for the process to be ready, before the run [s]
+# Size of the copies that may wait [bytes]: for the shipped cell, some seconds of a camera at 30 Hz.
+ROOM = 128 << 10
+_NICENESS = 19  # The loop and the writer have a higher priority.
+_QUALITY = 90  # The quality of JPEG.
+_ROUNDING = 1e-6  # Share of a period by which the rounding of times may make a picture seem to be not yet due.
+_READY = 10.0  # Longest time to wait before the run until the process is ready [s].
 
 
 @dataclass(frozen=True)
 class CameraSetup:
-    """The first request: what pictures are taken of and where they go."""
+    """The first request: the model to take pictures of, the cameras, and the channels of their messages."""
 
-    model: bytes  # an mujoco.MjModel, pickled
+    model: bytes  # A pickled mujoco.MjModel.
     cameras: dict[str, CameraConfig]
-    channels: dict[str, int]  # of the recording's file
-    waited_for: bool  # by the loop, in simulated time
+    channels: dict[str, int]  # By camera, the channel in the file of the recording.
+    waited_for: bool  # The loop waits for the pictures, in simulated time.
 
 
 class PictureRequest(NamedTuple):
-    number: int  # of the tick
-    time: int  # of day [ns]
+    number: int  # The number of the tick.
+    time: int  # The time of day [ns].
     cameras: list[str]
-    qpos: bytes  # float64, where everything is
+    qpos: bytes  # The model's qpos as float64: the positions of all joints and loose bodies.
 
 
 def main(requests: Iterator[Any], answer: Callable[[Message | None], None]) -> None:
-    """Answer None when ready, then each picture's message. Raises :class:`PlantError` where OpenGL is missing."""
+    """Answer None when ready, then the message of each picture. Raises :class:`PlantError` if OpenGL is missing."""
     setup = next(requests, None)
     if setup is None:
         return
@@ -64,12 +65,12 @@ def main(requests: Iterator[Any], answer: Callable[[Message | None], None]) -> N
 
 
 class CameraRecorder:
-    """Its process starts at once. To be ended by :meth:`finish`."""
+    """Starts the process that takes pictures, which :meth:`finish` ends."""
 
     def __init__(self, write: Callable[[Message], None], room: int = ROOM) -> None:
-        """``write`` gets the message of each picture, in another thread; ``room`` [bytes] is for copies that wait.
+        """Start the process. ``write`` gets the message of each picture, in another thread.
 
-        Raises :class:`OSError`.
+        ``room`` [bytes] is the size of the copies that may wait. Raises :class:`OSError`.
         """
         self._write, self._ready = write, Event()
         self.process = HelperProcess(
@@ -80,11 +81,11 @@ class CameraRecorder:
             idle=None,
             **ENVIRONMENT,
         )
-        self.due = 0  # pictures that should be there by now
-        self._plant: MujocoPlant | None = None  # None: not begun
-        self._rates: dict[str, float] = {}  # of the cameras [Hz]
-        self._last: dict[str, int] = {}  # number of each one's last picture
-        self._next = -math.inf  # when a picture is due, since the start of the run [s]
+        self.due = 0  # The number of pictures that were due up to now.
+        self._plant: MujocoPlant | None = None  # None before :meth:`prepare`.
+        self._rates: dict[str, float] = {}  # The rates of the cameras [Hz].
+        self._last: dict[str, int] = {}  # By camera, the number of its last picture.
+        self._next = -math.inf  # The time since the start of the run at which the next picture is due [s].
 
     def _on_answer(self, picture: Message | None) -> None:
         if picture is not None:
@@ -95,9 +96,9 @@ class CameraRecorder:
     def prepare(
         self, plant: MujocoPlant, cameras: Mapping[str, CameraConfig], topics: Mapping[str, Topic], *, waits: bool
     ) -> None:
-        """Make ready for pictures of ``plant``, for messages of ``topics``; waits for that, some seconds at most.
+        """Prepare pictures of ``plant`` for messages of ``topics``; waits until the process is ready, at most 10 s.
 
-        ``waits``: the loop will wait for pictures, so they are as urgent as the loop.
+        If ``waits`` is True, the loop will wait for pictures, so their process has the same priority as the loop.
         """
         channels = {name: topics[picture_topic(name)].channel for name in cameras}
         self.process.send(CameraSetup(pickle.dumps(plant.model), dict(cameras), channels, waits))
@@ -108,7 +109,7 @@ class CameraRecorder:
         self._rates = {name: camera.rate for name, camera in cameras.items()}
 
     def take_pictures(self, number: int, tick: Tick, epoch: int, *, wait: bool) -> None:
-        """Have pictures taken that are due at the ``number``-th tick of a run from ``epoch`` [ns] on."""
+        """Request the pictures that are due at tick ``number`` of a run that began at ``epoch`` [ns]."""
         since = tick.now - tick.start.now
         if self._plant is None or since < self._next:
             return
@@ -122,7 +123,7 @@ class CameraRecorder:
         self._next = min((last + 1 - _ROUNDING) / self._rates[name] for name, last in newest.items())
 
     def finish(self, patience: float) -> None:
-        """Let it take the pictures that wait; one that does nothing for ``patience`` [s] is killed."""
+        """Let the process take the pictures that wait. It is killed if it does nothing for ``patience`` [s]."""
         if self._plant is not None and patience > 0.0:
             self.process.finish(patience)
         else:

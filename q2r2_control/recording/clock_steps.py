@@ -1,7 +1,7 @@
-"""Where the times of a recording's ticks do not go on as its loop did: one rule, for the judge and the export.
+"""Finds ticks of a recording between which a clock was set: one rule, for the judge and the export.
 
-ROS time is the computer's clock, or a simulation's. Somebody or a time server may set it forward or back while arms
-move. A recording then has seconds twice, or seconds of which there is nothing.
+ROS time is the clock of the computer or of a simulation. A person or a time server may set it forward or back while
+arms move. A recording then has some seconds twice, or a gap of some seconds.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ import numpy.typing as npt
 
 from q2r2_control.types import Array
 
-_NOTED = 0.1  # by which time goes on farther than the loop, before it says anything [s]: receipts come unevenly
-_SHARE = 0.5  # of the time of ticks that were lost, whose own dt nobody knows
+_NOTED = 0.1  # A smaller difference between the clock and the loop is no step, since receipts are uneven [s].
+_SHARE = 0.5  # For lost ticks, whose own dt is not known, this share of their time is added to that tolerance.
 
 
 def clock_steps(numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> Array:
-    """By how much the clock was set before each of n ticks (n,) [s]: forward, or back where negative; 0 as a rule.
+    """Return the time by which the clock was set before each of n ticks (n,) [s]: negative if back, 0 if not set.
 
     A controller that stood still, and counts less time than passed, looks the same as a clock that was set forward.
 
     Args:
-        numbers: Of the ticks (n,).
+        numbers: Numbers of the ticks (n,).
         t: Times of the ticks (n,) [s].
-        dt: Time since the tick before, as its loop counted (n,) [s].
+        dt: Time since the tick before, as the loop counted it (n,) [s].
     """
     passed, ticks = np.diff(t, prepend=t[:1]), np.diff(numbers, prepend=numbers[:1])
     steps = passed - ticks * dt
@@ -32,7 +32,7 @@ def clock_steps(numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> Array:
 
 
 def clock_step_text(step: float) -> str:
-    """Words on a ``step`` [s] of :func:`clock_steps`."""
+    """Return words that describe a ``step`` [s] of :func:`clock_steps`."""
     if step < 0.0:
         return f"a clock was set back by {-step:.3f} s"
     return f"a clock was set forward, or the controller stood still, by {step:.3f} s"

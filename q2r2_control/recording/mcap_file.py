@@ -1,7 +1,7 @@
-"""Reads MCAP files of any writer: wherever its chunks end, whatever stands between them, and wherever the file is cut.
+"""Reads MCAP files of any writer, also files that were cut off at any place.
 
-The package ``mcap`` reads records. It reads no file whose end is missing, so a walk over the records finds them here.
-Its rules are in https://mcap.dev/spec.
+The package ``mcap`` decodes the records. It cannot find them in a file whose end is missing, so this module walks over
+the file from record to record. The rules of the format are in https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from mcap.writer import MCAP0_MAGIC
 
 from q2r2_control.recording.messages import Message, Topic
 
-_LARGEST = 1 << 30  # of a record [bytes]
-_BATCH = 1000  # number of messages that are read together from a file without chunks
-_HEADER = struct.Struct("<BQ")  # kind and length of a record, before its content
-_CHUNK_TIMES = struct.Struct("<QQ")  # of a chunk's first and last message [ns], where its content begins
+_LARGEST = 1 << 30  # The largest size of a record [bytes].
+_BATCH = 1000  # The number of messages that are read together from a file without chunks.
+_HEADER = struct.Struct("<BQ")  # The kind and the length of a record, before its content.
+_CHUNK_TIMES = struct.Struct("<QQ")  # Times of a chunk's first and last message [ns], at the start of its content.
 
 
 class _Place(NamedTuple):
-    """Where a record is in the file, and the beginning of its content."""
+    """The place of a record in the file, and the beginning of its content."""
 
     kind: int
-    begin: int  # [bytes]
+    begin: int  # The position of the record in the file [bytes].
     head: bytes
 
     @property
@@ -44,16 +44,16 @@ class _Place(NamedTuple):
 
 
 class McapFile:
-    """One file, which another process may be writing: what is written while it is read is left out."""
+    """One file. Another process may be writing to it; records that are added while it is read are left out."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._types: dict[int, str] = {}  # by schema
-        self._topics: dict[int, Topic] = {}  # by channel
-        self._skipped: list[_Place] = []  # chunks that may declare channels
+        self._types: dict[int, str] = {}  # By schema.
+        self._topics: dict[int, Topic] = {}  # By channel.
+        self._skipped: list[_Place] = []  # Chunks that were not read and may declare channels.
 
     def topics(self) -> dict[int, Topic]:
-        """All topics that the file declares anywhere, by channel."""
+        """Return all topics that the file declares anywhere, by channel."""
         with self._path.open("rb") as stream:
             for place in _places(stream):
                 if place.kind in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK):
@@ -61,11 +61,11 @@ class McapFile:
         return dict(self._topics)
 
     def topic(self, channel: int) -> str:
-        """The topic of a message that was read."""
+        """Return the topic of a message that was read, by the message's channel."""
         return self._topics[channel].name
 
     def extras(self) -> Iterator[Metadata | Attachment]:
-        """All metadata and attachments, in the order of the file."""
+        """Yield all metadata and attachments, in the order of the file."""
         with self._path.open("rb") as stream:
             for place in _places(stream):
                 if place.kind in (Opcode.METADATA, Opcode.ATTACHMENT):
@@ -74,7 +74,7 @@ class McapFile:
                     yield record
 
     def summary(self) -> Summary | None:
-        """The index, which is written last; None where there is none or it is damaged. Raises :class:`OSError`."""
+        """Return the index, which is written last; None if it is missing or damaged. Raises :class:`OSError`."""
         with self._path.open("rb") as stream:
             try:
                 return SeekingReader(stream, record_size_limit=_LARGEST).get_summary()
@@ -82,16 +82,16 @@ class McapFile:
                 return None
 
     def messages(self, topics: Collection[str] | None = None, since: int = 0) -> Iterator[list[Message]]:
-        """All messages, or those of some ``topics``, a chunk or some hundred at once.
+        """Yield all messages, or those of some ``topics``, as lists of a chunk or of some hundred messages.
 
-        They come in the order of the file, which ``mcap sort`` makes that of time. Chunks that end before ``since``
-        [ns] are left out. Raises what the package ``mcap`` raises of a damaged file.
+        They come in the order of the file. ``mcap sort`` changes that order to the order of time. Chunks that end
+        before ``since`` [ns] are left out. Raises the errors of the package ``mcap`` for a damaged file.
         """
         with self._path.open("rb") as stream:
             yield from self._in_file_order(stream, topics, since)
 
     def _in_file_order(self, stream: BinaryIO, topics: Collection[str] | None, since: int) -> Iterator[list[Message]]:
-        loose: list[Message] = []  # those that no chunk has
+        loose: list[Message] = []  # Messages that are in no chunk.
         for place in _places(stream):
             if place.kind == Opcode.CHUNK and place.times[1] < since:
                 self._skipped.append(place)
@@ -110,8 +110,8 @@ class McapFile:
             yield loose
 
     def _wanted(self, stream: BinaryIO, records: list[McapRecord], topics: Collection[str] | None) -> Iterator[Message]:
-        """The messages of ``topics`` among some records, whose channels become known."""
-        channels: dict[int, bool] = {}  # True for those of the topics
+        """Yield the messages of ``topics`` among some records, and learn the channels that these records declare."""
+        channels: dict[int, bool] = {}  # By channel, True if it belongs to the topics.
         for one in records:
             if isinstance(one, McapMessage):
                 channel = one.channel_id
@@ -137,10 +137,10 @@ class McapFile:
 
 
 def _places(stream: BinaryIO) -> Iterator[_Place]:
-    """Where each record is, up to the end of the data, or of the last whole record of a file that nobody ended.
+    """Yield the place of each record up to the end of the data, or up to the last whole record of an unfinished file.
 
-    Raises :class:`InvalidMagic` for another program's file, and :class:`EndOfFile` for a record that is longer than a
-    file that was ended.
+    Raises :class:`InvalidMagic` for a file that is not MCAP, and :class:`EndOfFile` if a finished file ends inside a
+    record.
     """
     file, size = stream.fileno(), os.fstat(stream.fileno()).st_size
     magic = os.pread(file, len(MCAP0_MAGIC), 0)

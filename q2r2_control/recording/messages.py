@@ -1,7 +1,8 @@
-"""Topics of recordings, of one loop's run and of the ROS nodes, and their messages: ROS 2 messages in CDR by rosbags.
+"""Topics of recordings and their messages: ROS 2 messages in CDR, made by rosbags.
 
-Replay, judge and export read ``tick``, ``hand_samples``, ``state`` and the pictures of a loop's run. The other topics
-are the same as standard messages, for tools that plot and show them.
+A recording is of the run of one loop or of the ROS nodes. Replay, judge and export read ``tick``, ``hand_samples``,
+``state`` and the pictures of a loop's run. Its other topics repeat this data as standard messages, for tools that plot
+and show them.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ ARRAY, TEXT, PICTURE = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/String", 
 POSE, JOINTS = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState"
 TRAJECTORY, HAND_INPUTS = "trajectory_msgs/msg/JointTrajectory", "quest2ros/msg/OVR2ROSInputs"
 NANOSECONDS = 1_000_000_000
-_ENCAPSULATION = 4  # bytes before the message
-WORLD = "world"  # frame of targets
+_ENCAPSULATION = 4  # The number of bytes before the message.
+WORLD = "world"  # The frame of targets.
 TICK, SAMPLES, STATE = "/q2r2/tick", "/q2r2/hand_samples", "/q2r2/state"
 JOINT_STATES, EXTERNAL_TORQUE = "/joint_states", "/q2r2/external_torque"
 JOINT_COMMANDS, REFERENCE, DESCRIPTION = "/joint_commands", "/q2r2/reference", "/robot_description"
@@ -32,12 +33,13 @@ RECORDER = "/recorder"
 RECORDER_EVENTS = f"{RECORDER}/events"
 _NODES = ("mujoco_robot", "cartesian_controller", "tcp_endpoint", "simulation_input", "hand_input", "recorder")
 
-# `index` counts the ticks that moved the reference, `dt` is since the last of them; `rejected` is of each arm.
+# `index` counts the ticks that moved the reference, and `dt` is the time since the last of them. Each arm has its own
+# `rejected`.
 TICK_FIELDS = (
     *("index", "now", "dt", "step", "compute_time", "solve_time", "status", "certified", "fallback"),
     *("closest_distance", "margin", "slack"),
 )
-ARM_FIELDS = ("engaged", "slip", "slip_angle", "wanted", "measured")  # the last two are openings, 0 closed .. 1 open
+ARM_FIELDS = ("engaged", "slip", "slip_angle", "wanted", "measured")  # The last two are openings, 0 closed .. 1 open.
 
 _BOOL, _TWIST, _IMAGE = "std_msgs/msg/Bool", "geometry_msgs/msg/Twist", "sensor_msgs/msg/Image"
 _TRANSFORMS, _DIAGNOSTICS = "tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray"
@@ -49,11 +51,11 @@ class Topic:
     channel: int
     name: str
     type: str
-    labels: tuple[str, ...] = ()  # of an array's numbers, in their order
+    labels: tuple[str, ...] = ()  # The names of an array's numbers, in their order.
 
 
 def run_topics(arms: Sequence[str], joints: Sequence[str], cameras: Sequence[str] = ()) -> dict[str, Topic]:
-    """Topics of a loop's run, by name."""
+    """Return the topics of a loop's run, by name."""
     types = {DESCRIPTION: TEXT, TICK: ARRAY, SAMPLES: ARRAY}
     for hand in SIDES:
         types |= {hand_pose(hand): POSE, hand_buttons(hand): HAND_INPUTS}
@@ -66,13 +68,13 @@ def run_topics(arms: Sequence[str], joints: Sequence[str], cameras: Sequence[str
 
 
 def loop_topics(arms: Sequence[str]) -> tuple[str, ...]:
-    """Topics on which every run has messages, whatever happens in it."""
+    """Return the topics on which every run has messages, whatever happens in it."""
     safe_targets = (safe_target(arm) for arm in arms)
     return (DESCRIPTION, TICK, JOINT_STATES, *safe_targets, REFERENCE, JOINT_COMMANDS, STATE)
 
 
 def ros_topics(arms: Sequence[str], cameras: Mapping[str, str]) -> tuple[Topic, ...]:
-    """Topics of a recording of the nodes; ``cameras``: name -> topic of its pictures."""
+    """Return the topics of a recording of the nodes; ``cameras`` has the topic of the pictures of each camera."""
     types: dict[str, str] = {DESCRIPTION: TEXT, JOINT_STATES: JOINTS, "/mujoco_robot/external_torque": JOINTS}
     types |= {"/tf": _TRANSFORMS, "/tf_static": _TRANSFORMS, "/diagnostics": _DIAGNOSTICS}
     for hand in SIDES:
@@ -108,32 +110,35 @@ def hand_buttons(hand: str) -> str:
 
 
 def filtered_hand(arm: str) -> str:
-    """Poses of the hand that an arm follows."""
+    """Return the topic of the filtered poses of the hand that an arm follows."""
     return f"/q2r2/{arm}/filtered_hand_pose"
 
 
 def target(arm: str) -> str:
-    """The target that the operator asks of an arm."""
+    """Return the topic of the targets that the operator gives to an arm."""
     return f"/q2r2/{arm}/target_frame"
 
 
 def asked_target(arm: str) -> str:
-    """Targets once more, for the recorder, which would count as the arm's controller on :func:`target`."""
+    """Return the topic that repeats an arm's targets for the recorder.
+
+    If the recorder subscribed to :func:`target`, it would count as the controller of the arm.
+    """
     return f"/q2r2/{arm}/asked_target"
 
 
 def safe_target(arm: str) -> str:
-    """An arm's tool at the controller's reference."""
+    """Return the topic of the pose that an arm's tool has at the controller's reference."""
     return f"/cartesian_controller/safe_target/{arm}"
 
 
 def arm_flags(arm: str) -> str:
-    """:data:`ARM_FIELDS` of each tick of an arm's teleoperation."""
+    """Return the topic with the :data:`ARM_FIELDS` of each tick of an arm's teleoperation."""
     return f"/q2r2/{arm}/flags"
 
 
 def arm_events(arm: str) -> str:
-    """An arm's events, as JSON."""
+    """Return the topic of an arm's events, as JSON."""
     return f"/q2r2/{arm}/events"
 
 
@@ -142,32 +147,32 @@ def picture_topic(camera: str) -> str:
 
 
 def heard_on(topic: str) -> str:
-    """The topic that the recorder listens to for a recorded one."""
+    """Return the topic that the recorder subscribes to for a recorded topic."""
     arm = topic.removeprefix("/q2r2/").split("/")[0]
     return asked_target(arm) if topic == target(arm) else topic
 
 
 def is_compressed(topic: str) -> bool:
-    """Whether a camera's topic carries CompressedImage, as image_transport names those."""
+    """Return whether a camera's topic has messages CompressedImage, by the naming of image_transport."""
     return topic.endswith("/compressed")
 
 
 def is_latched(topic: str) -> bool:
-    """Whether its last message is for those that subscribe later too."""
+    """Return whether later subscribers get the last message of a topic too."""
     return topic in (DESCRIPTION, "/tf_static") or topic.startswith("/cartesian_controller/following/")
 
 
 def is_reliable(topic: Topic) -> bool:
-    """Whether all of its messages are to arrive, at no one's cost: none that commands, and none of a stream."""
+    """Return whether all messages of a topic shall arrive. Senders of commands and streams must not wait for that."""
     return topic.type in (ARRAY, TEXT) or topic.name == REFERENCE or heard_on(topic.name) != topic.name
 
 
 class Message(NamedTuple):
     channel: int
-    number: int  # of its tick, or at its sender
-    time: int  # of day [ns]
-    sent: int  # of day, by its sender's clock [ns]
-    payload: bytes  # CDR
+    number: int  # The number of its tick, or its number at the sender.
+    time: int  # The time of day [ns].
+    sent: int  # The time of day at which it was sent, by the sender's clock [ns].
+    payload: bytes  # The message in CDR.
 
     @property
     def size(self) -> int:
@@ -175,23 +180,23 @@ class Message(NamedTuple):
 
 
 class MessageTemplate:
-    """Makes many messages that differ in float64 numbers, and in the stamp of the header that they all have.
+    """Makes many messages that differ only in float64 numbers and in the stamp of the header.
 
-    Measured for the poses and joints of one tick of two arms: 3 us, and 110 us by rosbags, 11 % of a processor.
+    The messages of the poses and joints of one tick of two arms take 3 us. rosbags needs 110 us, 11 % of a processor.
     """
 
     def __init__(self, kind: str, example: Any, count: int) -> None:
-        """``example``: a message whose numbers are 1, 2, ... ``count`` in the order in which they will be given."""
+        """Find the numbers 1, 2, ... ``count`` in the message ``example``: :meth:`filled` takes them in this order."""
         payload = serialized(kind, example)
         self._size = len(payload)
         padding = bytes(-(len(payload) - _ENCAPSULATION) % 8)
         self._bytes = np.frombuffer(payload + padding, dtype=np.uint8)
-        # CDR aligns a float64 to its size, counted from behind the encapsulation.
+        # CDR aligns a float64 to its size, counted from the end of the encapsulation.
         floats = self._bytes[_ENCAPSULATION:].view("<f8")
         self._places = [int(np.flatnonzero(floats == number)[0]) for number in range(1, count + 1)]
 
     def filled(self, numbers: Array, stamps: npt.NDArray[np.int64]) -> list[bytes]:
-        """n messages with ``numbers`` (n, count) and ``stamps`` (n,) [ns]."""
+        """Return n messages with ``numbers`` (n, count) and ``stamps`` (n,) [ns]."""
         made = np.tile(self._bytes, (len(numbers), 1))
         made[:, _ENCAPSULATION:].view("<f8")[:, self._places] = numbers
         stamp = made[:, _ENCAPSULATION : _ENCAPSULATION + 8].view("<u4")
@@ -217,14 +222,14 @@ def float_array(numbers: Array) -> Any:
 
 
 def pose_stamped(pose: Array, frame: str = "", stamp: int = 0) -> Any:
-    """A geometry_msgs/PoseStamped of x y z qx qy qz qw."""
+    """Return a geometry_msgs/PoseStamped of a ``pose`` (7,) x y z [m] qx qy qz qw; ``stamp`` [ns]."""
     x, y, z, *quaternion = (float(number) for number in pose)
     point, rotation = make("geometry_msgs/msg/Point", x, y, z), make("geometry_msgs/msg/Quaternion", *quaternion)
     return make(POSE, header(frame, stamp), make("geometry_msgs/msg/Pose", point, rotation))
 
 
 def pose_of(message: Any) -> Array:
-    """(7,) x y z [m] qx qy qz qw of such a message."""
+    """Return the pose (7,) x y z [m] qx qy qz qw of a geometry_msgs/PoseStamped."""
     p, q = message.pose.position, message.pose.orientation
     return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
 
@@ -234,10 +239,10 @@ def joint_state(names: list[str], position: Array, velocity: Array, effort: Arra
 
 
 def measured(field: str, numbers: Array) -> Array:
-    """A JointState's ``numbers`` of its ``field``, with zeros where NaN means that they are not measured.
+    """Return the ``numbers`` of a ``field`` of a JointState, with zeros where NaN means that they are not measured.
 
-    ros2_control's broadcaster fills NaN in for what a robot's hardware does not tell. Of velocities, only those of all
-    joints may be missing: one of them is a fault.
+    The broadcaster of ros2_control writes NaN for numbers that the hardware of a robot does not provide. Velocities may
+    be missing for all joints together. A single missing velocity is a fault, and its NaN is kept.
     """
     missing = np.isnan(numbers)
     if field == "effort" or (field == "velocity" and missing.all()):
@@ -246,7 +251,7 @@ def measured(field: str, numbers: Array) -> Array:
 
 
 def joint_trajectory(names: list[str], q: Array, v: Array, a: Array, stamp: int = 0) -> Any:
-    """A trajectory_msgs/JointTrajectory of one point that is due at once."""
+    """Return a trajectory_msgs/JointTrajectory of one point that is due at once; ``stamp`` [ns]."""
     at_once = make("builtin_interfaces/msg/Duration", 0, 0)
     point = make("trajectory_msgs/msg/JointTrajectoryPoint", q, v, a, np.empty(0), at_once)
     return make(TRAJECTORY, header(stamp=stamp), names, [point])
@@ -261,17 +266,17 @@ def text(data: str) -> bytes:
 
 
 def picture(camera: str, stamp: int, jpeg: bytes) -> bytes:
-    """A sensor_msgs/CompressedImage of a camera, which is its frame too, as CDR; ``stamp`` [ns]."""
+    """Return a sensor_msgs/CompressedImage as CDR, whose frame is the name of the camera; ``stamp`` [ns]."""
     return serialized(PICTURE, make(PICTURE, header(camera, stamp), "jpeg", np.frombuffer(jpeg, dtype=np.uint8)))
 
 
 def data_of(payload: bytes, kind: str) -> Any:
-    """The field ``data`` of a message."""
+    """Return the field ``data`` of a message."""
     return STORE.deserialize_cdr(payload, kind).data  # type: ignore[attr-defined]
 
 
 def numbers_of(payloads: list[bytes], count: int) -> Array:
-    """(n, count) of n arrays. Raises :class:`ValueError` for arrays of another length."""
+    """Return the numbers (n, count) of n arrays. Raises :class:`ValueError` for arrays of another length."""
     arrays = [data_of(payload, ARRAY) for payload in payloads]
     if any(len(array) != count for array in arrays):
         raise ValueError(f"an array that has not {count} numbers")

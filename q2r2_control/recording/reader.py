@@ -1,4 +1,4 @@
-"""Reads recordings, also what a killed process left: chunk by chunk, and the episodes that an operator told in them."""
+"""Reads recordings chunk by chunk, also those of a killed process, and the episodes that an operator marked in them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from q2r2_control.recording.messages import PICTURE, Message, Topic, data_of, pi
 from q2r2_control.recording.tick_chunks import TickAssembly, TickChunk
 from q2r2_control.teleop.both_arms import EpisodeMarks
 
-# Errors that readers raise of a file that is damaged, or another program's.
+# Errors that readers raise for a file that is damaged or of another program.
 BROKEN = (
     *(McapError, ZstdError, SerdeError, ValueError, KeyError, IndexError),
     *(struct.error, TypeError, OverflowError, MemoryError, AssertionError),
@@ -34,26 +34,26 @@ BROKEN = (
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    time: int  # of day, that of the tick at which all was where it shows it [ns]
-    tick: int  # its number
+    time: int  # The time of day of the tick that the picture shows [ns].
+    tick: int  # The number of that tick.
     jpeg: bytes
 
 
 class Recording:
-    """A file that ``q2r2 run --record`` wrote. Raises :class:`RecordingError`, one line, for any other."""
+    """A file that ``q2r2 run --record`` wrote. Raises :class:`RecordingError`, of one line, for any other file."""
 
     def __init__(self, path: Path) -> None:
-        """``path``: the file, or the folder that it is alone in."""
+        """Open ``path``: the file, or a folder in which it is the only recording."""
         files = recordings_in([path])
         if len(files) != 1:
             raise RecordingError(f"{path}: has {len(files)} files .mcap; allowed: a folder with one, or a file")
         self.file = files[0]
         self._mcap = McapFile(self.file)
         self.about = self._read_about()
-        self.since = 0  # time of day [ns]; what is known to be before it is left out
+        self.since = 0  # The time of day before which chunks of the file are left out [ns].
 
     def chunks(self) -> Iterator[TickChunk]:
-        """All ticks, some at once; some may be missing in between, where they were lost."""
+        """Yield all ticks in chunks. Ticks that were lost are missing between them."""
         ticks = TickAssembly(len(self.about.arms), len(self.about.joints))
         try:
             for messages in self.messages(ticks.topics):
@@ -68,11 +68,11 @@ class Recording:
             yield from ticks.rest(self.closed)
 
     def pictures(self, camera: str) -> Iterator[Picture]:
-        """All pictures of a camera, in the order of time."""
+        """Return all pictures of a camera, in the order of time."""
         return (picture for _, picture in self.pictures_of((camera,)))
 
     def pictures_of(self, cameras: Iterable[str]) -> Iterator[tuple[str, Picture]]:
-        """All pictures of some cameras, with the camera, those of each in the order of time."""
+        """Yield all pictures of some cameras, with the name of the camera; those of each are in the order of time."""
         names = {self._topic_of(camera): camera for camera in cameras}
         for messages in self.messages(names):
             for message in messages:
@@ -85,17 +85,17 @@ class Recording:
 
     @cached_property
     def declared_topics(self) -> dict[int, Topic]:
-        """All topics that are in the file, by channel."""
+        """Return all topics that are in the file, by channel."""
         with self._faults():
             return self._mcap.topics()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[list[Message]]:
-        """All messages, or those of some ``topics``, some at once."""
+        """Yield all messages, or those of some ``topics``, as lists of several messages."""
         with self._faults():
             yield from self._mcap.messages(topics, self.since)
 
     def topic(self, message: Message) -> str:
-        """The topic of a message that was read."""
+        """Return the topic of a message that was read."""
         return self._mcap.topic(message.channel)
 
     @contextmanager
@@ -111,12 +111,12 @@ class Recording:
 
     @property
     def closed(self) -> bool:
-        """Whether the file has an index, which is written last: not where its process was killed or the disk full."""
+        """Return whether the file has an index, which is written last: not by a killed process or on a full disk."""
         return self._summary() is not None
 
     @property
     def counts(self) -> dict[str, int] | None:
-        """How many messages each topic has; None where the file has no index."""
+        """Return the number of messages of each topic; None if the file has no index."""
         summary = self._summary()
         if summary is None or summary.statistics is None:
             return None
@@ -125,7 +125,7 @@ class Recording:
 
     @property
     def conclusion(self) -> Conclusion:
-        """Facts of the end of the run; none where the file has no index."""
+        """Return the facts of the end of the run; they are empty if the file has no index."""
         if self.closed:
             with self._faults():
                 for record in self._mcap.extras():
@@ -166,7 +166,10 @@ class Recording:
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
-    """Files of recordings: those given, and all in folders, by name; each once. Raises :class:`RecordingError`."""
+    """Return files of recordings: those given, and all in given folders, by name, each once.
+
+    Raises :class:`RecordingError` for a path that does not exist and for a folder without a recording.
+    """
     files: dict[Path, Path] = {}
     for path in paths:
         if path.is_dir():
@@ -184,23 +187,23 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class EpisodeSpan:
-    """An episode within a run; times are since the run began [s]."""
+    """An episode within a run. Times are since the run began [s]."""
 
     start: float = -math.inf
-    end: float = math.inf  # inf: the run's
-    discarded: bool = False  # by its operator
-    success: bool | None = None  # None: nobody said
-    number: int = 0  # from 1 on; 0: the whole run
+    end: float = math.inf  # inf stands for the end of the run.
+    discarded: bool = False  # The operator discarded it.
+    success: bool | None = None  # None if it is not known.
+    number: int = 0  # The number of the episode, from 1 on; 0 is the whole run.
 
 
 WHOLE = EpisodeSpan()
 
 
 def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list[EpisodeSpan]:
-    """The episodes that an operator has told; the whole run where that are none.
+    """Return the episodes that an operator has marked, or the whole run if there are none.
 
-    A discard, a success and a failure are for the episode that goes on, or else for the last one; what was said last
-    counts. Of the whole run they are what the operator said, or else ``run_succeeded``, what the task's own check did.
+    A discard, a success and a failure belong to the episode that goes on, or else to the last one. The last mark
+    counts. The success of the whole run is that of the operator, or else ``run_succeeded``, that of the task's check.
     """
     whole = replace(WHOLE, success=run_succeeded)
     spans: list[EpisodeSpan] = []
@@ -222,10 +225,11 @@ def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list
 
 
 def read_spans(recording: Recording) -> list[EpisodeSpan]:
-    """The episodes of a recording. Raises :class:`RecordingError` for a damaged one."""
+    """Return the episodes of a recording. Raises :class:`RecordingError` if it is damaged."""
     about, success = recording.about, recording.conclusion.success
     if about.source == LOOP and not any(action in about.cell for action in EpisodeMarks.actions):
-        return spans_of((), success)  # without reading all of it; of nodes, a service tells episodes too
+        # No control of the cell marks episodes, so the ticks need not be read. With ROS nodes a service marks them too.
+        return spans_of((), success)
     try:
         told = (events for chunk in recording.chunks() for events in chunk.events().values())
         return spans_of((event for events in told for event in events), success)

@@ -1,4 +1,4 @@
-"""The ticks of a recording, with all that each of them took."""
+"""The ticks of a recording, with all inputs of each tick."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import RunStart
 from q2r2_control.types import QUEST_CONTROLS, SIDES, ActionChunk, Array, HandInputs, HandSample, RobotState
 
-_SAME_POSE = 1e-6  # [m], and of a quaternion
+_SAME_POSE = 1e-6  # Largest difference of equal poses: of positions [m] and of the numbers of a quaternion.
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,17 +36,17 @@ class RecordedTick:
     openings: dict[str, float]
     unsolved: int
     events: list[Event]
-    packed: PackedTick  # all of it
+    packed: PackedTick  # The whole tick as it was recorded.
 
 
 class RecordedTicks:
-    """The ticks of a recording, one after the other. Ends before the first that is missing."""
+    """Reads the ticks of a recording, one after the other, up to the first tick that is missing."""
 
     def __init__(self, recording: Recording) -> None:
         self._arms = recording.about.arms
         self._ticks = self._all(recording)
         self._starts: list[RunStart] = []
-        self.missing = 0  # ticks that were lost behind the last one
+        self.missing = 0  # The number of ticks that were lost after the last one.
         self.current: RecordedTick | None = None
         self.next = next(self._ticks, None)
         if self.next is None or not self._starts:
@@ -54,7 +54,7 @@ class RecordedTicks:
         self.start = self._starts[0]
 
     def advance(self) -> RecordedTick:
-        """Go on to the next tick. Raises :class:`NoMoreTicksError` behind the last."""
+        """Go on to the next tick. Raises :class:`NoMoreTicksError` after the last one."""
         if self.next is None:
             raise NoMoreTicksError
         self.current, self.next = self.next, next(self._ticks, None)
@@ -110,7 +110,7 @@ class RecordedTicks:
 
 
 class NoMoreTicksError(Exception):
-    """There are no more ticks: the run was killed, or some were lost."""
+    """There are no more ticks: the run ended or was killed, or ticks were lost."""
 
 
 def _sample(numbers: Array, more: dict[str, float]) -> HandSample:
@@ -130,9 +130,10 @@ def _sample(numbers: Array, more: dict[str, float]) -> HandSample:
 
 
 def cell_and_robot_of(recording: Recording, config: Config | None = None) -> tuple[Config, Robot]:
-    """The recorded cell, or ``config``, with its robot.
+    """Return the recorded cell, or ``config`` if it is given, with its robot.
 
-    Raises :class:`RecordingError` where the recorded cell cannot be built or either one has other arms or joints.
+    Raises :class:`RecordingError` if the recorded cell cannot be built, or if the cell has other arms or joints than
+    the recording.
     """
     about = recording.about
     if config is not None:
@@ -154,13 +155,13 @@ def _built(text: str) -> tuple[Config, Robot]:
 
 
 def check_tools(positions: Array, tools: Array, robot: Robot) -> None:
-    """Raises :class:`RecordingError` where recorded tools (arms, 7) are not at joint positions (joints,)."""
+    """Raises :class:`RecordingError` if recorded ``tools`` (arms, 7) are not those at joint ``positions`` (joints,)."""
     (found,) = tool_poses(positions[None], robot)
-    near = np.minimum(np.abs(found - tools), np.abs(found + tools))[:, 3:].max() < _SAME_POSE  # q and -q are the same
+    near = np.minimum(np.abs(found - tools), np.abs(found + tools))[:, 3:].max() < _SAME_POSE  # q and -q are equal.
     if not near or np.abs(found - tools)[:, :3].max() > _SAME_POSE:
         raise RecordingError("the robot that its cell names now is not the recorded one: tools are elsewhere")
 
 
 def tool_poses(positions: Array, robot: Robot) -> Array:
-    """(n, arms, 7) x y z [m] qx qy qz qw of the tools in the world, at joint positions (n, joints)."""
+    """Return the poses (n, arms, 7) x y z [m] qx qy qz qw of the tools in the world, at joint positions (n, joints)."""
     return RecordedRobot.of(robot).tool_poses(positions)

@@ -1,4 +1,4 @@
-"""Records a run, or what ROS nodes publish: a new folder for each, and a process that writes there."""
+"""Records a run, or messages of ROS nodes, into a new folder, by a process that writes there."""
 
 from __future__ import annotations
 
@@ -26,33 +26,34 @@ from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, Recording
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 
-if TYPE_CHECKING:  # the ROS node does without MuJoCo
+if TYPE_CHECKING:  # The ROS node does not import MuJoCo.
     from q2r2_control.plants.mujoco import MujocoPlant
 
-PATIENCE = 10.0  # with a disk that hangs, at the end of a run [s]
-# For what waits to be sent [bytes], and the writer has as much: a tick of two arms takes 1.6 kB, both arms' nodes send
-# some 0.6 MB a second.
+PATIENCE = 10.0  # Time to wait for a disk that hangs at the end of a run [s].
+# Size of the data that may wait to be sent [bytes]. As much may wait in the writer. A tick of two arms takes 1.6 kB,
+# and the nodes of two arms send some 0.6 MB a second.
 ROOM = 4 << 20
-_BEHIND, _CAUGHT_UP = 2.0, 1.0  # time by which the file is behind the run, to be said, and to be said anew later [s]
-ROOM_WITH_PICTURES = 64 << 20  # of cameras of nodes, which have a megabyte each where they are not compressed
+# A warning is logged when the file is behind the run by the first time, and is possible again below the second [s].
+_BEHIND, _CAUGHT_UP = 2.0, 1.0
+ROOM_WITH_PICTURES = 64 << 20  # The same with cameras of nodes: an uncompressed picture takes a megabyte [bytes].
 _LAST_NUMBER = 2**32 - 1
-_BATCH = 16  # ticks that are sent at once
-_LONGEST_FAULT = 500  # that ended a run [characters]
+_BATCH = 16  # The number of ticks that are sent at once.
+_LONGEST_FAULT = 500  # Longest text of the fault that ended a run [characters].
 
 _logger = logging.getLogger(__name__)
 
 
 class BaseRecorder:
-    """Raises nothing: what fails is logged once, and the run goes on."""
+    """Sends data to a process that writes it. It raises nothing: a failure is logged once, and the run goes on."""
 
     def __init__(self, parent: Path, name: str, room: int) -> None:
-        """Start the process; ``room`` [bytes] is for what waits to be written."""
+        """Start the process; ``room`` [bytes] is the size of the data that may wait to be written."""
         self._parent, self._name = parent, name
-        self.fault: str | None = None  # why nothing more is recorded
-        self.file: Path | None = None  # that is written; None while there is none
+        self.fault: str | None = None  # The reason why nothing more is recorded.
+        self.file: Path | None = None  # The file that is written; None while there is no file.
         self.written = Written()
         self.writer: HelperProcess | None = None
-        self.record_outcome: Callable[[Reason], None] = lambda reason: None  # lets the operator know of the failure
+        self.record_outcome: Callable[[Reason], None] = lambda reason: None  # Informs the operator of a failure.
         try:
             module = "q2r2_control.recording.writer"
             on_written = partial(setattr, self, "written")
@@ -63,11 +64,11 @@ class BaseRecorder:
     def _open(
         self, about: About, robot: RecordedRobot | None, topics: tuple[Topic, ...], topic_rate: float | None = None
     ) -> bool:
-        """Have the file of a run begun that begins at ``about.epoch``; whether that was possible."""
+        """Let the writer begin the file of a run that begins at ``about.epoch``; returns whether that was possible."""
         if self.writer is None:
             return False
         try:
-            # The time of day, so that recordings are listed in their order.
+            # The name begins with the time of day, so that recordings are listed in their order.
             when = datetime.fromtimestamp(about.epoch * 1e-9)
             folder = new_folder(self._parent, f"{when:%Y%m%d-%H%M%S}-{self._name}", "--record")
         except (ConfigError, OSError) as error:
@@ -78,7 +79,7 @@ class BaseRecorder:
         return True
 
     def _send(self, batch: list[PackedTick] | list[Message], *, wait: bool = False) -> bool:
-        """Have some written; False where there is no room for them now. ``wait`` for room."""
+        """Send a batch to the writer; returns False if there is no room for it now. With ``wait`` it waits for room."""
         if self.writer is None or self.fault is not None:
             return False
         sent = self.writer.send(batch, sum(one.size for one in batch), wait=wait)
@@ -86,7 +87,7 @@ class BaseRecorder:
         return sent
 
     def finish(self, conclusion: Conclusion | None = None) -> None:
-        """Write what there is with the ``conclusion``, and close the file."""
+        """Write the data that waits and the ``conclusion``, and close the file."""
         if self.writer is not None:
             if self.file is not None:
                 self.writer.send(conclusion or Conclusion())
@@ -99,7 +100,7 @@ class BaseRecorder:
             self.file = None
 
     def _check(self, fault: str | None = None) -> None:
-        """Log the first ``fault``, or one of the writer, in one line; nothing more is recorded."""
+        """Log the first ``fault``, or a fault of the writer, in one line; after a fault nothing more is recorded."""
         if fault is None and self.writer is not None:
             fault = self.writer.fault
         if fault is not None and self.fault is None:
@@ -109,10 +110,10 @@ class BaseRecorder:
 
 
 def _is_empty(file: Path) -> bool:
-    """True if a file, as a writer that was killed leaves it, has no message."""
+    """Return whether a file has no message; the file may be that of a writer that was killed."""
     try:
         recording = Recording(file)
-    except RecordingError as error:  # messages come after what it lacks, unless the disk fails
+    except RecordingError as error:  # The missing data stands before all messages, unless the disk fails.
         return not isinstance(error.__cause__, OSError) or not file.exists()
     try:
         return not any(recording.messages())
@@ -121,21 +122,21 @@ def _is_empty(file: Path) -> bool:
 
 
 class MessageRecorder(BaseRecorder):
-    """Writes one file. It never waits: messages for which there is no room are lost, and counted."""
+    """Writes messages into one file. It never waits: messages for which there is no room are lost, and counted."""
 
     def __init__(self, parent: Path, name: str, room: int = ROOM) -> None:
         super().__init__(parent, name, room)
-        self.count = self.overflows = 0  # messages that came; those of them for which there was no room
-        self._last = 0  # time of the newest message [ns of day]
+        self.count = self.overflows = 0  # The number of messages that came, and of those for which there was no room.
+        self._last = 0  # The time of day of the newest message [ns].
         self._begun = False
 
     def begin(self, about: About, topics: tuple[Topic, ...]) -> None:
         self._begun, self._last = self._open(about, None, topics), about.epoch
 
     def record(self, messages: Iterable[Message]) -> None:
-        """Have messages written, in the order of their receipt.
+        """Let messages be written, in the order of their receipt.
 
-        One that was received before the last one counts as received with it: a file is in the order of time.
+        A file is in the order of time. A message that is older than the last one gets the time of the last one.
         """
         batch = []
         for message in sorted(messages, key=lambda one: one.time):
@@ -149,40 +150,45 @@ class MessageRecorder(BaseRecorder):
 
 @dataclass(frozen=True, slots=True)
 class RecordingSummary:
-    file: str | None  # None: none could be made
-    ticks: int  # written
-    lost_ticks: int  # that came while there was no room, or after the disk had failed
-    fault: str | None  # why it ended before the run did
-    pictures: int = 0  # written
-    lost_pictures: int = 0  # that were due and are not there
-    pictures_fault: str | None = None  # why they ended before the run did
-    longest_backlog_s: float = 0.0  # that waited to be written, at most; what a killed writer may cost
+    file: str | None  # None if no file could be made.
+    ticks: int  # The number of ticks that were written.
+    lost_ticks: int  # The number of ticks that came while there was no room, or after the disk had failed.
+    fault: str | None  # The reason why the recording ended before the run.
+    pictures: int = 0  # The number of pictures that were written.
+    lost_pictures: int = 0  # The number of pictures that were due and are missing.
+    pictures_fault: str | None = None  # The reason why the pictures ended before the run.
+    longest_backlog_s: float = 0.0  # The longest time that waited to be written and that a kill of the writer may lose.
 
 
 class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
-    """A listener of one run, as a context around it. It raises nothing: what fails is logged once, and the run goes on.
+    """A listener of one run, as a context around it. It raises nothing: a failure is logged once, and the run goes on.
 
-    Its process starts with it, so make it before what takes long, and :meth:`begin` when the run is about to begin.
+    The process starts in the constructor. Make the recorder before any long preparation, and call :meth:`begin` just
+    before the run begins.
     """
 
-    keeps_episodes = True  # its operator can tell where one begins and ends
+    keeps_episodes = True  # The operator can mark where an episode begins and ends.
 
     def __init__(
         self, parent: Path, name: str, *, waits: bool = False, room: int = ROOM, pictures: bool = False
     ) -> None:
-        """``waits``: ticks wait for ``room`` [bytes], as they may in simulated time; else they are lost, and counted.
+        """Start the process of the writer.
 
-        With ``pictures`` there is one more process, which takes those of the cameras of :meth:`prepare`.
+        If ``waits`` is True, ticks wait for ``room`` [bytes], as they may in simulated time. Otherwise ticks for which
+        there is no room are lost, and counted. With ``pictures`` there is one more process, which takes the pictures of
+        the cameras of :meth:`prepare`.
         """
         self._waits = waits
-        self._count = 0  # ticks
-        self.overflows = 0  # ticks for which there was no room
-        self._packer: TickPacker | None = None  # None: not begun
+        self._count = 0  # The number of ticks.
+        self.overflows = 0  # The number of ticks for which there was no room.
+        self._packer: TickPacker | None = None  # None before :meth:`begin`.
         self._batch: list[PackedTick] = []
-        self._sent: deque[tuple[int, float]] = deque()  # ticks by then, and the loop's time [s], of what is not written
+        # For each batch that is not yet written, the number of ticks up to it and the loop's time [s].
+        self._sent: deque[tuple[int, float]] = deque()
         self._longest_backlog, self._said_so = 0.0, False
         self._epoch = 0
-        self.success: bool | None = None  # of the run, where its task has a check of its own, set before the end
+        # The success of the run, set before its end if the task has a check of its own.
+        self.success: bool | None = None
         self.cameras: CameraRecorder | None = None
         self._pictures_fault: str | None = None
         super().__init__(parent, name, room)
@@ -193,14 +199,14 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
                 self._check_cameras(reason_of(error))
 
     def prepare(self, plant: MujocoPlant, robot: Robot, cameras: Mapping[str, CameraConfig]) -> None:
-        """Make ready to take pictures of a run of ``plant``, just before :meth:`begin`; some seconds at most."""
+        """Prepare pictures of a run of ``plant``, just before :meth:`begin`; this takes at most some seconds."""
         if self.cameras is not None:
             topics = run_topics(tuple(robot.arms), tuple(robot.joint_names), tuple(cameras))
             self.cameras.prepare(plant, cameras, topics, waits=self._waits)
             self._check_cameras()
 
     def begin(self, about: About, robot: Robot, topic_rate: float | None = TOPIC_RATE) -> None:
-        """Begin the file of a run of ``robot``, with standard topics at ``topic_rate`` [Hz]; None: at every tick."""
+        """Begin the file of a run of ``robot``, with standard topics at ``topic_rate`` [Hz]; None means every tick."""
         topics = about.topics()
         if self._open(about, RecordedRobot.of(robot), tuple(topics.values()), topic_rate):
             self._packer, self._epoch = TickPacker(about.arms, about.joints), about.epoch
@@ -214,24 +220,27 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             if len(self._batch) >= _BATCH:
                 self._send_batch()
                 self._watch_backlog(tick.now)
-        except Exception as error:  # the arms move on, whatever it is
+        except Exception as error:  # The arms go on moving after any error.
             self._check(reason_of(error))
         if self.cameras is not None:
             try:
                 self.cameras.take_pictures(number, tick, self._epoch, wait=self._waits)
-            except Exception as error:  # ticks are recorded all the same
+            except Exception as error:  # Ticks are still recorded.
                 self._check_cameras(reason_of(error))
             self._check_cameras()
 
     def _send_batch(self) -> None:
-        """Send all ticks that wait; those for which there is no room are lost."""
+        """Send all ticks that wait; the ticks are lost if there is no room for them."""
         batch, self._batch = self._batch, []
         if batch and not self._send(batch, wait=self._waits) and self._packer is not None:
             self.overflows += len(batch)
             self._packer.repeat_state()
 
     def _watch_backlog(self, now: float) -> None:
-        """Say it when the file is long behind the run, which a kill of the writer would cost; simulated time waits."""
+        """Warn if the file is far behind the run, since a kill of the writer would lose that time.
+
+        A run in simulated time waits for the writer, so nothing is watched.
+        """
         if self._waits:
             return
         self._sent.append((self._count - self.overflows, now))
@@ -245,7 +254,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         self._said_so = behind > (_CAUGHT_UP if self._said_so else _BEHIND)
 
     def _write_picture(self, picture: Message) -> None:
-        """Called in the thread that hears of the cameras, which may wait for room."""
+        """Send a picture to the writer; called in the thread that receives pictures, which may wait for room."""
         if self.writer is not None:
             self.writer.send([picture], picture.size, wait=True)
 
@@ -271,7 +280,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         )
 
     def _check_cameras(self, fault: str | None = None) -> None:
-        """Log the first ``fault``, or one of their process, in one line; no more pictures are taken."""
+        """Log the first ``fault``, or a fault of the process, in one line; after a fault no more pictures are taken."""
         if fault is None and self.cameras is not None:
             fault = self.cameras.process.fault
         if fault is not None and self._pictures_fault is None:

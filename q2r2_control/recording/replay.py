@@ -1,4 +1,4 @@
-"""A recorded run once more: the pipeline's own loop, with what it took before as its clock, input and plant."""
+"""Runs a recording again: the pipeline's own loop, with the recorded data as its clock, input and plant."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from q2r2_control.types import (
 
 @dataclass(frozen=True, slots=True)
 class ArmDifference:
-    """How far an arm's measured tool is from where it was at the same ticks."""
+    """The difference between an arm's measured tool in the replay and in the recording, at the same ticks."""
 
     position_mm_rms: float
     position_mm_max: float
@@ -54,11 +54,11 @@ class ArmDifference:
 @dataclass(frozen=True, slots=True)
 class Replay:
     ticks: int
-    summary: RunSummary | None  # None: the recording has no end, or a fault ended the run
-    ended_by: str | None  # that fault, or why it ended before the recording did
-    difference: str | None  # the first one; None: identical
-    notes: list[str]  # what is not as it was when it was recorded
-    arms: dict[str, ArmDifference]  # with a plant: where the tools were elsewhere
+    summary: RunSummary | None  # None if the recording has no end, or if a fault ended the run.
+    ended_by: str | None  # That fault, or the reason why the replay ended too early.
+    difference: str | None  # The first difference; None if there is none.
+    notes: list[str]  # The changes since the run was recorded.
+    arms: dict[str, ArmDifference]  # With a plant, the difference of each arm's tool.
 
 
 def replay(
@@ -72,11 +72,12 @@ def replay(
 ) -> Replay:
     """Run a recording again, with its own cell or another one.
 
-    Without a ``plant``, what was measured is measured again, whatever is commanded; with one, it moves and is measured.
-    Only one of the recorded kind can do the same to the bit, so ``compare`` is for no other. ``prepare`` gets the
-    pipeline. ``paced`` is True if the run must not be faster than it was recorded. Raises :class:`RecordingError` for a
-    file that is none or is damaged. Raises :class:`Q2R2Error` for a cell that cannot be built or has other arms or
-    joints, and for a plant without the recorded mode.
+    Without a ``plant``, the loop gets the recorded measurements, whatever it commands. With a ``plant``, that plant
+    moves and is measured. Only a plant of the recorded kind can repeat the run to the bit, so ``compare`` is not
+    allowed with others. ``prepare`` is called with the pipeline before the run. ``paced`` is True if the run must not
+    be faster than it was recorded. Raises :class:`RecordingError` for a file that is not a recording or is damaged.
+    Raises :class:`Q2R2Error` for a cell that cannot be built or has other arms or joints, and for a plant without the
+    recorded mode.
     """
     recording = Recording(path)
     about = recording.about
@@ -117,12 +118,12 @@ def replay(
 
 
 class ReplayPipeline(Pipeline):
-    """Runs the loop with the clock and input of a recording, and its solver as late as it was then."""
+    """Runs the loop with the clock and input of a recording. Its solver fails in the same substeps as it did then."""
 
     def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, about: About, plant: str | None) -> None:
-        """``plant`` by its name; None: the recorded one, which no command moves."""
+        """``plant`` is the name of a plant; None stands for the recorded measurements, which no command changes."""
         recorded = _Recorded(ticks, about.plant_modes, self._ask_again)
-        # A recording does not say which buttons of its own the device had.
+        # A recording does not tell which extra buttons the device had.
         buttons = QUEST_CONTROLS.buttons + config.teleop.bindings.of_device
         recorded.controls = replace(_Recorded.controls, buttons=buttons)
         moves = recorded if plant is None else make_plant(plant, robot, config)
@@ -133,7 +134,7 @@ class ReplayPipeline(Pipeline):
         return _Clock(1.0 / self.config.nominal_rate_hz, self._recorded, self._pace)
 
     def _ask_again(self, tick: RecordedTick) -> None:
-        """Repeat what a program asked of the run at this tick: an event of both arms, and of no change of a state."""
+        """Repeat the requests of a program at this tick: they are events of both arms that change no state."""
         first = next(iter(self.robot.arms))
         asked = (event for event in tick.events if event.arm == first and event.source == event.destination)
         self.requests.extend(event.reason for event in asked if event.kind in REPEATED)
@@ -162,7 +163,10 @@ class _Clock(LoopClock):
 
 
 class _Recorded:
-    """Samples and measured states of the recorded tick; commands move nothing. Implements PolicySource and Plant."""
+    """Gives the samples and measured states of the recorded tick. Implements PolicySource and Plant.
+
+    Commands move nothing.
+    """
 
     controls = replace(QUEST_CONTROLS, words=replace(QUEST_WORDS, nobody="this is a recording"))
 
@@ -200,7 +204,7 @@ class _Recorded:
 
 
 class _Solver:
-    """Has no solution in those substeps in which there was none, or none in time."""
+    """Returns no solution in the substeps in which the recorded run had no solution in time."""
 
     def __init__(self, solver: Solver, ticks: RecordedTicks) -> None:
         self._solver, self._ticks = solver, ticks
@@ -217,14 +221,15 @@ class _Solver:
 
 
 class _PlantDifference:
-    """A listener of a replay on a plant: how far its tools are from where they were when the run was recorded."""
+    """A listener of a replay on a plant that measures how far the tools are from their recorded places."""
 
-    keeps_episodes = True  # as when it was recorded
+    keeps_episodes = True  # The recorder has set this too.
 
     def __init__(self, robot: Robot, ticks: RecordedTicks) -> None:
         self._robot, self._ticks = robot, ticks
         self._data = robot.model.createData()
-        self._off: dict[str, list[tuple[float, float]]] = {name: [] for name in robot.arms}  # [m], [rad]
+        # By arm, the distance [m] and the angle [rad] at each tick.
+        self._off: dict[str, list[tuple[float, float]]] = {name: [] for name in robot.arms}
 
     def __call__(self, tick: Tick) -> None:
         recorded = self._ticks.current
@@ -247,9 +252,9 @@ class _PlantDifference:
 
 
 class _Comparison:
-    """A listener of a replay that holds each tick to the recorded one, bit for bit, but for how long it took."""
+    """A listener of a replay that compares each tick with the recorded one, bit by bit, except computing times."""
 
-    keeps_episodes = True  # as when it was recorded
+    keeps_episodes = True  # The recorder has set this too.
 
     def __init__(self, about: About, ticks: RecordedTicks) -> None:
         self._ticks, self._packer = ticks, TickPacker(about.arms, about.joints)
@@ -269,7 +274,7 @@ class _Comparison:
                 self._difference = f"{tick.now - self._ticks.start.now:.6f} s: {found}"
 
     def finish(self) -> str | None:
-        """The first difference, after the replay, of which nothing may be left; None: there is none."""
+        """Return the first difference after the replay, or None. A recorded tick that was not replayed is one too."""
         if self._difference is None and self._ticks.next is not None:
             return f"{self._ticks.next.now - self._ticks.start.now:.6f} s: a tick was recorded only"
         return self._difference

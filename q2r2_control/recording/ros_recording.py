@@ -1,7 +1,7 @@
-"""A recording of the ROS nodes, read as if one loop had made it.
+"""Reads a recording of the ROS nodes as if one loop had made it.
 
-A tick is one of the controller's node, with what had been received by then: the newest joint states, flags of the arms,
-and targets. The reference is the one with the same time.
+A tick is a tick of the controller's node, with the newest joint states, flags of the arms and targets that had been
+received by then. Its reference is the one with the same time.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array
 
-_CLOCK_SET = 0.5  # times of a reference and a tick are not so far apart unless the clock was set between them [s]
-_SAME = 1e-6  # times of one tick may differ by their rounding [s]
+_CLOCK_SET = 0.5  # The times of a reference and a tick differ by this much only if the clock was set between them [s].
+_SAME = 1e-6  # The times of one tick may differ by their rounding [s].
 
 
 def open_recording(path: Path) -> Recording:
-    """A recording, whatever was recorded. Raises :class:`RecordingError`, see :class:`Recording`."""
+    """Open a recording of a loop or of the nodes. Raises :class:`RecordingError`, see :class:`Recording`."""
     recording = Recording(path)
     return RosRecording(path) if recording.about.source == ROS else recording
 
 
 class RosRecording(Recording):
-    """Raises :class:`RecordingError` for any other recording, and where another controller moved the arms."""
+    """A recording of the ROS nodes. Raises :class:`RecordingError`, also if another controller moved the arms."""
 
     def chunks(self) -> Iterator[TickChunk]:
         config, robot = cell_and_robot_of(self)
@@ -60,7 +60,7 @@ class RosRecording(Recording):
                 if previous is not None:
                     yield previous
                 previous = chunk
-        if previous is not None and self.closed:  # the recorder was told to end, and the last tick is the run's
+        if previous is not None and self.closed:  # The recorder ended as planned, so this is the last tick of the run.
             previous.rows["following"][-1] = 0.0
         yield ticks.rest(previous)
 
@@ -76,31 +76,31 @@ class RosRecording(Recording):
 
 @dataclass(slots=True)
 class _Tick:
-    time: int  # of its receipt [ns of day]
-    now: float  # of the controller [s]
-    row: Rows  # (1,), filled with what was known by then
-    samples: list[Array]  # numbers of SAMPLE_FIELDS, received since the last tick
-    events: list[Event]  # since the last tick
+    time: int  # The time of day of its receipt [ns].
+    now: float  # The controller's time [s].
+    row: Rows  # (1,), filled with the numbers that were known by then.
+    samples: list[Array]  # The numbers of SAMPLE_FIELDS of samples that were received since the last tick.
+    events: list[Event]  # The events since the last tick.
 
 
 class RosTicks:
     """Makes ticks of the messages of a set of nodes."""
 
     def __init__(self, epoch: int, robot: Robot) -> None:
-        """``epoch`` [ns]: where times of ticks begin, by the clock of the messages' times."""
+        """``epoch`` [ns] is the time at which times of ticks begin, by the clock of the messages."""
         self._robot, self._epoch, self._joint_names = robot, epoch, robot.joint_names
         self._arms = arms = tuple(robot.arms)
         self._fields, self._type = names.tick_fields(arms), tick_type(len(arms), len(robot.joint_names))
         self._types = {topic.name: topic.type for topic in names.ros_topics(arms, {})}
-        self.joints = np.full((3, len(robot.joint_names)), np.nan)  # newest q, v and tau
-        self._known = np.zeros(len(robot.joint_names), dtype=bool)  # joints that were measured
+        self.joints = np.full((3, len(robot.joint_names)), np.nan)  # The newest q, v and tau.
+        self._known = np.zeros(len(robot.joint_names), dtype=bool)  # True for joints that were measured.
         self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)
-        self._targets: dict[int, tuple[int, Array]] = {}  # by the arm's place: when it came [ns], and the pose
+        self._targets: dict[int, tuple[int, Array]] = {}  # By the arm's place, the time of receipt [ns] and the pose.
         self._samples: list[Array] = []
         self._events: list[Event] = []
-        self._due: deque[_Tick] = deque()  # wait for their references
-        self._references: deque[tuple[float, Array]] = deque()  # by the controller's time [s]
-        self._last_index, self._number = 0, -1  # of the newest tick
+        self._due: deque[_Tick] = deque()  # Ticks that wait for their references.
+        self._references: deque[tuple[float, Array]] = deque()  # The controller's time [s] and the reference.
+        self._last_index, self._number = 0, -1  # The controller's index and the number of the newest tick.
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             names.JOINT_STATES: self._on_joints,
             names.REFERENCE: self._on_reference,
@@ -116,18 +116,18 @@ class RosTicks:
 
     @property
     def topics(self) -> frozenset[str]:
-        """Those that ticks are made of."""
+        """Return the topics that ticks are made of."""
         return frozenset(self._handlers)
 
     def add_messages(self, messages: Iterable[tuple[str, Message]]) -> TickChunk:
-        """The ticks that are known after some more messages, with their topics; there may be none."""
+        """Take messages with their topics, and return the ticks that are complete now; there may be none."""
         for topic, message in messages:
             if (handle := self._handlers.get(topic)) is not None:
                 handle(STORE.deserialize_cdr(message.payload, self._types[topic]), message.time)
         return self._chunk(list(self._whole_ticks()))
 
     def rest(self, last: TickChunk | None) -> TickChunk:
-        """The ``last`` chunk, or one without a tick, with what happened after it."""
+        """Return the ``last`` chunk, or a chunk without a tick, with the events after it added."""
         chunk = self._chunk([]) if last is None else last
         if events := [*(event for tick in self._due for event in tick.events), *self._events]:
             number = max(self._number, 0)
@@ -156,7 +156,7 @@ class RosTicks:
         self._flags[place] = message.data
 
     def _on_event(self, message: Any, time: int) -> None:
-        told = json.loads(message.data) | {"t": (time - self._epoch) / NANOSECONDS}  # its sender's clock is another
+        told = json.loads(message.data) | {"t": (time - self._epoch) / NANOSECONDS}  # The sender has another clock.
         self._events.append(Event.from_json(told))
 
     def _on_hand(self, side: int, message: Any, time: int) -> None:
@@ -168,7 +168,7 @@ class RosTicks:
 
     def _on_tick(self, message: Any, time: int) -> None:
         if not self._known.all() or np.isnan(self._flags[:, 0]).any():
-            return  # nothing can be said of it yet
+            return  # The tick is not complete, since some joints or flags are not known yet.
         values = dict(zip(self._fields, message.data.tolist(), strict=True))
         row = np.zeros(1, dtype=self._type)
         for name in set(values) & set(self._type.names or ()):
@@ -189,7 +189,10 @@ class RosTicks:
         self._samples, self._events = [], []
 
     def _whole_ticks(self) -> Iterator[_Tick]:
-        """Those whose reference is there; what came with one whose reference was lost is the next one's."""
+        """Yield the ticks whose reference came.
+
+        Samples and events of a tick whose reference was lost go to the next tick.
+        """
         while self._due and self._references:
             tick, (now, reference) = self._due[0], self._references[0]
             if self._is_older(now, tick.now):
@@ -205,17 +208,17 @@ class RosTicks:
             self._references.popleft()
             row, index = tick.row, int(tick.row["index"][0])
             row["reference_q"], row["reference_v"], row["reference_a"] = reference
-            # A controller that was started again begins anew.
+            # The index begins again if the controller was started again.
             self._number += index - self._last_index if 0 < self._last_index < index else 1
             self._last_index = index
             row["index"] = self._number
             yield tick
 
     def _is_older(self, reference: float, tick: float) -> bool:
-        """True if the tick of the oldest reference, of time ``reference`` [s], is not there."""
+        """Return whether the tick of the oldest reference, of time ``reference`` [s], is missing."""
         if abs(reference - tick) < _CLOCK_SET:
             return reference < tick - _SAME
-        # The clock was set between the two, forward or back: which of them is the later one, others tell.
+        # The clock was set between the two, forward or back. Other ticks and references tell which of them is later.
         return not any(abs(other.now - reference) <= _SAME for other in self._due) and any(
             abs(other - tick) <= _SAME for other, _ in self._references
         )

@@ -1,4 +1,4 @@
-"""Puts the messages of ticks together, wherever a file's chunks end between them."""
+"""Joins the messages of each tick, also if a chunk of the file ends between them."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from q2r2_control.recording.messages import SAMPLES, STATE, TEXT, TICK, Message,
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.types import Array
 
-_FEWEST = 200  # ticks at once, since NumPy takes as long for one as for many
+_FEWEST = 200  # Ticks are read in groups of more than this, since NumPy takes as long for one as for many.
 
 
 @dataclass(frozen=True)
 class TickChunk:
-    """Some ticks that follow each other, n of them, which may be none."""
+    """A group of n ticks that follow each other; n may be 0."""
 
-    rows: Rows  # (n,) of tick_type
-    times: npt.NDArray[np.int64]  # (n,) of day [ns]
-    samples: Array  # (m, numbers of SAMPLE_FIELDS)
-    states: dict[int, str]  # JSON, by the number of the tick
+    rows: Rows  # (n,) of tick_type.
+    times: npt.NDArray[np.int64]  # (n,) The times of day [ns].
+    samples: Array  # (m, numbers of SAMPLE_FIELDS).
+    states: dict[int, str]  # JSON, by the number of the tick.
 
     @property
     def numbers(self) -> npt.NDArray[np.int64]:
-        """(n,) of the ticks, from 0 on."""
+        """Return the numbers (n,) of the ticks, from 0 on."""
         return np.asarray(self.rows["index"].astype(np.int64))
 
     def events(self) -> dict[int, list[Event]]:
-        """The events of each tick, by the tick's number. Raises ValueError, KeyError and TypeError for other data."""
+        """Return the events by number of their tick. Raises ValueError, KeyError and TypeError for other data."""
         found = {number: json.loads(text).get("events", ()) for number, text in self.states.items()}
         return {number: [Event.from_json(event) for event in events] for number, events in found.items()}
 
 
 class TickAssembly:
-    """Gives ticks of which all messages are there.
+    """Collects messages, and gives the ticks whose messages are complete.
 
-    Messages have the numbers of their ticks and come in the order of time. Therefore a tick is whole when the next one
-    comes. The last one is whole when there are no more messages.
+    Messages have the numbers of their ticks and come in the order of time. Therefore a tick is complete when the next
+    one comes. The last one is complete when there are no more messages.
     """
 
     topics = (TICK, SAMPLES, STATE)
@@ -58,14 +58,14 @@ class TickAssembly:
             found[topic].append(message)
 
     def whole(self) -> Iterator[TickChunk]:
-        """The ticks that are whole, if they are enough to be worth it. Raises as :meth:`rest`."""
+        """Yield the complete ticks if there are more than 200. Raises the same errors as :meth:`rest`."""
         if len(self._found[TICK]) > _FEWEST:
             yield self._taken(self._found[TICK][-1].number)
 
     def rest(self, ended: bool) -> Iterator[TickChunk]:
-        """All that is left; without a last tick whose samples are missing, unless the file was ``ended``.
+        """Yield the ticks that are left. A last tick without all its samples is left out unless the file was ``ended``.
 
-        Raises :class:`ValueError` where ticks are not in their order, and what rosbags raises for other messages.
+        Raises :class:`ValueError` if ticks are not in order, and the errors of rosbags for other messages.
         """
         if not any(self._found.values()):
             return
@@ -79,7 +79,7 @@ class TickAssembly:
         yield chunk
 
     def _taken(self, border: int | None) -> TickChunk:
-        """Take all that is held of ticks below the ``border``, and keep the rest. A border of None takes all."""
+        """Take the messages of ticks with numbers below the ``border``, and keep the others. None takes all."""
         taken: dict[str, list[Message]] = {}
         for topic, messages in self._found.items():
             end = len(messages)

@@ -1,4 +1,4 @@
-"""A tick as one row of float64, in the order in which a tick computes its numbers, with its samples and state."""
+"""Packs a tick: one row of float64, in the order in which a tick computes its numbers, its samples and its state."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ import pinocchio as pin
 
 from q2r2_control.types import POSE_FIELDS, QUEST_CONTROLS, SIDES, Array, CommandMode, HandFault, HandSample, StepStatus
 
-if TYPE_CHECKING:  # the writer's process does without the loop's modules
+if TYPE_CHECKING:  # The process of the writer does not import the modules of the loop.
     from q2r2_control.summary.tick import Tick
 
 Rows = npt.NDArray[np.void]
 
-NOT_MEASURED = -math.inf  # in place of the opening of a gripper that the plant does not measure
+NOT_MEASURED = -math.inf  # Stands for the opening of a gripper that the plant does not measure.
 COMMAND_MODES, STATUSES = tuple(CommandMode), tuple(StepStatus)
 HAND_FAULTS = (None, *HandFault)
-UNSOLVED_MAX = 2**53  # more substeps than a float64 has bits for cannot be told apart
+UNSOLVED_MAX = 2**53  # The limit of the bit mask of unsolved substeps: a float64 has bits for no more.
 SAMPLE_FIELDS = (
     *("tick", "hand", "pose_stamp", "inputs_stamp", "x", "y", "z", "qx", "qy", "qz", "qw"),
     *QUEST_CONTROLS.names,
@@ -33,8 +33,8 @@ ARM_FIELDS = (
     *("opening", "engaged", "slip", "slip_angle", "wanted", "commanded", "rejected", "gripper_held", "holding"),
     *("intervention", "policy"),
 )
-ARM_POSES = ("filtered_hand", "target", "tool")  # zeros: none; the tool is at the reference
-NOT_REPLAYED = ("compute_time", "solve_time", "tool")  # the writer adds the tool, which follows from the reference
+ARM_POSES = ("filtered_hand", "target", "tool")  # Zeros stand for no pose. The tool is at the reference.
+NOT_REPLAYED = ("compute_time", "solve_time", "tool")  # The writer computes the tool from the reference.
 _LOOP = ("index", "now", "dt", "connected", "following", "samples", "state_stamp", "external")
 _MEASURED = ("q", "v", "tau", "tau_external")
 _CONTROLLER = ("step", "unsolved", "status", "certified", "fallback", "closest_distance", "margin", "slack")
@@ -42,15 +42,15 @@ _DECIDED = ("reference_q", "reference_v", "reference_a", "command_q", "command_v
 _LAST = ("command_mode", "compute_time", "solve_time")
 
 _values_of = attrgetter(*QUEST_CONTROLS.names)
-_NO_POSE = (0.0,) * len(POSE_FIELDS)  # whose quaternion is none
+_NO_POSE = (0.0,) * len(POSE_FIELDS)  # Its quaternion has length 0, so it is no pose.
 
 
 class PackedTick(NamedTuple):
     """One tick, on its way to the process that writes it."""
 
-    row: bytes  # of tick_type
-    samples: bytes  # float64 of SAMPLE_FIELDS, one after the other
-    state: str  # JSON where it changed, a chunk came or samples have controls of their device's own
+    row: bytes  # A row of tick_type.
+    samples: bytes  # The float64 numbers of SAMPLE_FIELDS, sample after sample.
+    state: str  # JSON of the state if it changed, or if there are events, chunks or extra controls; otherwise empty.
 
     @property
     def size(self) -> int:
@@ -58,7 +58,7 @@ class PackedTick(NamedTuple):
 
 
 def tick_type(arms: int, joints: int) -> np.dtype[np.void]:
-    """A row for so many arms and joints; all numbers are float64."""
+    """Return the type of a row for the given numbers of arms and joints; all numbers are float64."""
     number, pose, of_joints = "<f8", f"({len(POSE_FIELDS)},)<f8", f"({joints},)<f8"
     arm = [*((name, number) for name in ARM_FIELDS), *((name, pose) for name in ARM_POSES)]
     return np.dtype(
@@ -82,12 +82,12 @@ def tick_labels(arms: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def numbers_in(rows: Rows) -> Array:
-    """(n, numbers of a row) of rows (n,)."""
+    """Return the numbers (n, numbers of a row) of rows (n,)."""
     return np.ascontiguousarray(rows).view(np.float64).reshape(len(rows), rows.dtype.itemsize // 8)
 
 
 def targets_or_tools(rows: Rows) -> Array:
-    """(n, arms, 7) what the operator asks for, and while that is nothing the tools at the reference."""
+    """Return the operator's targets (n, arms, 7), or the tools at the reference where there is no target."""
     targets, tools = rows["arms"]["target"], rows["arms"]["tool"]
     return np.where(targets.any(axis=2, keepdims=True), targets, tools)
 
@@ -99,14 +99,14 @@ class TickPacker:
         self._arms = tuple(arms)
         self._row = struct.Struct(f"<{len(tick_labels(arms, joints))}d")
         self._not_measured = [0.0] * len(joints)
-        self._state: dict[str, Any] | None = None  # as it was told last
+        self._state: dict[str, Any] | None = None  # The last state that was packed.
 
     def repeat_state(self) -> None:
-        """Tell the state and the start again with the next tick: the last one was lost."""
+        """Pack the state and the start again with the next tick, since the last one was lost."""
         self._state = None
 
     def pack(self, number: int, tick: Tick) -> PackedTick:
-        """One tick, the ``number``-th from 0 on."""
+        """Pack one tick. ``number`` counts the ticks from 0 on."""
         reference, state, command = tick.reference, tick.state, tick.command
         report, external = reference.report, state.tau_external
         samples = [sample for sample in tick.samples if sample.hand in SIDES] if tick.samples else []
@@ -138,7 +138,7 @@ class TickPacker:
         )
 
     def _state_text(self, tick: Tick, samples: Sequence[HandSample]) -> str:
-        """Fields with names, as JSON; empty where nothing changed."""
+        """Return fields with names, as JSON; the text is empty if nothing changed."""
         report = tick.reference.report
         state: dict[str, Any] = {
             "states": tick.states,

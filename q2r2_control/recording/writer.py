@@ -1,4 +1,4 @@
-"""The process that writes a recording. It imports none of the modules that compute."""
+"""The process that writes a recording. It imports none of the modules of the control loop."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from q2r2_control.types import QUEST_CONTROLS, SIDES, Array
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
-FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
-READ_AHEAD = 4 << 20  # of what was sent, for what waits to be written [bytes]
-_NICENESS = 10  # the loop goes first where there are not enough processors
-_ROUNDING = 1e-6  # share of a period by which rounding may make a message seem to come too early
-_LAST_TIME = (2**31 - 1) * NANOSECONDS  # that a stamp can have [ns]
+FLUSH_PERIOD = 0.5  # Time between two flushes of the file, which is lost at most if this process is killed [s].
+READ_AHEAD = 4 << 20  # Size of the data that was read and may wait to be written [bytes].
+_NICENESS = 10  # The loop has a higher priority if there are not enough processors.
+_ROUNDING = 1e-6  # Share of a period by which rounding may make a message seem to come too early.
+_LAST_TIME = (2**31 - 1) * NANOSECONDS  # The latest time of a stamp [ns].
 _HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (
     SAMPLE_FIELDS.index(name) for name in ("hand", "pose_stamp", "inputs_stamp", "x", "button_upper")
 )
@@ -44,7 +44,7 @@ class RecordedRobot:
     model: pin.Model
     joints: tuple[str, ...]
     arms: tuple[str, ...]
-    tools: tuple[int, ...]  # frames, arm by arm
+    tools: tuple[int, ...]  # The frame of each arm's tool.
     urdf: str
 
     @classmethod
@@ -53,7 +53,7 @@ class RecordedRobot:
         return cls(robot.model, tuple(robot.joint_names), tuple(robot.arms), tools, robot.urdf)
 
     def tool_poses(self, postures: Array) -> Array:
-        """(n, arms, 7) x y z [m] qx qy qz qw of the tools in the world, at joint positions (n, joints)."""
+        """Return the tools' poses (n, arms, 7) x y z [m] qx qy qz qw in the world, at joint positions (n, joints)."""
         data = self.model.createData()
         poses = np.empty((len(postures), len(self.tools), len(POSE_FIELDS)))
         for q, row in zip(postures, poses, strict=True):
@@ -69,12 +69,12 @@ class TickEncoder:
     def __init__(
         self, robot: RecordedRobot, topics: dict[str, Topic], epoch: int, topic_rate: float | None = None
     ) -> None:
-        """``topic_rate`` [Hz] of the standard topics, which repeat numbers of the tick; None: with every tick."""
+        """``topic_rate`` [Hz] is that of the standard topics, which repeat numbers of ticks; None means every tick."""
         self._robot, self._topics, self._epoch, self._topic_rate = robot, topics, epoch, topic_rate
-        self._slot = -1.0  # of the newest tick with standard topics
+        self._slot = -1.0  # The number of the period of the newest tick with standard topics.
         self._type = tick_type(len(robot.arms), len(robot.joints))
-        self._start: float | None = None  # of the loop's clock [s]
-        self._stamps: dict[tuple[float, int], float] = {}  # the last of each hand's poses and inputs
+        self._start: float | None = None  # The time of the loop's clock at the start of the run [s].
+        self._stamps: dict[tuple[float, int], float] = {}  # The last stamps of each hand's poses and inputs.
         self._templates = _templates(list(robot.joints))
         self._poses = {
             frame: MessageTemplate(messages.POSE, messages.pose_stamped(np.arange(1.0, 8.0), frame), 7)
@@ -82,7 +82,10 @@ class TickEncoder:
         }
 
     def encode(self, batch: Sequence[PackedTick]) -> list[Message]:
-        """Messages of packed ticks that follow the last ones, tick by tick, as readers without an index expect."""
+        """Return the messages of packed ticks that follow the last batch.
+
+        They are in the order of the ticks, because readers expect that of a file without an index.
+        """
         rows = np.frombuffer(b"".join(tick.row for tick in batch), dtype=self._type).copy()
         rows["arms"]["tool"] = self._robot.tool_poses(rows["reference_q"])
         first = []
@@ -120,7 +123,7 @@ class TickEncoder:
         return first + [message for of_tick in made.messages for message in of_tick]
 
     def _due(self, now: Array) -> npt.NDArray[np.int64]:
-        """Which of the ticks at ``now`` (n,) [s] have standard topics: the first from each multiple of a period on."""
+        """Return which ticks at ``now`` (n,) [s] have standard topics: the first tick in each period of the topics."""
         if self._topic_rate is None:
             return np.arange(len(now))
         assert self._start is not None
@@ -130,13 +133,13 @@ class TickEncoder:
         return np.flatnonzero(np.diff(newest) > 0.0)
 
     def _times(self, seconds: Array) -> npt.NDArray[np.int64]:
-        """Times of the loop's clock [s] as times of day [ns]; any number of a sender gives some time."""
+        """Convert times of the loop's clock [s] to times of day [ns]; NaN becomes the start, others are limited."""
         assert self._start is not None
         passed = np.clip(np.nan_to_num(seconds - self._start) * NANOSECONDS, -_LAST_TIME, _LAST_TIME)
         return np.clip(np.rint(passed).astype(np.int64) + self._epoch, 0, _LAST_TIME)
 
     def _add_samples(self, made: _Batch, at: int, samples: Array) -> None:
-        """Samples of a tick as the loop got them; poses and inputs that are new as messages of the nodes too."""
+        """Add the samples of a tick as the loop got them, and new poses and inputs as messages of the nodes."""
         for sample in samples:
             hand = SIDES[int(sample[_HAND])]
             made.add(messages.SAMPLES, [at], [messages.array(sample)])
@@ -145,25 +148,25 @@ class TickEncoder:
                 pose = messages.pose_stamped(sample[_X : _X + len(POSE_FIELDS)], stamp=stamp)
                 made.add(messages.hand_pose(hand), [at], [messages.serialized(messages.POSE, pose)])
             if self._is_new(sample, _INPUTS_STAMP):
-                with np.errstate(over="ignore"):  # float32, whatever an input sends
+                with np.errstate(over="ignore"):  # An input may send numbers beyond float32.
                     values = sample[_BUTTONS : _BUTTONS + len(QUEST_CONTROLS.names)].astype(np.float32)
                 upper, lower, *analog = values.tolist()
                 inputs = messages.make(messages.HAND_INPUTS, bool(upper), bool(lower), *analog)
                 made.add(messages.hand_buttons(hand), [at], [messages.serialized(messages.HAND_INPUTS, inputs)])
 
     def _is_new(self, sample: Array, stamp: int) -> bool:
-        """Whether a sample of a hand has another stamp than the one before."""
+        """Return whether a sample of a hand has another stamp than the one before."""
         before = self._stamps.get((sample[_HAND], stamp))
         self._stamps[sample[_HAND], stamp] = sample[stamp]
         return bool(before != sample[stamp])
 
 
 class _Batch:
-    """Messages of some ticks, which have these numbers and times of day [ns]."""
+    """The messages of some ticks, which have the given numbers and times of day [ns]."""
 
     def __init__(self, topics: dict[str, Topic], numbers: npt.NDArray[np.int64], times: npt.NDArray[np.int64]) -> None:
         self._topics, self._numbers, self.times = topics, numbers.tolist(), times
-        self.messages: list[list[Message]] = [[] for _ in self._numbers]  # tick by tick
+        self.messages: list[list[Message]] = [[] for _ in self._numbers]  # One list for each tick.
 
     def add(self, topic: str, at: Iterable[int], payloads: Iterable[bytes]) -> None:
         channel = self._topics[topic].channel
@@ -186,24 +189,24 @@ def _templates(joints: list[str]) -> dict[str, MessageTemplate]:
 
 @dataclass(frozen=True)
 class RecordingSetup:
-    path: Path  # of the file, in a folder that is there
+    path: Path  # The path of the file, in a folder that exists.
     about: About
-    topics: tuple[Topic, ...]  # of the file
-    robot: RecordedRobot | None = None  # of packed ticks
-    topic_rate: float | None = None  # of the standard topics that are made of ticks [Hz]; None: with every tick
+    topics: tuple[Topic, ...]  # The topics of the file.
+    robot: RecordedRobot | None = None  # The robot of packed ticks; None if only messages are sent.
+    topic_rate: float | None = None  # The rate of the standard topics that are made of ticks [Hz]; None: every tick.
 
 
 class Written(NamedTuple):
-    """An answer: how much of what was sent is in the file."""
+    """An answer of the process: the numbers of sent ticks and messages that are in the file."""
 
     ticks: int = 0
-    messages: int = 0  # that were sent as such
+    messages: int = 0  # Messages that were sent as messages, not as ticks.
 
 
 def read_ahead(requests: Iterator[Any], room: int = READ_AHEAD) -> Iterator[Any]:
-    """The same requests, read by a thread as they come.
+    """Yield the same requests, read by a thread as they come.
 
-    Requests that are here already are written even if the run is killed. As much as ``room`` [bytes] may wait.
+    Requests that were read are written even if the run is killed. Requests of ``room`` [bytes] may wait.
     """
     waiting: SimpleQueue[tuple[Any, int]] = SimpleQueue()
     free = Condition()
@@ -229,13 +232,13 @@ def read_ahead(requests: Iterator[Any], room: int = READ_AHEAD) -> Iterator[Any]
 
 
 def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
-    """Write one recording, of lists of packed ticks or messages. Raises :class:`OSError`; what was written stays."""
+    """Write one recording, from lists of packed ticks or messages. Raises :class:`OSError`; written data is kept."""
     requests = read_ahead(requests)
     setup = next((request for request in requests if request is not None), None)
     if not isinstance(setup, RecordingSetup):
-        return  # there was no run
+        return  # There was no run.
     about = setup.about
-    if about.realtime:  # another loop may wait for this process
+    if about.realtime:  # In simulated time, the loop may wait for this process.
         with suppress(OSError):
             os.nice(_NICENESS)
     encoder = None
