@@ -1,1 +1,1 @@
-"""The controller beside public ones: times of a tick, and two-armed work motions."""
+"""Comparison of the controller with public ones: times of a tick, and two-armed work motions."""

@@ -1,7 +1,7 @@
-"""One controller in one work motion, with its figures, and the bench of ours and peers, which take turns.
+"""Run one controller in one work motion and compute its figures, and run the bench of our controller and its peers.
 
-All get the same cell, limits, targets and ticks, in one process. Peers run open loop as ours does, with targets ahead
-of time by what they would lag. Beside ours stands ours in free air: the difference is the cost of the pairs.
+All controllers get the same cell, limits, targets and ticks, in one process. Peers run open loop like ours, with
+targets ahead of time by their lag. Our controller also runs in free air. The difference is the cost of the pairs.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 DT = 0.001  # [s]
-ARRIVED = 0.01  # from the goal [m]
-PATIENCE = 3.0  # with a controller: how many times the motion's own time it may take
-JOLT = 5.0  # change of a joint's acceleration from one tick to the next [rad/s^2]
-_TAIL = 0.5  # [s]
-_SHORTEST_DT = 1e-9  # a tick that moves nothing [s]
-_DISTANCE_TICKS = 4  # between postures whose distances are measured, but near the nearest
+ARRIVED = 0.01  # A tool within this distance of its goal has arrived [m].
+PATIENCE = 3.0  # Longest time that a controller may take, as a multiple of the motion's own time.
+JOLT = 5.0  # A larger change of a joint's acceleration in one tick is a jolt [rad/s^2].
+_TAIL = 0.5  # Duration at the end over which the acceleration at rest is computed [s].
+_SHORTEST_DT = 1e-9  # Duration of a tick that moves nothing [s].
+_DISTANCE_TICKS = 4  # Ticks between postures whose distances are measured. Near the nearest one, all are measured.
 
 
 class OwnController:
     """:class:`CartesianController` as a :class:`BenchController`.
 
-    It has a cell's settings but the time limit, so that a slow machine computes the same motion.
+    It has the settings of a cell without the time limit, so that a slow machine computes the same motion.
     """
 
     limitations = ""
@@ -42,7 +42,7 @@ class OwnController:
     def __init__(self, robot: Robot, config: Config, name: str = "q2r2_control") -> None:
         self.name = name
         self._controller = CartesianController(robot, config.control.timed(realtime=False))
-        # Of each tick since the reset: whether the certified stop was executed, and whether some QP was not solved.
+        # For each tick since the reset, whether the certified stop was executed, and whether some QP was not solved.
         self.stopped: list[bool] = []
         self.unsolved: list[bool] = []
 
@@ -58,26 +58,32 @@ class OwnController:
         return reference.q, reference.v
 
     def hold(self) -> tuple[Array, Array]:
-        """Only called after a step that raised, which the contract forbids."""
+        """Return the same positions at rest. This follows only a step that raised, which the contract forbids."""
         reference = self._controller.step({}, _SHORTEST_DT)
         return reference.q, np.zeros_like(reference.v)
 
 
 def without_pairs(config: Config) -> Robot:
-    """The robot of a cell in free air: no pair is monitored, so that the arms go through each other and all else."""
+    """Return the robot of a cell in free air: no pair is monitored, so that the arms can move through everything."""
     robot = Robot.from_config(config)
     robot.collision_model.removeAllCollisionPairs()
     return robot
 
 
 def rest_acceleration(v: Array, dt: float) -> float:
-    """RMS over the last 0.5 s of velocities (n, nv) [rad/s], of the acceleration's norm over the joints [rad/s^2]."""
+    """Return the RMS of the acceleration's norm over the joints [rad/s^2] in the last 0.5 s.
+
+    ``v`` (n, nv) are the velocities [rad/s].
+    """
     a = np.diff(v, axis=0, prepend=0.0)[-round(_TAIL / dt) :] / dt
     return float(np.sqrt(np.mean(np.sum(a**2, axis=1))))
 
 
 def count_jolts(v: Array, dt: float, since: float) -> int:
-    """From ``since`` [s] on, ticks of velocities (n, nv) [rad/s] that change an acceleration by over :data:`JOLT`."""
+    """Count the ticks after ``since`` [s] in which an acceleration changes by more than :data:`JOLT`.
+
+    ``v`` (n, nv) are the velocities [rad/s].
+    """
     a = np.diff(v, axis=0, prepend=0.0) / dt
     changes = np.abs(np.diff(a, axis=0)).max(axis=1)
     return int((changes[round(since / dt) :] > JOLT).sum())
@@ -85,34 +91,34 @@ def count_jolts(v: Array, dt: float, since: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class MotionFigures:
-    """One controller in one motion, from the end of the approach on. None where it did not get that far."""
+    """Figures of one controller in one motion after the approach. A figure is None if the run ended before it."""
 
     motion: str
     controller: str
-    done: float  # share of the ticks, 1 unless the controller was too slow to wait for
-    ticks: int = 0  # measured
-    failures: int = 0  # of these: exception, no solution, not finite
-    rms_error_mm: float | None = None  # of the tool with the larger one, until the rest begins
-    max_error_mm: float | None = None  # of either tool, until the rest begins
-    end_error_mm: float | None = None  # of either tool, at the end
-    arrival_s: float | None = None  # since the motion began, to within 10 mm of the goal for good; also None: no goal
-    fallback_percent: float | None = None  # of the ticks; None: a peer, which has none
-    min_distance_mm: float | None = None  # of the monitored pairs, by Coal
+    done: float  # Share of the ticks; less than 1 if the controller was too slow.
+    ticks: int = 0  # Measured ticks.
+    failures: int = 0  # Measured ticks with an exception, no solution, or numbers that are not finite.
+    rms_error_mm: float | None = None  # Until the rest begins, of the tool with the larger error.
+    max_error_mm: float | None = None  # Until the rest begins, of either tool.
+    end_error_mm: float | None = None  # At the end, of either tool.
+    arrival_s: float | None = None  # From the motion's begin until both tools stay within 10 mm of the goal, if any.
+    fallback_percent: float | None = None  # Share of ticks with the certified stop; None for a peer, which has none.
+    min_distance_mm: float | None = None  # Least distance of the monitored pairs, by Coal.
     closest_pair: tuple[str, str] | None = None
-    max_acceleration: float | None = None  # of a joint [rad/s^2]
-    rest_acceleration: float | None = None  # RMS over the last 0.5 s, norm over the joints [rad/s^2]
-    times_us: tuple[float, float, float] | None = None  # of a tick: median, p99, max
+    max_acceleration: float | None = None  # Largest acceleration of a joint [rad/s^2].
+    rest_acceleration: float | None = None  # See :func:`rest_acceleration` [rad/s^2].
+    times_us: tuple[float, float, float] | None = None  # Median, p99 and maximum of a tick.
 
 
 @dataclass(frozen=True, slots=True)
 class MotionRun:
-    """The ticks of a run, those of the approach first."""
+    """The ticks of a run. Those of the approach come first."""
 
     times: Array  # (n,) [s]
     q: Array  # (n, nv) [rad]
     v: Array  # (n, nv) [rad/s]
-    asked: list[dict[str, pin.SE3]]  # n
-    failed: Array  # (n,) bool
+    asked: list[dict[str, pin.SE3]]  # The targets of each tick.
+    failed: Array  # (n,) bool, whether the tick had no solution
 
 
 def run_motion(
@@ -125,7 +131,7 @@ def run_motion(
 def play_motion(controller: BenchController, robot: Robot, motion: WorkMotion, patience: float, dt: float) -> MotionRun:
     """Run ``motion`` from home. A tick without a solution leaves the arms where they are.
 
-    A controller that takes ``patience`` times the motion's own time of this process is not waited for any longer.
+    The run ends early if the process has used ``patience`` times the motion's own time.
     """
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     asked = [motion.targets(tick * dt, start) for tick in range(round(motion.ends / dt))]
@@ -141,7 +147,7 @@ def play_motion(controller: BenchController, robot: Robot, motion: WorkMotion, p
             try:
                 q[done], v[done] = controller.step(asked[done], dt)
                 solved = True
-            except Exception:  # each peer has exceptions of its own
+            except Exception:  # Each peer has its own exceptions.
                 solved = False
             times[done] = time.perf_counter() - began
             if not (solved and np.isfinite(np.sum(q[done]) + np.sum(v[done]))):
@@ -156,10 +162,9 @@ def play_motion(controller: BenchController, robot: Robot, motion: WorkMotion, p
 def figures_of(
     run: MotionRun, controller: BenchController, robot: Robot, motion: WorkMotion, dt: float
 ) -> MotionFigures:
-    """Figures of the ticks after the approach.
+    """Return the figures of the ticks after the approach.
 
-    ``robot`` says which pairs are measured, and may be another one than the controller's; its arms have to be left and
-    right.
+    ``robot`` defines the measured pairs, and may differ from the controller's. Its arms have to be left and right.
     """
     began, rests, ends = (round(time / dt) for time in (motion.begins, motion.rests, motion.ends))
     ticks, finished = len(run.q), len(run.q) == ends
@@ -191,7 +196,7 @@ def figures_of(
 
 
 def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tuple[Array, Array]:
-    """Distances (n, arms) [m] of the tools from their targets, and from their last targets, at each tick measured."""
+    """Return the distances (n, arms) of tools from their targets and from their last targets, by measured tick [m]."""
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     goal = motion.targets(motion.ends, start)
     tools = np.array([[robot.tool_pose(q, arm).translation for arm in goal] for q in run.q[began:]])
@@ -201,14 +206,17 @@ def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tup
 
 
 def arrival_time(to_goal: Array, dt: float) -> float | None:
-    """Time [s] from which on both tools stay at the goal; None if they are not there at the end."""
+    """Return the time after which both tools stay at the goal [s]; None if they are not there at the end."""
     away = np.flatnonzero((to_goal >= ARRIVED).any(axis=1))
     first = int(away[-1]) + 1 if len(away) else 0
     return first * dt if first < len(to_goal) else None
 
 
 def nearest_pair(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] | None]:
-    """Least distance [mm] over postures (n, nv) and its pair: every few of them first, then all around the nearest."""
+    """Return the least distance [mm] over postures (n, nv), and its pair.
+
+    Every few postures are measured first, then all postures around the nearest one.
+    """
     if not len(robot.collision_model.collisionPairs):
         return None, None
     coarse = range(0, len(q), _DISTANCE_TICKS)
@@ -221,33 +229,33 @@ def nearest_pair(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] 
 
 @dataclass(frozen=True, slots=True)
 class BenchRow:
-    """One motion: our controller in free air, ours, and the peers."""
+    """The figures of one motion: of our controller in free air, of ours in the cell, and of the peers."""
 
     motion: str
     about: str
-    reachable: bool  # whether both arms can be at all targets with every distance kept
+    reachable: bool  # Whether both arms can reach all targets with every distance kept.
     free_air: MotionFigures
-    figures: list[MotionFigures]  # ours first
+    figures: list[MotionFigures]  # Ours comes first.
 
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """All motions on one cell."""
+    """The figures of all motions in one cell."""
 
     cell: str
     pairs: int
     rounds: int
     rows: list[BenchRow]
-    notes: list[str]  # limitations of the peers, and which are not installed
+    notes: list[str]  # The limitations of the peers, and the peers that are not installed.
 
 
 def run_bench(
     config: Config, motions: Sequence[WorkMotion], peers: Sequence[str], rounds: int, progress: Callable[[str], None]
 ) -> BenchReport:
-    """Run ``motions``, which are made for ``config/dual_iiwa7.yaml``, with ours and with ``peers`` where installed.
+    """Run ``motions``, which are made for ``config/dual_iiwa7.yaml``, with our controller and installed ``peers``.
 
-    All controllers take turns, ``rounds`` times, since a machine's speed varies. Figures are those of the last round,
-    and times the medians over the rounds.
+    All controllers take turns for ``rounds`` rounds, because the speed of a machine varies. Figures are those of the
+    last round. Times are the medians over the rounds.
     """
     robot = Robot.from_config(config)
     free = OwnController(without_pairs(config), config, "free air")
@@ -267,7 +275,7 @@ def run_bench(
 
 
 def _over_rounds(runs: Sequence[MotionFigures]) -> MotionFigures:
-    """The last round's, with the medians of all times."""
+    """Return the figures of the last round, with the medians of all times."""
     times = [run.times_us for run in runs if run.times_us is not None]
     if not times:
         return runs[-1]

@@ -1,7 +1,7 @@
-"""The same motion with one QP solver after another, in one process: what each costs, and how far it leads from DAQP's.
+"""Run the same motion with one QP solver after another, in one process, and compare times and motions with DAQP's.
 
-The motion is the bench's contact: both tools are sent where they cannot get, so that rows and box bind at nearly every
-tick. Every solver gets the same cell, targets and ticks. None has a time limit.
+The motion is the contact motion of the bench. Both tools are sent to places that they cannot reach, so that rows and
+box bind at nearly every tick. Every solver gets the same cell, targets and ticks. No solver has a time limit.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ SOLVERS = (DAQP, "osqp", "quadprog", "proxqp", "piqp", "clarabel", "scs", "highs
 CONTACT = TIMED_MOTIONS[1]
 DT = 0.002  # [s]
 INSTALL = "pip install 'qpsolvers[open-source-solvers]'"
-_PATIENCE = 3.0  # with a solver: how many times the motion's own time it may take
+_PATIENCE = 3.0  # Longest time that a solver may take, as a multiple of the motion's own time.
 
 
 @dataclass(frozen=True, slots=True)
 class SolverFigures:
-    """One solver in the motion."""
+    """The figures of one solver in the motion."""
 
     solver: str
-    unsolved_percent: float  # of the ticks
-    off_daqp_mm: float | None  # of the tool that is farthest from where DAQP leads it, at most; None: nothing was done
+    unsolved_percent: float  # Share of ticks with an unsolved QP.
+    off_daqp_mm: float | None  # Largest distance of a tool from its position with DAQP; None without any tick.
     motion: MotionFigures
 
 
 @dataclass(frozen=True, slots=True)
 class SolverReport:
-    """All solvers in one motion."""
+    """The figures of all solvers in one motion."""
 
     cell: str
     motion: str
     dt: float  # [s]
-    figures: list[SolverFigures]  # DAQP's first
-    missing: list[str]  # names of solvers that are not installed
+    figures: list[SolverFigures]  # DAQP's come first.
+    missing: list[str]  # Names of solvers that are not installed.
 
 
 def run_solvers(
@@ -83,7 +83,7 @@ def _with_solver(config: Config, name: str) -> Config:
 
 
 def _apart_mm(run: MotionRun, other: MotionRun, robot: Robot) -> float | None:
-    """The largest distance between a tool's positions in this run and in the ``other`` one, at the same tick [mm]."""
+    """Return the largest distance between a tool's positions in this run and in the ``other`` one, at a tick [mm]."""
     ticks = min(len(run.q), len(other.q))
     if not ticks:
         return None

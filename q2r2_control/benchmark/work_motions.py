@@ -1,12 +1,12 @@
-"""Motions that two arms make at work, near each other, near the table and at the end of their reach.
+"""Work motions of two arms near each other, near the table and at the end of their reach.
 
-Made for ``config/dual_iiwa7.yaml``. Targets are functions of time and of the tools at the start alone, so that any
-controller can be asked for the same. Each motion begins with an approach from home, and ends with the targets held
-still for :data:`REST`. Tools keep their rotation, in which they point straight down, unless the motion says otherwise.
+The motions are made for ``config/dual_iiwa7.yaml``. Targets depend only on time and on the tools' start, so that every
+controller can get the same ones. Each motion begins with an approach from home, and ends with still targets for
+:data:`REST`. Tools keep their rotation, in which they point straight down, unless the motion says otherwise.
 
-How near is near: with both tools pointing down at one height, wrists keep 20 mm from each other down to 0.18 m between
-the tools. Pointing down, a tool gets 0.73 m away from its arm's mount (0.38 m above it). No arm then reaches the place
-where the other one's tool has its home.
+With both tools pointing down at one height, the wrists are 20 mm apart when the tools are 0.18 m apart. A tool that
+points down can get 0.73 m away from its arm's mount (0.38 m above it). In this rotation, no arm reaches the home of the
+other arm's tool.
 """
 
 from __future__ import annotations
@@ -23,47 +23,47 @@ from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.types import Array
 
 ARMS = ("left", "right")
-REST = 2.0  # with still targets at the end, unless a motion says otherwise [s]
-_LEG = 2.0  # of an approach, from place to place [s]
-_SETTLE = 0.5  # between the approach and the motion [s]
+REST = 2.0  # Time with still targets at the end, unless a motion has its own [s].
+_LEG = 2.0  # Time of an approach from one place to the next [s].
+_SETTLE = 0.5  # Time between the approach and the motion [s].
 
-# Positions of both tools in the world, (2, 3) [m], the left one's first. They are those of a motion by the time since
-# it began [s] and by where the tools are at home.
+# A function of the time since the motion began [s] and of the tools' positions at home. It returns the positions of
+# both tools in the world frame, (2, 3) [m], with the left one first.
 Path = Callable[[float, Array], Array]
-Stop = Array | Callable[[Array], Array]  # places (2, 3) [m], or such by where the tools are at home
+Stop = Array | Callable[[Array], Array]  # Positions (2, 3) [m], or a function of the tools' positions at home.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorkMotion:
-    """Targets of both tools over time."""
+    """The targets of both tools over time."""
 
     name: str
     about: str
-    duration: float  # between approach and rest [s]
+    duration: float  # Time between approach and rest [s].
     path: Path
-    approach: tuple[Array, ...] = ()  # places (2, 3) on the way from home [m]; the last is where the motion begins
-    tilt: tuple[float, float] = (0.0, 0.0)  # turn of each tool about the world's x, kept from the approach on [rad]
-    has_goal: bool = False  # whether arriving at the last targets is what it is about
-    reachable: bool = True  # whether both arms can be at all targets with every distance kept
-    rest: float = REST  # with still targets at the end [s]
+    approach: tuple[Array, ...] = ()  # Positions (2, 3) on the way from home to the begin of the motion [m].
+    tilt: tuple[float, float] = (0.0, 0.0)  # Turn of each tool about the world's x, kept after the approach [rad].
+    has_goal: bool = False  # Whether the purpose is to arrive at the last targets.
+    reachable: bool = True  # Whether both arms can reach all targets with every distance kept.
+    rest: float = REST  # Time with still targets at the end [s].
 
     @property
     def begins(self) -> float:
-        """End of the approach, from which on the motion is measured [s]."""
+        """The time at which the approach ends and the measured motion begins [s]."""
         return _LEG * len(self.approach) + _SETTLE
 
     @property
     def rests(self) -> float:
-        """From when on the targets are still [s]."""
+        """The time after which the targets are still [s]."""
         return self.begins + self.duration
 
     @property
     def ends(self) -> float:
-        """Time in all [s]."""
+        """The total time [s]."""
         return self.rests + self.rest
 
     def targets(self, t: float, start: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
-        """Tool poses that are asked for at ``t`` [s], by those at the start; both in the world frame."""
+        """Return the target poses of the tools at ``t`` [s]; ``start`` has their first poses. Both are in the world."""
         home = np.array([start[arm].translation for arm in ARMS])
         turned = 1.0
         if t >= self.begins:
@@ -82,9 +82,9 @@ class WorkMotion:
 
 
 def motions_named(names: Iterable[str]) -> tuple[WorkMotion, ...]:
-    """The motions of :data:`WORK_MOTIONS` of these names, in its order; ``carry`` stands for all ``carry-...``.
+    """Return the motions of :data:`WORK_MOTIONS` with these names, in its order; ``carry`` means all ``carry-...``.
 
-    Raises :class:`ConfigError` for a name that is neither.
+    Raises :class:`ConfigError` for an unknown name.
     """
     chosen: set[str] = set()
     for name in names:
@@ -103,7 +103,7 @@ def _to(
     tilt: tuple[float, float] = (0.0, 0.0),
     reachable: bool = False,
 ) -> WorkMotion:
-    """A motion with a goal, straight from stop to stop, in the time [s] beside each."""
+    """Return a motion with a goal, straight from stop to stop. Each stop has its time of travel [s]."""
 
     def path(t: float, home: Array) -> Array:
         here = approach[-1] if approach else home
@@ -119,7 +119,7 @@ def _to(
 
 
 def _uniform(t: float, way: float, speed: float, ramp: float) -> float:
-    """How far along a ``way`` at a ``speed`` that is reached, and left, within the time ``ramp``."""
+    """Return the distance at ``t`` along a ``way`` at a ``speed``, with the time ``ramp`` to speed up and to stop."""
     duration = way / speed + ramp
     if t < ramp:
         return 0.5 * speed * t**2 / ramp
@@ -128,13 +128,16 @@ def _uniform(t: float, way: float, speed: float, ramp: float) -> float:
     return speed * (t - 0.5 * ramp)
 
 
-_CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04  # x and z [m], of x, of z [m]
-_CARRY_RAMP = 0.5  # [s]
-_LEAST_GAP = 0.18  # between tools at one height, for wrists 20 mm apart [m]
+_CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04  # Centre x and z, radius in x, rise in z [m].
+_CARRY_RAMP = 0.5  # Time to reach the speed, and to stop [s].
+_LEAST_GAP = 0.18  # Distance between tools at one height at which wrists are 20 mm apart [m].
 
 
 def carry(gap: float, speed: float, shortest: float = 3.0) -> WorkMotion:
-    """Both tools, ``gap`` [m] apart, go round at ``speed`` [m/s], in whole laps of at least ``shortest`` [s] in all."""
+    """Return a motion of both tools in laps at ``speed`` [m/s], ``gap`` [m] apart.
+
+    The number of laps is the least whole number that takes ``shortest`` [s] or more.
+    """
     rate = speed / _CARRY_RADIUS
     turn = 2.0 * math.pi * max(1, math.ceil(shortest * rate / (2.0 * math.pi)))
 
@@ -155,7 +158,7 @@ def carry(gap: float, speed: float, shortest: float = 3.0) -> WorkMotion:
 
 
 def _between_tools(home: Array, gap: float) -> Array:
-    """Both tools moved sideways to the middle, ``gap`` [m] apart."""
+    """Return the positions of both tools moved sideways to the middle, ``gap`` [m] apart."""
     return np.column_stack((home[:, 0], 0.5 * gap * np.sign(home[:, 1]), home[:, 2]))
 
 
@@ -168,41 +171,41 @@ def _swapped(home: Array) -> Array:
 
 
 def _ahead(home: Array) -> Array:
-    """Straight ahead to 0.80 m; 0.73 m can be reached."""
+    """Return positions 0.80 m straight ahead, of which 0.73 m can be reached."""
     return np.column_stack((np.full(2, 0.80), home[:, 1:]))
 
 
 def _met(home: Array) -> Array:
-    """In the middle, 30 mm nearer than each can."""
+    """Return positions in the middle, 30 mm nearer than each tool can get."""
     return _between_tools(home, 0.12)
 
 
-# Side by side, and past each other: the left tool behind the right one's arm, above its elbow's way.
+# Side by side, and past each other, with the left tool behind the right arm and above the path of its elbow.
 _APART = np.array([(0.30, 0.25, 0.40), (0.58, -0.25, 0.26)])
 _PAST = np.array([(0.30, -0.05, 0.40), (0.58, 0.05, 0.26)])
-# At one depth, where the tools cannot pass.
+# At the same x, so that the tools cannot pass each other.
 _FACING = np.array([(0.44, 0.25, 0.33), (0.44, -0.25, 0.33)])
 _CROSSED = np.array([(0.44, -0.05, 0.33), (0.44, 0.05, 0.33)])
 _BEFORE_REACHING = np.array([(0.50, 0.05, 0.47), (0.50, -0.25, 0.30)])
 _REACHED_UNDER = np.array([(0.50, 0.05, 0.47), (0.50, 0.08, 0.30)])
-_PASSING = 2.0  # [s]
+_PASSING = 2.0  # Time of travel to a stop [s].
 _THROUGH = ((_PASSING, _CROSSED), (_PASSING, _PAST))
 
 
 def _oscillate(t: float, home: Array) -> Array:
-    """Sideways at 0.5 Hz, from home until the targets are 0.06 m apart, and back."""
+    """Return targets that swing sideways at 0.5 Hz between home and positions 0.06 m apart."""
     share = 0.5 * (1.0 - math.cos(math.pi * t))
     return home + share * (_between_tools(home, 0.06) - home)
 
 
-_SLIDING_HEIGHT = 0.2045  # 10 mm lower than the millimetre that fingers keep from the table allows [m]
-_SLIDE_FROM = (0.50, 0.40)  # x and y [m]
-_SLIDE_WAY, _SLIDE_SPEED, _SLIDE_RAMP = 0.3, 0.2, 0.2  # [m], [m/s], [s]
+_SLIDING_HEIGHT = 0.2045  # 10 mm lower than allowed: fingers keep 1 mm from the table [m].
+_SLIDE_FROM = (0.50, 0.40)  # Start x and y [m].
+_SLIDE_WAY, _SLIDE_SPEED, _SLIDE_RAMP = 0.3, 0.2, 0.2  # Distance [m], speed [m/s], time to speed up and to stop [s].
 _RIGHT_ASIDE = (0.50, -0.25, 0.38)
 
 
 def _slide(t: float, home: Array) -> Array:
-    """The left tool sideways over the table; the right one stays aside."""
+    """Return the left tool's target that slides sideways over the table, and a right one that stays aside."""
     y = _SLIDE_FROM[1] - _uniform(t, _SLIDE_WAY, _SLIDE_SPEED, _SLIDE_RAMP)
     return np.array([(_SLIDE_FROM[0], y, _SLIDING_HEIGHT), _RIGHT_ASIDE])
 
@@ -242,7 +245,7 @@ def _circle(t: float, home: Array) -> Array:
     return home + np.array([0.0, 0.1 * math.sin(phase), 0.1 * (1.0 - math.cos(phase))])
 
 
-# Those that ticks are timed in.
+# The motions in which ticks are timed.
 TIMED_MOTIONS = (
     WorkMotion("free motion", "circles of 0.1 m radius at 0.5 Hz in free space", 3.0, _circle, rest=0.0),
     WorkMotion(

@@ -1,4 +1,4 @@
-"""Answers to the questions of a command, kept until it ends well: the next try offers them instead of its guesses."""
+"""Answers to the questions of a command. They are kept until it succeeds, so that the next try offers them again."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ Answer = TypeVar("Answer", float, str)
 
 
 class RememberedAnswers:
-    """Asks at a terminal, and keeps the answers that are not what was offered in a ``file``.
+    """Asks at a terminal, and keeps the answers that differ from the proposed ones in a ``file``.
 
-    ``about`` says what the questions are about. Answers about something else are not offered. With ``yes`` nothing is
-    asked, offered or kept.
+    ``about`` names the subject of the questions, such as models. Kept answers about another subject are not offered.
+    With ``yes`` nothing is asked, offered or kept.
     """
 
     def __init__(self, file: Path, about: Mapping[str, str], yes: bool = False) -> None:
         self.file, self._about, self._yes = file, dict(about), yes
         self._answers: dict[str, float | str] = {}
         if not yes:
-            with suppress(OSError, ValueError, TypeError, KeyError):  # a file that says nothing of use
+            with suppress(OSError, ValueError, TypeError, KeyError):  # The file may be missing or useless.
                 kept = json.loads(file.read_text(encoding="utf-8"))
                 if kept["about"] == self._about:
                     self._answers = dict(kept["answers"])
@@ -35,7 +35,7 @@ class RememberedAnswers:
         return bool(self._answers)
 
     def ask(self, question: str, usual: Answer) -> Answer:
-        """The answer to a question; the answer of the earlier try is offered, or else ``usual``."""
+        """Ask a question, and return its answer. The answer of the earlier try is offered, or else ``usual``."""
         if self._yes:
             return usual
         earlier = self._answers.get(question)
@@ -43,13 +43,13 @@ class RememberedAnswers:
         offered = earlier if isinstance(earlier, kind) else usual
         answer: Any = typer.prompt(question, default=offered, type=kind)
         self._answers.pop(question, None)
-        if answer != usual:  # what was accepted as it was found is found anew
+        if answer != usual:  # An answer equal to ``usual`` need not be kept: the next try finds it again.
             self._answers[question] = answer
         self._keep()
         return cast(Answer, answer)
 
     def forget(self) -> None:
-        """Remove the file, since the command ended well."""
+        """Remove the file, because the command succeeded."""
         with suppress(OSError):
             self.file.unlink(missing_ok=True)
 
@@ -57,6 +57,6 @@ class RememberedAnswers:
         if not self._answers:
             self.forget()
             return
-        with suppress(OSError):  # the answers count all the same
+        with suppress(OSError):  # Without the file, the answers are still valid for this try.
             kept = {"about": self._about, "answers": self._answers}
             self.file.write_text(json.dumps(kept, indent=4, ensure_ascii=False), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The ``q2r2`` command: what all commands of the table in ``commands`` share."""
+"""The ``q2r2`` command, with everything that all commands of the table in ``commands`` share."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from typer.core import TyperGroup
 from q2r2_control.cli.commands import COMMANDS, CommandOnDemand
 from q2r2_control.errors import ConfigError, Q2R2Error
 
-# typer raises its own copy of click's exceptions, or click's, depending on its version; this is the root of either.
+# Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of either.
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
 
 class ErrorHandlingGroup(TyperGroup):
-    """All commands; Ctrl-C ends them in exit code 130, bad usage and :class:`Q2R2Error` in 2.
+    """All commands. Ctrl-C ends them with exit code 130, bad usage and :class:`Q2R2Error` with 2.
 
-    Each fault is a line on stderr.
+    Each fault is one line on stderr.
     """
 
     def __init__(self, **attributes: Any) -> None:
@@ -34,7 +34,7 @@ class ErrorHandlingGroup(TyperGroup):
             self.add_command(CommandOnDemand(command))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands into the help, each group under its heading."""
+        """Write the commands into the help, with each group under its heading."""
         for group, commands in groupby(COMMANDS, key=attrgetter("group")):
             with formatter.section(group):
                 formatter.write_dl([(command.name, command.about) for command in commands])
@@ -70,16 +70,16 @@ app = typer.Typer(
 
 
 class _StderrHandler(logging.Handler):
-    """Writes to the stderr of that moment, so that lines appear above a live table and not across it."""
+    """Writes to the current ``sys.stderr``, so that lines appear above a live table and not across it."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        with suppress(OSError):  # the terminal is gone
+        with suppress(OSError):  # The terminal may be closed.
             print(self.format(record), file=sys.stderr)
 
 
 def _print_version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version  # which takes as long as all other help
+        from importlib.metadata import version  # This import takes as long as the rest of the help.
 
         print(f"q2r2 {version('q2r2_control')}")
         raise typer.Exit

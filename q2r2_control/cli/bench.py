@@ -1,4 +1,4 @@
-"""``q2r2 bench``: the controller beside public ones; ``q2r2 soak``: all its promises under hostile input."""
+"""``q2r2 bench``: compare the controller with public ones. ``q2r2 soak``: check its promises under hostile input."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def bench(
 
 
 def bench_table(report: BenchReport) -> Table:
-    """A row for each controller under each motion."""
+    """Return a table with a row for each controller under each motion."""
     return figure_table(
         f"{report.cell}: ticks of 1 ms, {report.pairs} pairs, rounds: {report.rounds}",
         (
@@ -91,7 +91,7 @@ def bench_table(report: BenchReport) -> Table:
 
 
 def solver_table(report: SolverReport) -> Table:
-    """A row for each solver."""
+    """Return a table with a row for each solver."""
     return figure_table(
         f"{report.cell}: {report.motion}, ticks of {1e3 * report.dt:g} ms, by QP solver",
         ("solver", "p50 [us]", "p99 [us]", "unsolved [%]", "off DAQP's [mm]", "near [mm]", "rest [s-2]"),
@@ -175,7 +175,7 @@ def soak(
 
 
 def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
-    """Worst margin of every promise, and how often it was broken."""
+    """Yield the worst margin of every promise, and how often it was broken."""
     for margin in report.margins:
         name = Text(margin.name, style="red" if margin.violations else "")
         worst = "" if math.isinf(margin.worst) and not margin.violations else f"{margin.worst:.2g} {margin.unit}"
@@ -186,7 +186,7 @@ def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
 
 
 def _soak_notes(report: SoakReport, options: str) -> Iterator[str]:
-    """Counts, the first time of each broken promise, and the command with ``options`` that shows it again."""
+    """Yield counts, the first break of each promise, and the command with ``options`` that repeats the first one."""
     counted = COUNTED if "resets" in report.counts else POLICY_COUNTED
     yield ", ".join(f"{report.counts[name]} {what}" for name, what in counted.items())
     for found in report.broken:

@@ -1,4 +1,4 @@
-"""The parts of a cell, and its faults, found before anything moves."""
+"""Report the parts of a cell and its faults before anything moves."""
 
 from __future__ import annotations
 
@@ -32,64 +32,65 @@ from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.types import DeviceControls
 
 _NEAREST = 8
-_TICKS = 300  # that are timed
+_TICKS = 300  # Number of timed ticks.
 
 
-# Positions in rad (m for a sliding joint), velocity per second, torque in Nm (N).
+# Figures of a joint: positions in rad, velocity in rad/s, torque in Nm; for a sliding joint m, m/s and N.
 _JOINT = ("name", "lower", "home", "upper", "velocity", "torque")
 
 
 @dataclass(frozen=True, slots=True)
 class ArmCheck:
-    """One arm; ``tool_position`` [m] is in the world, at home."""
+    """One arm. ``tool_position`` [m] is in the world frame, at home."""
 
     name: str
     model: str
-    flange: str | None  # model, or sizes
+    flange: str | None  # Model or sizes of the flange.
     tool_model: str | None
     tool_frame: str
     tool_position: list[float]
-    joints: list[dict[str, Any]]  # the figures of _JOINT by name
-    object: str | None  # what its gripper is to hold, which is part of the tool then
+    joints: list[dict[str, Any]]  # The figures of _JOINT by name.
+    object: str | None  # The object that its gripper shall hold, as a part of the tool.
 
 
 @dataclass(frozen=True, slots=True)
 class KeptPair(PairDistance):
-    """Distance of a monitored pair at home, and the one that it keeps [m]."""
+    """The distance of a monitored pair at home, and the least distance that it keeps [m]."""
 
     kept: float
 
 
 @dataclass(frozen=True, slots=True)
 class CellCheck:
-    """A cell as the controller sees it. Distances in metres, at home; ``faults`` are empty for a good cell."""
+    """A cell as the controller sees it. Distances are in metres, at home; ``faults`` are empty for a good cell."""
 
     name: str
     arms: list[ArmCheck]
     obstacles: dict[str, ObstacleConfig]
-    floor: float | None  # height [m]
+    floor: float | None  # Height of the floor [m].
     monitored_pairs: int
-    ignored_pairs: tuple[tuple[str, str], ...]  # overlap by construction
+    ignored_pairs: tuple[tuple[str, str], ...]  # Pairs that overlap by construction.
     min_distance: float
-    contacts: tuple[ContactPair, ...]  # that may touch, in torque mode
-    nearest: list[KeptPair]  # nearest first
+    contacts: tuple[ContactPair, ...]  # Pairs that may touch in torque mode.
+    nearest: list[KeptPair]  # The nearest pairs, the nearest first.
     faults: tuple[str, ...]
     remedies: list[str]  # Lines to paste into the YAML for these pairs, with comments that say where.
-    stop_torques: tuple[StopTorque, ...]  # by arm
-    driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
-    controls: dict[str, str]  # what those of each hand do
-    notes: list[str]  # a line for each thing that a user should know of and that is no fault
-    verdict: str  # whether the cell can run
+    stop_torques: tuple[StopTorque, ...]  # One for each arm.
+    driven: dict[str, str]  # By arm, the output to an external controller; empty for the built-in controller.
+    controls: dict[str, str]  # The actions of each hand's controls.
+    notes: list[str]  # Lines that a user should know, but that are not faults.
+    verdict: str  # One line that says whether the cell can run.
 
 
 def check_cell(config: Config) -> CellCheck:
-    """Build the cell and look at it at home. Raises :class:`Q2R2Error` where it cannot be built."""
+    """Build the cell and check it at home; raises :class:`Q2R2Error` if it cannot be built."""
     controls = getattr(load_class(INPUTS, config.input), "controls", None)
-    if isinstance(controls, DeviceControls):  # otherwise only a device that is connected knows them
+    if isinstance(controls, DeviceControls):  # Other devices know their controls only when connected.
         config.teleop.bindings.check_device(controls)
     load_class(PLANTS, config.plant)
     robot = Robot.from_config(config)
-    # With what may touch too, so that every name and number is checked; what is kept is that of position mode.
+    # The settings include pairs that may touch, so that each name and number is checked. Kept distances are those of
+    # position mode.
     check_settings(robot, config.control)
     settings = config.control.without_contact()
     kept = kept_distances(robot, settings)
@@ -109,7 +110,7 @@ def check_cell(config: Config) -> CellCheck:
     for allowed in config.control.contact_allowed:
         inside = f"the reference gets inside by up to {1e3 * allowed.depth:g} mm at {1e3 * allowed.speed:g} mm/s"
         notes.append(f"{' and '.join(allowed.pair)} may touch in torque mode: {inside}")
-    # Without a controller, whose kernels take minutes to compile: at rest its certificate says no more than this.
+    # No controller is built, because its kernels take minutes to compile. At rest its certificate would add nothing.
     faults = (*preflight_faults(robot, settings, None), *_plant_faults(config, robot))
     return CellCheck(
         name=config.name,
@@ -132,14 +133,14 @@ def check_cell(config: Config) -> CellCheck:
 
 
 def verdict_on(faults: Sequence[str]) -> str:
-    """One line that says whether a cell with these ``faults`` can run."""
+    """Return one line that says whether a cell with these ``faults`` can run."""
     number = f"{len(faults)} fault{'s' * (len(faults) > 1)}"
     return f"this cell cannot run: {number}" if faults else "this cell can run"
 
 
 def _plant_faults(config: Config, robot: Robot) -> list[str]:
-    """Why the simulation of a run cannot be made, such as an inertia that no body has."""
-    if config.plant != "mujoco":  # others may hold a device, which no check may take
+    """Return why the simulation cannot be built, for example because of an impossible inertia."""
+    if config.plant != "mujoco":  # Other plants may open a device, which a check must not do.
         return []
     try:
         make_plant(config.plant, robot, config).close()
@@ -149,7 +150,7 @@ def _plant_faults(config: Config, robot: Robot) -> list[str]:
 
 
 def _notes_on_models(config: Config) -> list[str]:
-    """Lines on what the models say, and a user should look at."""
+    """Return the notes of the models that a user should read."""
     if config.robot is not None:
         return [f"robot: {note}" for note in load_model(config.robot, config.packages, "robot").notes]
     arms = {side: load_model(arm, config.packages, f"arms.{side}") for side, arm in config.arms.items()}
@@ -157,10 +158,10 @@ def _notes_on_models(config: Config) -> list[str]:
 
 
 def _capsules_note(config: Config, robot: Robot) -> str:
-    """How many shapes stand for the meshes of links that have several, and what they cost."""
+    """Return how many shapes replace the meshes of some links, and their cost in pairs and in time of a tick."""
     names = [link_of(item.name) for item in robot.collision_model.geometryObjects]
     shapes = ", ".join(f"{link} {names.count(link)}" for link in config.capsules)
-    settings = config.control.model_copy(update={"pairs": ()})  # that need not be pairs without these shapes
+    settings = config.control.model_copy(update={"pairs": ()})  # These may be no pairs without the shapes.
     costs = []
     for its in (robot, Robot.from_config(config.model_copy(update={"capsules": {}, "control": settings}))):
         with notice_of_compiling():
@@ -174,7 +175,7 @@ def _capsules_note(config: Config, robot: Robot) -> str:
 
 
 def _stop_note(stop: StopTorque) -> str:
-    """Which joint of an arm is asked for more torque than it has, how often, and what helps."""
+    """Return which joint of an arm needs more torque than its limit, how often, and how to change that."""
     if stop.gravity.ratio > 1.0:
         worst, where = stop.gravity, "at rest, by gravity alone"
         helps = "the model's torque limits, masses and position limits"

@@ -1,4 +1,4 @@
-"""A run as the command line offers it: pipeline, live table, window, recording."""
+"""A run as the command line offers it, with pipeline, live table, window and recording."""
 
 from __future__ import annotations
 
@@ -49,22 +49,22 @@ from q2r2_control.viewer.state_colours import obstacle_colour
 from q2r2_control.viewer.tables import print_table
 from q2r2_control.viewer.web.view import PageView
 
-_PERIOD = 1.0 / 30.0  # [s]
-_ON_PAGE, _IN_HEADSET = 5.0, 30.0  # pictures of all cameras a second
+_PERIOD = 1.0 / 30.0  # Period at which the window is drawn [s].
+_ON_PAGE, _IN_HEADSET = 5.0, 30.0  # Pictures per second, of all cameras on a page and of one camera in a headset.
 
 
 def check_window(plant: str | None) -> None:
-    """Raises :class:`ConfigError` for a plant without a window."""
+    """Raise :class:`ConfigError` for a plant without a window."""
     if plant is None or not issubclass(load_class(PLANTS, plant), WindowedPlant):
         which = "without --plant there is no window" if plant is None else f"the {plant} plant has no window"
         raise ConfigError(f"--viewer: {which}; allowed: a plant that has one, as --plant mujoco")
 
 
 def show_window(pipeline: Pipeline) -> None:
-    """Open the window and keep it up to date while ``pipeline`` runs; closing the window ends the run.
+    """Open the window and keep it up to date while ``pipeline`` runs. Closing the window ends the run.
 
     Raises:
-        PlantError: There is no display.
+        PlantError: If there is no display.
     """
     plant, due = pipeline.plant, 0.0
     if not isinstance(plant, WindowedPlant):
@@ -86,30 +86,30 @@ def show_window(pipeline: Pipeline) -> None:
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """Choices of the command line."""
+    """The choices of the user on the command line."""
 
-    name: str  # of the run, for its recording's folder and title
+    name: str  # Name of the run, for the folder of its recording and for titles.
     input: str
     plant: str
     mode: str
-    duration: float | None  # [s]; None: until Ctrl-C
-    fast: bool  # simulated time as fast as it can, where it is otherwise paced by the clock
-    input_options: Mapping[str, object]  # by name, those that the input takes
-    table: bool
-    window: bool
-    real_time: bool  # ask the system for locked memory and SCHED_FIFO
-    force: bool = False  # run although q2r2 check finds faults
-    tasks: tuple[AssemblyTask, ...] = ()  # to be judged
-    steps: tuple[tuple[float, str], ...] = ()  # of scripted work, from when on [s], in words
-    record: Path | None = None  # folder of recordings
-    notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
-    anonymous: bool = False  # the recording says neither whose hands nor on which computer
-    longest_wait: float = SCRIPTS_WAIT_S  # for a plant that waits for a person, such as one at a cabinet [s]
-    page: tuple[str, int, Path | None] | None = None  # address of the page in the browser, and its certificate
+    duration: float | None  # Duration of the run [s]; None for a run until Ctrl-C.
+    fast: bool  # Whether simulated time runs as fast as possible, not paced by the clock.
+    input_options: Mapping[str, object]  # The options of the input, by name.
+    table: bool  # Whether a live table is shown.
+    window: bool  # Whether the plant's window is opened.
+    real_time: bool  # Whether to request locked memory and SCHED_FIFO from the system.
+    force: bool = False  # Whether to run although q2r2 check finds faults.
+    tasks: tuple[AssemblyTask, ...] = ()  # Tasks to be judged.
+    steps: tuple[tuple[float, str], ...] = ()  # Steps of scripted work, each with its begin [s] and its name.
+    record: Path | None = None  # Folder of recordings.
+    notes: Mapping[str, str] = field(default_factory=dict)  # Notes for the recording, by name.
+    anonymous: bool = False  # Whether the recording leaves out the operator and the computer's name.
+    longest_wait: float = SCRIPTS_WAIT_S  # Longest wait of a plant for a person, such as one at a cabinet [s].
+    page: tuple[str, int, Path | None] | None = None  # Host and port of the page in the browser, and its certificate.
 
     @property
     def simulated_time(self) -> bool:
-        """True if nothing outside keeps the time: neither a person's hands nor a plant that is real."""
+        """True if the run needs no real time, because neither a person's hands nor a real plant take part."""
         inputs = filter(None, (self.input, self.input_options.get("takeover")))
         is_simulated_plant = bool(getattr(load_class(PLANTS, self.plant), "simulated", False))
         return self.fast or (is_simulated_plant and all(is_simulated(str(name)) for name in inputs))
@@ -117,7 +117,7 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True)
 class CellRun:
-    """Results of a run."""
+    """The results of a run."""
 
     summary: RunSummary
     tasks: tuple[TaskResult, ...] = ()
@@ -130,13 +130,13 @@ class CellRun:
 
 
 def run_cell(config: Config, options: RunOptions) -> CellRun:
-    """Run a cell and tell about it on stderr. Raises :class:`Q2R2Error` where that is not possible as asked."""
+    """Run a cell and report on stderr; raises :class:`Q2R2Error` if it cannot run with these options."""
     if config.controller is ControllerKind.EXTERNAL:
         builtin = "this command runs controller: builtin only"
         raise ConfigError(f"{config.name}: controller: external is driven by q2r2 ros up; {builtin}")
     if options.window:
         check_window(options.plant)
-    # Processes before the pipeline, which takes longer to build than they take to start.
+    # The processes start before the pipeline is built, because building it takes longer than their start.
     if options.page is None:
         return _run_recorded(config, options, None)
     with PageView(*options.page) as page:
@@ -173,11 +173,11 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, pa
             faults = preflight_faults(robot, config.control.without_contact(), pipeline.controller)
         return _run_pipeline(pipeline, faults, options, recorder, page, console)
     finally:
-        plant.close()  # also where no run began: a window that is open brings the process down at its end
+        plant.close()  # Also if no run began: an open window would crash the process at its end.
 
 
 def _open_window(plant: Plant) -> None:
-    """Show the arms at home before the controller is built, which takes long where its kernels are compiled."""
+    """Show the arms at home before the controller is built, which takes long if its kernels have to be compiled."""
     if isinstance(plant, MujocoPlant):
         plant.launch_viewer()
         plant.viewer_say("preparing the controller")
@@ -217,7 +217,7 @@ def _run_pipeline(
 
 
 def print_summary(run: CellRun, json: bool, verbose: bool = False) -> None:
-    """Print a run on stdout: its verdict, those on its tasks and its recording, and figures; or one JSON object."""
+    """Print the verdicts on a run, its tasks and its recording, and its figures, on stdout; or one JSON object."""
     if json:
         data = run.summary.as_json()
         if run.tasks:
@@ -245,7 +245,7 @@ def _print_lines(console: Console, lines: Iterable[str]) -> None:
 
 
 def _recording_lines(recording: RecordingSummary) -> Iterator[str]:
-    """Lines of markup: where the run was recorded, and the verdicts on its episodes."""
+    """Yield lines of markup with the file of the recording and the verdicts on its episodes."""
     yield recording_line(recording)
     for one in _judge_recording(recording):
         which = "" if one.figures.part is None else f" on episode {one.figures.part}"
@@ -253,7 +253,7 @@ def _recording_lines(recording: RecordingSummary) -> Iterator[str]:
 
 
 def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
-    """Judge the file as it was written, and keep the verdicts beside it. A failure is one line on stderr."""
+    """Judge the written file, and keep the verdicts beside it. A failure is one line on stderr."""
     if recording is None or recording.file is None or not Path(recording.file).exists():
         return []
     try:
@@ -268,7 +268,7 @@ def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
 def _run(
     pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, page: PageView | None, console: Console
 ) -> RunSummary:
-    """Run with what is to be shown and recorded of it."""
+    """Run the pipeline with its table, window, pictures and recording."""
     with ExitStack() as stack:
         if options.window:
             show_window(pipeline)
@@ -297,7 +297,8 @@ def _run(
             recorder.record_outcome = pipeline.record_outcome
             notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
             given = options.input_options.items()
-            notes |= {name: str(value) for name, value in given if name != "fast"}  # which changes nothing of the run
+            # The option fast is left out, because it does not change the motion.
+            notes |= {name: str(value) for name, value in given if name != "fast"}
             about = About.of(pipeline, not options.simulated_time, notes, cameras)
             if options.anonymous:
                 about = replace(about, notes=anonymous(about.notes))
@@ -313,7 +314,7 @@ def _run(
 def _lookers(
     pipeline: Pipeline, page: PageView | None
 ) -> Iterator[tuple[str, float, Callable[[bytes], object], Callable[[], bool]]]:
-    """Cameras whose pictures are shown, how many a second at most, where, and whether somebody looks."""
+    """Yield each shown camera, its most pictures per second, where to show them, and whether somebody looks."""
     names, source = list(pipeline.config.simulated_cameras), pipeline.input
     if isinstance(source, DisplayInput):
         yield from ((name, _IN_HEADSET, source.show_picture, lambda: source.connected) for name in names[:1])

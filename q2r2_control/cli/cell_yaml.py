@@ -1,4 +1,4 @@
-"""The YAML that ``q2r2 new-cell`` writes, with a comment where a user may have to change something."""
+"""The YAML that ``q2r2 new-cell`` writes, with comments on the values that a user may have to change."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from q2r2_control.robot.robot import Robot
 
 
 def commented_yaml(data: Mapping[str, Any], robot: Robot) -> str:
-    """The YAML of a cell's ``data``, of which ``robot`` was made."""
+    """Return the YAML of a cell's ``data``, from which ``robot`` was built."""
     lines = [
         "# Written by q2r2 new-cell; change what is not true. config/dual_iiwa7.yaml explains every key.",
         f"name: {_flow(data['name'])}",
@@ -54,5 +54,5 @@ def commented_yaml(data: Mapping[str, Any], robot: Robot) -> str:
 
 
 def _flow(value: Any) -> str:
-    """A value as YAML on one line."""
+    """Return a value as YAML on one line."""
     return str(yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=math.inf)).strip()[1:-1]

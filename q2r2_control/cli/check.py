@@ -1,4 +1,4 @@
-"""``q2r2 check``: what a cell consists of, and what is wrong with it."""
+"""``q2r2 check``: print the parts of a cell and its faults."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from q2r2_control.viewer.tables import figure_table, print_table
 
 @dataclass(frozen=True, slots=True)
 class PairsWritten:
-    """Sampled approaches of the monitored pairs of links; distances in metres."""
+    """Sampled nearest approaches of the monitored pairs of links. Distances are in metres."""
 
     file: str
     samples: int
     clearance: float
-    never: tuple[PairReach, ...]  # farther apart than the clearance, farthest last
-    watched: tuple[PairReach, ...]  # the others, nearest found first
+    never: tuple[PairReach, ...]  # Pairs that stay farther apart than the clearance, the farthest last.
+    watched: tuple[PairReach, ...]  # The other pairs, the nearest first.
 
 
 def write_pairs(
@@ -37,7 +37,7 @@ def write_pairs(
 ) -> PairsWritten:
     """Sample which pairs of a cell can meet, and write those that cannot as an SRDF to a new ``file``.
 
-    Raises :class:`ConfigError` for a file that exists, and a clearance that is not above all distances in ``control``.
+    Raises :class:`ConfigError` if the file exists, or if the clearance is not above all distances in ``control``.
     """
     key, least = config.control.largest_distance
     if not least < clearance <= 1.0:
@@ -85,7 +85,7 @@ def check(
 
 @contextmanager
 def _verdict_on_refusal(file: str, json: bool) -> Iterator[None]:
-    """Print what is wrong with a cell that cannot even be built, and the verdict. Exit 2, as of all that is refused."""
+    """Print the faults of a cell that cannot even be built, and the verdict. The exit code is 2, as for all errors."""
     try:
         yield
     except Q2R2Error as error:
@@ -98,7 +98,7 @@ def _verdict_on_refusal(file: str, json: bool) -> Iterator[None]:
 
 
 def _print_cell(cell: CellCheck) -> None:
-    """Arms and what a stop asks of them, obstacles, the nearest pairs, and what the hands' controls do."""
+    """Print the arms, their torques in a stop, obstacles, the nearest pairs, and the actions of the hands' controls."""
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"cell {cell.name}")
     for table in _cell_tables(cell):

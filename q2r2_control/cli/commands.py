@@ -11,13 +11,13 @@ from typer.main import get_command
 
 
 class ListedCommand(NamedTuple):
-    """A command as the help of ``q2r2`` lists it, and where it is."""
+    """A command as the help of ``q2r2`` lists it, with the place of its function."""
 
     name: str
-    at: str  # module in this package, and the name of the function or Typer in it
-    about: str  # first sentence of the function's docstring
-    group: str = ""  # heading in the help
-    example: str = ""  # of a call, for a command that has no commands of its own
+    at: str  # Module in this package, and the name of the function or Typer in it.
+    about: str  # First sentence of the function's docstring.
+    group: str = ""  # Heading in the help.
+    example: str = ""  # Example of a call, for a command without subcommands.
 
 
 COMMANDS = (
@@ -146,19 +146,19 @@ COMMANDS = (
 
 
 class CommandOnDemand(TyperCommand):
-    """A command that the help knows by its line in the table; parsing its arguments imports it."""
+    """A command of which the help knows only its line in the table. Its module is imported to parse arguments."""
 
     def __init__(self, command: ListedCommand) -> None:
         super().__init__(command.name, help=command.about)
         self._command = command
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Parse ``args`` by the command itself, which the context that is returned leads to."""
+        """Parse ``args`` by the command itself, and return a context that calls it."""
         return load(self._command).make_context(info_name, args, parent, **extra)
 
 
 def load(command: ListedCommand) -> Any:
-    """Import a command; returns it as click knows it."""
+    """Import a command, and return it as click's type of command."""
     module, _, name = command.at.partition(":")
     found = getattr(import_module(f"{__package__}.{module}"), name)
     if not isinstance(found, Typer):

@@ -1,4 +1,4 @@
-"""``q2r2 commission``: two arms behind real cabinets, step by step, each with what must be seen before the next."""
+"""``q2r2 commission``: commission two arms behind real cabinets. Each step must pass before the next one begins."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, CommandMode
 from q2r2_control.viewer.tables import figure_table, print_table, record_table
 
-_MOST_LOST = 0.01  # of a cabinet's messages
-_POINTS = 3  # that both tips touch
-_GUIDED = 1.0  # a joint that was guided by hand has moved so far [deg]
+_MOST_LOST = 0.01  # Largest share of a cabinet's messages that may be lost.
+_POINTS = 3  # Number of points that both tips touch.
+_GUIDED = 1.0  # A joint that was guided by hand has moved by more than this [deg].
 _Measured = TypeVar("_Measured")
 
 
 class _Commissioning:
-    """The dialogue. Each step returns its figures, and raises :class:`Q2R2Error` where it is not passed."""
+    """The dialogue with the operator. Each step returns its figures; raises :class:`Q2R2Error` if it is not passed."""
 
     def __init__(self, file: Path, duration: float, tip: tuple[float, float, float]) -> None:
         self.file, self.config = file, load_config(file)
         self._duration, self._tip, self._console = duration, np.array(tip), Console(stderr=True)
         self._robot = Robot.from_config(self.config)
         self._plant = FriPlant(self._robot, self.config)
-        self.step = ""  # that goes on
+        self.step = ""  # The current step.
         self.seen: dict[str, Any] = {}
-        self._repeats = 0  # of measurements
+        self._repeats = 0  # Count of repeated measurements.
 
     def run(self, stack: ExitStack) -> None:
-        """All steps; what ``stack`` closes brings the arms to rest, or lets go of the cabinets."""
+        """Do all steps. ``stack`` closes the connection to the cabinets at the end."""
         self._plant.begin(CommandMode.POSITION)
         stack.callback(self._plant.close)
         self._do("cabinets", f"listens for {self._duration:g} s, and moves nothing", self._cabinets)
@@ -73,7 +73,7 @@ class _Commissioning:
         self._do("kill", "both tools go up for two seconds, and the program that leads them is killed", self._kill)
 
     def signed(self) -> dict[str, Any]:
-        """The sign-off, with the operator's name."""
+        """Ask for the operator's name, and return the sign-off."""
         self.step = "sign-off"
         name = ""
         while not name:
@@ -114,7 +114,7 @@ class _Commissioning:
         return {arm: self._guided(arm) for arm in self._robot.arms}
 
     def _guided(self, arm: str) -> dict[str, Any]:
-        """An arm whose joints an operator has seen change."""
+        """Let the operator guide an arm by hand and confirm its joints; return the changes."""
         joints = self._robot.arms[arm].joints
         names = [self._robot.joint_names[joint] for joint in joints]
         start = postures_over(self._plant, 0.1)[-1]
@@ -211,7 +211,7 @@ class _Commissioning:
         return [asdict(report) for report in reports]
 
     def _resting(self) -> Array:
-        """Where the arms rest, while nothing commands them (nv,) [rad]. Raises :class:`PlantError` where they move."""
+        """Return the posture (nv,) [rad] of arms that nothing commands; raises :class:`PlantError` if they move."""
         self._plant.reset()
         try:
             seen = postures_over(self._plant, REST)
@@ -222,7 +222,7 @@ class _Commissioning:
         return np.asarray(seen[-1])
 
     def _tried(self, measure: Callable[[], _Measured], run: SlowRun | None = None) -> _Measured:
-        """The result of ``measure``, which the operator may let try again: a cabinet may have ended its session."""
+        """Return the result of ``measure``. If it fails, for example by a lost session, the operator may repeat it."""
         while True:
             try:
                 return measure()
@@ -235,7 +235,7 @@ class _Commissioning:
                 self._repeats += 1
 
     def _ask(self, question: str, *allowed: str) -> str:
-        """A person's line, one of ``allowed``; without any, whatever it is."""
+        """Ask a person, and return the line, which is one of ``allowed`` if any are given."""
         say(f"{question} [{'/'.join(allowed)}]" if allowed else question, self._console)
         while line := sys.stdin.readline():
             answer = line.strip()
@@ -262,8 +262,8 @@ def commission(
     try:
         with ExitStack() as stack:
             stack.callback(logger.setLevel, logger.level)
-            logger.setLevel(logging.ERROR)  # the steps say what went wrong
-            # Without priority this thread could keep the loop waiting for Python's lock.
+            logger.setLevel(logging.ERROR)  # The steps report what went wrong.
+            # Without real-time priority this thread could hold Python's global lock while the loop waits for it.
             stack.enter_context(real_time())
             work.run(stack)
         signed = work.signed()

@@ -1,4 +1,4 @@
-"""``q2r2 doctor``: what this computer lacks, and the command that cures it."""
+"""``q2r2 doctor``: report what this computer lacks, with the command that helps."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def doctor(
 
 
 def _packages(required: Iterable[str]) -> Iterator[Finding]:
-    """Of the requirements in ``required``, those that are not met; extras aside."""
+    """Yield the requirements in ``required`` that are not met. Those of extras do not count."""
     for requirement in map(Requirement, required):
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
@@ -74,7 +74,7 @@ def _packages(required: Iterable[str]) -> Iterator[Finding]:
 
 
 def _ros() -> Iterator[Finding]:
-    """Nothing but the nodes needs ROS."""
+    """Yield what is missing for the ROS nodes. Nothing else needs ROS."""
     if importlib.util.find_spec("rclpy") is None:
         cure = f"pip install '{_PACKAGE}[ros]', or source a ROS 2 Jazzy, if you want them"
         yield Finding(False, "rclpy cannot be imported: no ROS nodes", cure)
@@ -83,7 +83,7 @@ def _ros() -> Iterator[Finding]:
 
 
 def _ports(cell: Config) -> Iterator[Finding]:
-    """Ports that the cell's input and plant listen on and that another program holds."""
+    """Yield the ports of the cell's input and plant on which this computer cannot listen."""
     wanted = [("headset", socket.SOCK_STREAM, cell.headset.host, cell.headset.port)]
     wanted += [(f"fri.{arm}", socket.SOCK_DGRAM, "0.0.0.0", its.port) for arm, its in cell.fri.items()]
     for key, kind, host, port in wanted:
@@ -98,12 +98,12 @@ def _ports(cell: Config) -> Iterator[Finding]:
 
 
 def _display(environment: Mapping[str, str]) -> Iterator[Finding]:
-    """MuJoCo's window needs one, nothing else."""
+    """Yield a finding if there is no display. Only MuJoCo's window needs one."""
     if not has_display(environment):
         yield Finding(False, "no display: no --viewer", "log in on the desktop or by ssh -X; a run without needs none")
 
 
 def _what_and_cure(note: str) -> tuple[str, str]:
-    """Of a note whose last part, after "; ", is the cure; a command in it has no "; "."""
+    """Split a note into the problem and its cure, which follows the last "; ". Commands in notes have no "; "."""
     what, _, cure = note.rpartition("; " if "; " in note else ": ")
     return what, cure

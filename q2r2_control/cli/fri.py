@@ -1,4 +1,4 @@
-"""``q2r2 fri-cabinet``: stands in for the cabinets of a cell, whose arms are simulated."""
+"""``q2r2 fri-cabinet``: simulate the cabinets of a cell and their arms."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
-_JUDGED_EVERY = 0.005  # tasks: seldom enough that no cabinet is late for it [s]
-_LOOKS, _LONGEST_LINES = 0.05, 1 << 16  # between two looks at what the cabinets' process has said [s, bytes]
-_SAFETY_STOP = 1.0  # how long one lasts [s]
+_JUDGED_EVERY = 0.005  # Time between two judgements of tasks. No cabinet becomes late by them [s].
+_LOOKS, _LONGEST_LINES = 0.05, 1 << 16  # Time between two reads of the cabinets' lines [s], their size [B].
+_SAFETY_STOP = 1.0  # Duration of a safety stop [s].
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
 class Pendant:
-    """The operator at the cabinets: starts their overlays, stops the first one now and then, reads what they say."""
+    """The operator at the cabinets: starts their overlays, stops the first one at times, and prints their states."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Pendant:
         self._held = False
 
     def toggle(self) -> None:
-        """End the sessions of all arms, or let them begin again."""
+        """End the sessions of all arms, or allow them to begin again."""
         self._held = not self._held
         say("overlays are stopped, Enter starts them" if self._held else "overlays start", self._console)
         for cabinet in self._cabinets.values() if self._held else ():
@@ -91,10 +91,10 @@ class Pendant:
 
 
 def _enter_pressed() -> bool:
-    """Whether a line was entered; not for a process in the background, which reading from a terminal would stop."""
+    """Return whether a line was entered. In the background nothing is read, because reading would stop the process."""
     try:
         is_ours = os.tcgetpgrp(0) == os.getpgrp()
-    except OSError:  # no terminal
+    except OSError:  # There is no terminal.
         return False
     return is_ours and bool(select.select([0], (), (), 0)[0]) and bool(os.read(0, 1024))
 
@@ -153,7 +153,7 @@ def fri_cabinet(
         every = right_period if arm == "right" and right_period is not None else period
         cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every, multiplier)
         client = clients[str(arm)] = address_for(its.address) or "127.0.0.1", its.port
-        # As KUKA's, from the port of its client; two programs cannot have the same one at the same address.
+        # KUKA's cabinet sends from the port of its client. At one address, two programs cannot have the same port.
         port = 0 if its.address == client[0] else its.port
         origins[str(arm)] = its.address, port if source_port is None else source_port
     grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if isinstance(its.gripper, GripperIoConfig)}
@@ -196,11 +196,11 @@ def fri_cabinet(
 
 
 def wait_for_states(child: subprocess.Popen[str], lines: int, count: int) -> None:
-    """Look into the file ``lines`` until the cabinets' process has said of ``count`` arms that they send.
+    """Read the file ``lines`` until the cabinets' process has printed for ``count`` arms that they send.
 
-    Raises :class:`PlantError` where the process has ended instead.
+    Raises :class:`PlantError` if the process has ended instead.
     """
-    said = ""  # read by position: the process writes at the file's own
+    said = ""  # Read at a fixed position, because the process writes at the position of the open file.
     while said.count(in_words(Session.MONITORING_WAIT)) < count:
         if child.poll() is not None:
             raise PlantError(f"the cabinets that stand in have ended: {said.strip() or 'without a word'}")
@@ -212,10 +212,13 @@ def wait_for_states(child: subprocess.Popen[str], lines: int, count: int) -> Non
 def rehearsal(
     config: str, mode: CommandMode, tasks: Sequence[AssemblyTask], period: float, rt: bool
 ) -> Iterator[list[TaskResult]]:
-    """Cabinets of a cell in a process of their own; at the end, results of the ``tasks`` as they measured them.
+    """Run the cabinets of a cell in a process of their own, which send messages when the context begins.
 
-    They can be heard when the context begins. ``period`` is the time between two messages [ms]. Raises
-    :class:`PlantError` where they cannot begin, ended a session or say nothing.
+    At the end, the yielded list holds the results of the ``tasks`` that the cabinets measured. ``period`` is the time
+    between two messages [ms].
+
+    Raises:
+        PlantError: If the cabinets cannot begin, ended a session or gave no result.
     """
     words = [
         "fri-cabinet",
@@ -248,6 +251,7 @@ def rehearsal(
     except ValueError:
         raise PlantError("the cabinets that stand in have failed; q2r2 fri-cabinet says why") from None
     for arm, cabinet in told["cabinets"].items():
-        if cabinet["trips"][:-1] or cabinet["trips"][-1:] not in ([], [Trip.LATE]):  # the last end is ours
+        # The last trip may be LATE, because the cabinet gets no more answers after the end of our run.
+        if cabinet["trips"][:-1] or cabinet["trips"][-1:] not in ([], [Trip.LATE]):
             raise PlantError(f"{arm}: the cabinet ended the session: {', '.join(cabinet['trips'])}")
     results += [TaskResult(**result) for result in told["tasks"]]

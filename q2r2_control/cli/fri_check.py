@@ -1,4 +1,4 @@
-"""``q2r2 fri-check``: listens to the cabinets of a cell for some seconds, and moves nothing."""
+"""``q2r2 fri-check``: listen to the cabinets of a cell for some seconds, and move nothing."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from q2r2_control.types import Array, CommandMode
 from q2r2_control.viewer.tables import record_table
 from q2r2_control.wording import sentence
 
-_LOOKS = 2e-4  # between two looks at whether a message came [s]
-_LARGE_JITTER = 0.5  # of a period
+_LOOKS = 2e-4  # Time between two checks for a new message [s].
+_LARGE_JITTER = 0.5  # Jitter that causes a note, as a share of the period.
 
 
 @dataclass(frozen=True, slots=True)
 class CabinetReport:
-    """One cabinet's messages, and the newest of them in words."""
+    """Figures of one cabinet's messages, and the states in the newest message in words."""
 
     arm: str
     fri_version: int
     period_ms: float
     messages: int
     lost: int
-    jitter_ms_p99: float  # of the time between two messages, about the cabinet's period
+    jitter_ms_p99: float  # Deviation of the time between two messages from the cabinet's period.
     jitter_ms_max: float
     session: str
     quality: str
     safety: str
     operation: str
     drives: str
-    joints_deg: list[float]  # measured
-    external_torque_nm: float | None  # the greatest of a joint
+    joints_deg: list[float]  # Measured positions.
+    external_torque_nm: float | None  # The largest external torque of a joint.
 
 
 def cabinet_report(arm: str, heard: Sequence[tuple[Monitoring, float]], lost: int) -> CabinetReport:
-    """Of at least one message, each with when it came [s], in the order of their counters."""
+    """Return the report on at least one message, each with its time of arrival [s], in the order of their counters."""
     newest = heard[-1][0]
     counters = np.array([message.counter for message, _ in heard])
     late = np.abs(np.diff([came for _, came in heard]) - np.diff(counters) * newest.period)
@@ -72,20 +72,20 @@ def cabinet_report(arm: str, heard: Sequence[tuple[Monitoring, float]], lost: in
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Messages of the cabinets over some seconds, and how they were answered."""
+    """Messages of the cabinets over some seconds, and the delays of the answers."""
 
     cabinets: list[CabinetReport]
-    answers: Array  # from the arrival of each message until its answer was sent [s]
-    fault: Reason | None  # why the arms could not be commanded at the end
+    answers: Array  # Time from the arrival of each message until its answer was sent [s].
+    fault: Reason | None  # The reason why the arms could not be commanded at the end.
     notes: list[str]
 
     def table(self, duration: float) -> Table:
-        """Of ``duration`` [s]."""
+        """Return a table of the cabinets; ``duration`` is the time of listening [s]."""
         return record_table(f"cabinets, for {duration:g} s", self.cabinets, self.notes)
 
 
 def listen(plant: FriPlant, duration: float, asked: Callable[[], bool] = lambda: False) -> Heard:
-    """Listen to the cabinets of a plant that was reset, for ``duration`` [s] or until it is ``asked`` to end."""
+    """Listen to the cabinets of a plant that was reset, for ``duration`` [s] or until ``asked`` returns True."""
     heard: dict[str, list[tuple[Monitoring, float]]] = {arm: [] for arm in plant.states()}
     end = time.monotonic() + duration
     while (now := time.monotonic()) < end and not asked():

@@ -1,4 +1,4 @@
-"""Models as the command line of ``q2r2 new-cell`` names them: arguments of xacro, and MJCF that is written as URDF."""
+"""The model arguments of ``q2r2 new-cell``: arguments of xacro, and MJCF files, which are converted to URDF."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.description import MJCF_ENDS
 from q2r2_control.robot.mjcf import urdf_of_mjcf
 
-SPEEDS = 0.01, 10.0  # that a joint's limit may be [rad/s]
+SPEEDS = 0.01, 10.0  # Allowed range of a joint's speed limit [rad/s].
 
 
 def named_values(given: list[str]) -> dict[str, str]:
-    """Values by name. Raises :class:`ConfigError`."""
+    """Return the values of texts NAME=VALUE by name; raises :class:`ConfigError`."""
     for text in given:
         if not text.partition("=")[0].strip() or "=" not in text:
             raise ConfigError(f"--xacro-arg {text!r:.80}: allowed: NAME=VALUE")
@@ -25,7 +25,7 @@ def named_values(given: list[str]) -> dict[str, str]:
 def without_mjcf(
     models: dict[str, str], name: str, velocity: float | None, yes: bool, answers: RememberedAnswers
 ) -> dict[str, str]:
-    """The models, with a URDF that is written here in place of each MJCF file. Raises :class:`Q2R2Error`."""
+    """Write a URDF for each MJCF file, and return the models with it in place; raises :class:`Q2R2Error`."""
     sides = {model: side for side, model in reversed(models.items()) if model.endswith(MJCF_ENDS)}
     files = {model: Path(f"{name}_{side}.urdf") for model, side in sides.items()}
     for model, file in files.items():

@@ -1,4 +1,4 @@
-"""``q2r2 mounts``: where the right arm's base is, from points that both tips touch."""
+"""``q2r2 mounts``: find the position of the right arm's base from points that both tips touch."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ from q2r2_control.viewer.tables import figure_table
 from q2r2_control.wording import sentence
 
 Tip = Annotated[tuple[float, float, float], Option(help="Of either tool, where both touch, in its frame [m].")]
-_FEWEST = 3  # points
-_MOST_APART = 5.0  # tips that touch the same point, after the fit [mm]
-_BEYOND = 0.1  # a joint that is measured farther beyond its limits was not written in radians [rad]
-_STILL, _LISTENS = 2e-3, 0.5  # joints at rest move less than this [rad] for so long [s]
+_FEWEST = 3  # Least number of points.
+_MOST_APART = 5.0  # Largest distance after the fit between tips that touched the same point [mm].
+_BEYOND = 0.1  # A joint farther beyond its limits than this was probably not written in radians [rad].
+_STILL, _LISTENS = 2e-3, 0.5  # Joints at rest move less than this angle [rad] in this time [s].
 
 
 @dataclass(frozen=True, slots=True)
 class MountReport:
-    """The right arm's mount that fits, and how well it does."""
+    """The mount of the right arm that fits best, and the errors of the fit."""
 
     position: list[float]  # [m]
     rpy: list[float]  # [rad]
-    moved_mm: float  # from where the cell has it
-    turned_deg: float
-    off_mm: list[float]  # of each point
+    moved_mm: float  # Distance from the mount in the cell.
+    turned_deg: float  # Angle from the mount in the cell.
+    off_mm: list[float]  # Distance between the tips at each point.
 
     @property
     def fault(self) -> str | None:
-        """Why this is no mount to use."""
+        """The reason why this mount must not be used, or None."""
         if (worst := max(self.off_mm)) <= _MOST_APART:
             return None
         cure = "see to --tip, and touch points that do not move"
         return f"the tips are {worst:.1f} mm apart; allowed: {_MOST_APART:g} mm; {cure}"
 
     def table(self) -> Table:
-        """How far the tips are apart, and the lines for the YAML where they fit."""
+        """Return a table of the distances between the tips, with the lines for the YAML if the mount fits."""
         rows = [(f"point {number}", off) for number, off in enumerate(self.off_mm, 1)]
         notes = [
             f"the right arm's base is {self.moved_mm:.1f} mm and {self.turned_deg:.2f} deg from where the cell has it"
@@ -58,12 +58,15 @@ class MountReport:
         if self.fault is None:
             notes += ["arms.right.mount:", f"  position: {self.position}", f"  rpy: {self.rpy}"]
         table = figure_table("tips, after the fit", ("", "apart [mm]"), rows, notes)
-        table.min_width = max(map(len, notes))  # lines to paste stay lines
+        table.min_width = max(map(len, notes))  # Lines to paste must not be wrapped.
         return table
 
 
 def mount_report(config: Config, points: Array, touched: Array) -> MountReport:
-    """``points`` (n, 3) of the left tip and ``touched`` (n, 3) of the right one, in the world of the cell [m]."""
+    """Fit the right arm's mount, so that ``touched`` (n, 3) by the right tip match ``points`` (n, 3) by the left one.
+
+    Both are in the world frame of the cell [m].
+    """
     move, off = fit_move(points, touched)
     before = next(arm.mount for side, arm in config.arms.items() if side == SIDES[1])
     mount = pin.SE3(pin.rpy.rpyToMatrix(*before.rpy), np.array(before.position))
@@ -122,7 +125,7 @@ def mounts(
 
 
 def _print(report: MountReport, json: bool) -> None:
-    """Raises :class:`PlantError` where the tips did not touch the same points."""
+    """Print the report; raises :class:`PlantError` if the tips did not touch the same points."""
     print_report(asdict(report), (report.table(),), json)
     if report.fault is not None:
         raise PlantError(report.fault)
@@ -131,7 +134,7 @@ def _print(report: MountReport, json: bool) -> None:
 def measure_mount(
     plant: FriPlant, config: Config, robot: Robot, points: int, tip: Array, console: Console
 ) -> MountReport:
-    """Ask for ``points`` that both tips touch, with ``tip`` (3,) in the tool frame of either arm [m]."""
+    """Let the operator touch ``points`` with both tips, and fit the mount; ``tip`` (3,) is in each tool's frame [m]."""
     tips: dict[str, list[Array]] = {arm: [] for arm in SIDES}
     for number in range(1, points + 1):
         for arm in SIDES:
@@ -141,7 +144,7 @@ def measure_mount(
 
 
 def _written(file: Path, robot: Robot) -> Array:
-    """The postures (n, nv) [rad] in a text file. Raises :class:`ConfigError`."""
+    """Read the postures (n, nv) [rad] from a text file; raises :class:`ConfigError`."""
     joints = np.concatenate([robot.arms[arm].joints for arm in SIDES])
     allowed = f"lines of {len(joints)} numbers in radians: {', '.join(robot.joint_names[joint] for joint in joints)}"
     try:
@@ -166,7 +169,7 @@ def _written(file: Path, robot: Robot) -> Array:
 
 
 def _resting(plant: FriPlant, arm: str, robot: Robot, console: Console) -> Array:
-    """The mean posture (nv,) [rad] of arms of which this one rests, once Enter was pressed."""
+    """Wait until Enter is pressed while ``arm`` is at rest, and return the mean posture (nv,) of all arms [rad]."""
     while True:
         if not sys.stdin.readline():
             raise ConfigError("no more input; allowed: Enter for each point")
@@ -178,7 +181,7 @@ def _resting(plant: FriPlant, arm: str, robot: Robot, console: Console) -> Array
 
 
 def postures_over(plant: FriPlant, duration: float) -> Array:
-    """Measured postures (n, nv) [rad] over ``duration`` [s]. Raises :class:`PlantError` where a cabinet is silent."""
+    """Measure postures (n, nv) [rad] over ``duration`` [s]; raises :class:`PlantError` if a cabinet is silent."""
     seen, end = [], time.monotonic() + duration
     while time.monotonic() < end:
         plant.due(time.monotonic())

@@ -1,4 +1,4 @@
-"""``q2r2 new-cell``: the YAML of a cell for models that no cell has yet, with a home that passes the check."""
+"""``q2r2 new-cell``: write the YAML of a cell for new models, with a home that passes the check."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
 
-_ANSWERS = Path("new-cell.answers.json")  # in the folder that the cell is written to
-_FITS = 8  # capsules in the table
-_LEAST_JOINTS = 3  # of an arm
-_OFF_FLOOR = 0.03  # that each link can get at least [m]
-_BARELY = 0.003  # a pair that parts by no more than this beyond what it keeps hardly does [m]
+_ANSWERS = Path("new-cell.answers.json")  # In the folder of the new cell.
+_FITS = 8  # Number of capsules in the table.
+_LEAST_JOINTS = 3  # Least number of joints of an arm.
+_OFF_FLOOR = 0.03  # Distance from the floor that each link can reach in some posture [m].
+_BARELY = 0.003  # A pair that cannot get this much farther apart than its kept distance gets an exception [m].
 
 Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, MJCF, package:// or example-robot-data:NAME.")]
 Tip = Annotated[str | None, Option(metavar="LINK", help="Last link of that arm, where the model leaves a doubt.")]
@@ -51,18 +51,18 @@ Metres = Annotated[float | None, Option(min=-3, max=5, help="[m]")]
 
 @dataclass
 class _Draft:
-    """The cell so far, as its YAML has it, and what there is to say of it."""
+    """The unfinished cell as data of its YAML, with notes and faults."""
 
     file: Path
     data: dict[str, Any]
-    notes: list[str] = field(default_factory=list)  # of what was guessed
-    faults: list[str] = field(default_factory=list)  # that the check of a cell does not look for
-    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # by model
-    always: list[tuple[str, str]] = field(default_factory=list)  # links that overlap by construction
-    xacro_args: dict[str, str] = field(default_factory=dict)  # of each model that is one of xacro
+    notes: list[str] = field(default_factory=list)  # Notes about guessed values.
+    faults: list[str] = field(default_factory=list)  # Faults for which q2r2 check does not look.
+    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # By model.
+    always: list[tuple[str, str]] = field(default_factory=list)  # Pairs of links that overlap by construction.
+    xacro_args: dict[str, str] = field(default_factory=dict)  # Arguments of each xacro model.
 
     def part(self, model: str) -> dict[str, Any]:
-        """The block of a model, which stands at the world's origin yet."""
+        """Return the block of a model, which is still mounted at the world's origin."""
         args = {"xacro_args": self.xacro_args} if self.xacro_args and model.endswith(".xacro") else {}
         return {"model": model, **args, "mount": {"position": [0.0, 0.0, 0.0]}}
 
@@ -122,7 +122,7 @@ def new_cell(
         cell = Robot.from_config(found)
         _limit_acceleration(draft, cell, found)
         approaches = nearest_approaches(cell, samples, 0, CLEARANCE, progress)
-    # Links of several shapes are left out only where no two of these are watched.
+    # A pair of links with several shapes is left out only if no pair of their shapes is watched.
     watched = {frozenset(map(link_of, pair)) for pair in pair_names(cell.collision_model)}
     overlapping = ((link_of(a), link_of(b)) for a, b in cell.ignored_pairs)
     always = dict.fromkeys([*draft.always, *(links for links in overlapping if frozenset(links) not in watched)])
@@ -148,7 +148,7 @@ def new_cell(
 
 
 def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], shared: str | None) -> None:
-    """Arms, tips and grippers. Raises :class:`ConfigError` with all that the models lack."""
+    """Find arms, tips and grippers; raises :class:`ConfigError` with everything that the models lack."""
     described = {}
     for side, model in models.items():
         try:
@@ -195,7 +195,7 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
             draft.notes.append(
                 f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints, see {key}"
             )
-    # Fingers are all that they sweep, which finer shapes would hardly make smaller.
+    # The shape of a finger covers its whole stroke. Finer shapes would hardly make it smaller.
     moved = {
         side: links_moved_by(tree, [joint.get("name", "") for joint in chains[side]])
         - links_moved_by(tree, arms[side].get("gripper", {}).get("joints", ()))
@@ -214,7 +214,7 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
 
 
 def _enclose_drawings(draft: _Draft, yes: bool) -> None:
-    """Capsules around the drawings of links that weigh something and have no collision shape."""
+    """Put capsules around the visual shapes of links that have a mass and no collision shape."""
     moving = moving_links(Robot.from_config(draft.config()))
     links = [link for link in moving if link.is_unchecked and link.drawn and not link.shaped]
     names = ", ".join(link.name for link in links)
@@ -232,7 +232,7 @@ def _enclose_drawings(draft: _Draft, yes: bool) -> None:
 
 
 def _mount(draft: _Draft, distance: float | None, height: float | None, answers: RememberedAnswers) -> None:
-    """Where the bases stand, which only the user knows."""
+    """Set the positions of the bases, which only the user knows."""
     arms, shared = draft.data["arms"], draft.data.get("robot")
     length = max(compose(draft.config()).arm_lengths().values())
     usual = round(min(max(length, 0.3), 1.0), 1)
@@ -248,9 +248,9 @@ def _mount(draft: _Draft, distance: float | None, height: float | None, answers:
 
 
 def _stand(robot: Robot, has_feet: bool) -> float:
-    """Height of the root link at which feet stand on the floor, and at which no link is held up by it [m]."""
+    """Return the height of the root link [m] at which feet stand on the floor and each link can leave the floor."""
     lowest = [0.0]
-    # Shapes as drawn: a capsule around a pedestal reaches far below it.
+    # The collision shapes of the file are used, because a capsule around a pedestal reaches far below it.
     drawn = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
     for item in drawn.geometryObjects:
         if has_feet and item.parentJoint == 0 and link_of(item.name) != FLOOR:
@@ -264,7 +264,7 @@ def _stand(robot: Robot, has_feet: bool) -> float:
 
 
 def _place(draft: _Draft, answers: RememberedAnswers) -> None:
-    """A home for each arm, apart from pairs that never part, which get a distance of their own or none."""
+    """Find a home for each arm. Pairs that never get far enough apart get a distance of their own, or none."""
     config = draft.config()
     robot = Robot.from_config(config)
     least = config.control.min_distance
@@ -305,7 +305,7 @@ def _place(draft: _Draft, answers: RememberedAnswers) -> None:
 
 
 def _limit_acceleration(draft: _Draft, robot: Robot, config: Config) -> None:
-    """A limit that a full stop's torques bear, for models that have none."""
+    """Set an acceleration limit that the torques of a full stop allow, for models that have no limit."""
     cap = config.control.acceleration_limit
     if np.isfinite(robot.acceleration_limit).all():
         return

@@ -1,4 +1,4 @@
-"""Output of commands: JSON on stdout, lines on a run, and all else on stderr or as tables."""
+"""The output of commands: JSON on stdout, lines about a run, tables, and messages on stderr."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.viewer.tables import print_table
 
-# A loop that was late by more [us], or by over a period in a larger share of its ticks, may be why a task failed.
+# A loop that is late by _LATE [us], or by more than a period in a larger share of ticks than _OFTEN, may fail a task.
 _LATE, _OFTEN = 2e4, 0.2
-# Time without a word about kernels that are being compiled, and between two lines about them [s].
+# Time until the first line about compiled kernels, and time between two such lines [s].
 _SILENT_S, _BETWEEN_LINES_S = 3.0, 5.0
-SCRIPTS_WAIT_S = 60.0  # for cabinets, where nobody is at a terminal who could end the wait
+SCRIPTS_WAIT_S = 60.0  # Longest wait for cabinets if nobody at a terminal can end it.
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
 ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
@@ -56,12 +56,12 @@ Operator = Annotated[str | None, Option(help="With --record: whose hands, noted 
 
 
 def as_json_text(value: Any) -> str:
-    """``value`` as strict JSON: dataclasses and mappings as objects, arrays as lists, what is not finite as null."""
+    """Return ``value`` as strict JSON: dataclasses and mappings as objects, arrays as lists, inf and nan as null."""
     return to_json(value, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode()
 
 
 def with_solver(config: Config, name: str | None) -> Config:
-    """The cell with the QP solver called ``name``; None: with its own. Raises :class:`ConfigError` without one."""
+    """Return the cell with the QP solver ``name``, or with its own if None; raises :class:`ConfigError`."""
     if name is not None:
         check_installed(name)
     return config.model_copy(update={"control": config.control.with_solver(name)})
@@ -78,13 +78,13 @@ def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:
 
 
 def say(line: str, console: Console | None = None, style: str = "") -> None:
-    """Print one line as it is, however long, on stderr or ``console``."""
+    """Print one line without wrapping it, on stderr or ``console``."""
     (console or Console(stderr=True)).print(line, style=style, soft_wrap=True, highlight=False, markup=False)
 
 
 @contextmanager
 def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
-    """Show how far a long work has got, where stderr is a terminal, by what it is told: what, how many done, of all."""
+    """Show the progress of long work if stderr is a terminal. The yielded function takes a text, done and total."""
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task(what, total=None)
@@ -92,21 +92,21 @@ def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
 
 
 def print_progress(what: str) -> None:
-    """Print a line on stderr, where that is a terminal; a live line would need a thread, which adds to times."""
+    """Print a line on stderr if it is a terminal. A live line would need a thread, which would distort timings."""
     console = Console(stderr=True)
     if console.is_terminal:
         console.print(what, highlight=False)
 
 
 class _CompilingLines:
-    """Says how far compiling the controller's kernels has got, a line every few seconds."""
+    """Prints the progress of compiling the controller's kernels, one line every few seconds."""
 
     def __init__(self) -> None:
         self._start: float | None = None
         self._due = 0.0
 
     def __call__(self, done: int, total: int) -> None:
-        """Print a line if one is due; the time to go is that of the kernels that are done, scaled to the rest."""
+        """Print a line if one is due. Its remaining time assumes that each kernel takes as long as those before."""
         now = time.monotonic()
         if self._start is None:
             self._start, self._due = now, now + _SILENT_S
@@ -119,13 +119,13 @@ class _CompilingLines:
 
 @contextmanager
 def notice_of_compiling() -> Iterator[None]:
-    """Say what takes so long, where the controller's kernels have to be compiled for longer than three seconds."""
+    """Print the reason for the wait if compiling the controller's kernels takes longer than three seconds."""
     with compiling(_CompilingLines()):
         yield
 
 
 def notes_of(task: str | None, operator: str | None, record: object) -> dict[str, str]:
-    """Notes for a recording. Raises :class:`ConfigError` where there is none."""
+    """Return the notes for a recording; raises :class:`ConfigError` if a note has no recording or no text."""
     notes = {name: text for name, text in (("task", task), ("operator", operator)) if text is not None}
     for name in notes:
         if record is None:
@@ -136,21 +136,21 @@ def notes_of(task: str | None, operator: str | None, record: object) -> dict[str
 
 
 def positive(option: str, value: float | None) -> float | None:
-    """``value`` [s] of ``option``, if one is given. Raises :class:`ConfigError` unless it is positive and finite."""
+    """Return the ``value`` [s] of ``option``; raises :class:`ConfigError` if it is not positive and finite."""
     if value is not None and not (math.isfinite(value) and value > 0.0):
         raise ConfigError(f"{option} {value:g}: allowed: a positive number of seconds")
     return value
 
 
 def longest_wait(asked: float | None) -> float:
-    """The time to wait for cabinets [s]: as ``asked``; else without end if a person at a terminal can end it."""
+    """Return the longest wait for cabinets [s]: ``asked``, or without end if a person at a terminal can end it."""
     if asked is not None:
         return asked
     return math.inf if sys.stderr.isatty() else SCRIPTS_WAIT_S
 
 
 def task_line(task: TaskResult) -> str:
-    """One line of markup: whether a task succeeded, and what was measured of it."""
+    """Return one line of markup with the success of a task and its measured figures."""
     figures = ", ".join(
         f"{what.rpartition('_')[0].replace('_', ' ')} {value:.1f} {what.rpartition('_')[2]}"
         for what, value in task.measured.items()
@@ -160,7 +160,7 @@ def task_line(task: TaskResult) -> str:
 
 
 def late_line(summary: RunSummary, tasks: Iterable[TaskResult]) -> str | None:
-    """One line of markup where a task failed in a run whose loop was late; else None."""
+    """Return one line of markup if a task failed in a run whose loop was late, else None."""
     late, often = summary.lateness_us.max, summary.overruns > _OFTEN * summary.ticks
     if late is None or not (late >= _LATE or often) or all(task.succeeded for task in tasks):
         return None
@@ -169,7 +169,7 @@ def late_line(summary: RunSummary, tasks: Iterable[TaskResult]) -> str | None:
 
 
 def recording_line(recording: RecordingSummary) -> str:
-    """One line of markup: where a run was recorded, and what is missing of it."""
+    """Return one line of markup with the file of a recording and the data that it lacks."""
     if recording.fault is not None:
         ended = f"[red]recording ended[/]: {escape(recording.fault)}"
         return f"{ended}; {recording.ticks} ticks recorded, {recording.lost_ticks} not"
@@ -185,6 +185,6 @@ def recording_line(recording: RecordingSummary) -> str:
 
 
 def verdict_markup(verdict: Verdict) -> str:
-    """One line of markup: whether an episode is kept, and why not."""
+    """Return one line of markup that says whether an episode is kept, and if not, why."""
     colour = "green" if verdict.keep else "red"
     return f"[{colour}]{verdict.word}[/]{escape(verdict.line.removeprefix(verdict.word))}"

@@ -39,7 +39,8 @@ from q2r2_control.viewer.tables import figure_table
 from q2r2_control.viewer.web.playback import Playback
 from q2r2_control.viewer.web.view import PageView
 
-_SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
+# The columns that fit into a terminal. The page has all columns.
+_SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")
 
 Recordings = Annotated[list[Path], Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them.")]
 Thresholds = Annotated[str | None, Option(metavar="CONFIG", help="The cell whose thresholds to use instead.")]
@@ -121,7 +122,8 @@ def judge(recordings: Recordings, config: Thresholds = None, json: Json = False)
 
 
 def _print_verdicts(found: _Judgements) -> None:
-    columns = [column for column in COLUMNS if column.name in _SHOWN]  # of several hands or arms the worst number
+    # A column shows the worst number of several hands or arms.
+    columns = [column for column in COLUMNS if column.name in _SHOWN]
     judged, console = found.judged, Console()
     kept = sum(one.verdict.keep for one in judged)
     rows = [(one.figures.name, one.verdict.word, *(column.text(one.figures) for column in columns)) for one in judged]
@@ -165,7 +167,7 @@ def report(
 
 @dataclass(frozen=True)
 class _Judgements:
-    all: list[Judged | Unreadable]  # in the order of the files
+    all: list[Judged | Unreadable]  # In the order of the files.
 
     @property
     def judged(self) -> list[Judged]:

@@ -1,4 +1,4 @@
-"""``q2r2 ros``: what concerns ROS 2."""
+"""``q2r2 ros``: the commands for ROS 2."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ from q2r2_control.viewer.web.page import check_viser
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
 _ROS_ARGUMENTS = "--ros-args"
-_ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
-_TIME = 4.0  # in which a set is found, and a second publisher too [s]
+_ONCE = 3.0  # Time to find a running set of nodes, and to get several messages of each node [s].
+_TIME = 4.0  # Time to find a running set of nodes, and also a second publisher of a topic [s].
 
 
 def set_tables(view: SetView, domain: str) -> Group:
-    """Why each arm moves or does not, what each node says, and what goes over each topic."""
+    """Return tables with the state of each arm and its reason, the message of each node, and the rate of each topic."""
     title = f"ROS domain {domain}: {len(view.nodes)} nodes of a set"
     arms = figure_table(title, ("arm", "state", "controller", "why"), map(_arm_cells, view.arms))
     if not view.nodes:
@@ -132,7 +132,7 @@ def _watch_live(cell: Config, domain: str, duration: float | None) -> SetView:
         def tell(view: SetView) -> None:
             for arm in view.arms:
                 line = f"{arm.name}: {arm.state or 'no node'}: {arm.why}"
-                if said.get(arm.name) != (words := re.sub(r"[\d.]+", "", line)):  # an age changes all the time
+                if said.get(arm.name) != (words := re.sub(r"[\d.]+", "", line)):  # Ages change all the time.
                     said[arm.name] = words
                     say(line, console)
 
@@ -174,7 +174,7 @@ def doctor(
 
 
 def print_findings(facts: dict[str, str], findings: list[Finding], worst: str = "stops arms") -> None:
-    """Print facts and findings, first those that stop arms, which are called ``worst``."""
+    """Print facts and findings. Findings that stop arms come first, with the label ``worst``."""
     console = Console(highlight=False, soft_wrap=True)
     for name, value in facts.items():
         console.print(Text(f"{name:<11} {value}"))
@@ -193,7 +193,7 @@ app.command(epilog="Example: q2r2 ros doctor config/dual_iiwa7.yaml")(doctor)
 
 
 class RobotSource(StrEnum):
-    """The robot behind the nodes."""
+    """The source of the robot that the nodes drive."""
 
     AUTO = "auto"
     MUJOCO = "mujoco"
@@ -216,10 +216,10 @@ def build_interfaces_command(
 
 
 class _WithRosArguments(TyperCommand):
-    """A command whose last words may be for ROS: all between ``--ros-args`` and ``--``, or the end."""
+    """A command with arguments for ROS, which stand between ``--ros-args`` and ``--`` or the end."""
 
     def parse_args(self, context: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Set them aside, and parse the others."""
+        """Store the arguments for ROS in the context, and parse the others."""
         first = args.index(_ROS_ARGUMENTS) if _ROS_ARGUMENTS in args else len(args)
         last = args.index("--", first) if "--" in args[first:] else len(args)
         context.meta[_ROS_ARGUMENTS] = args[first + 1 : last]
@@ -263,7 +263,7 @@ def up(
     recording = None if record is None else {"folder": record, **notes, **leaves_out}
     page = (web_host, web_port) if web else None
     if web:
-        check_viser()  # before any node starts
+        check_viser()  # The check comes before any node starts.
     nodes = nodes_of(config, input, robot.value, recording, separate, page)
     nodes = in_ros(nodes, context.meta[_ROS_ARGUMENTS], namespace, sim_time)
     raise Exit(run_together(nodes, lambda line: print(line, flush=True)))

@@ -1,6 +1,6 @@
-"""``q2r2 run``: a cell with an input and a plant of the user's choice.
+"""``q2r2 run``: run a cell with an input and a plant of the user's choice.
 
-``q2r2 demo``: simulated assembly work; ``q2r2 headset-check``: what a headset sends.
+``q2r2 demo`` shows simulated assembly work, and ``q2r2 headset-check`` shows the messages of a headset.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned,
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
-LARGEST_SPREAD = 0.03  # [m], within which all tasks reach their parts
+LARGEST_SPREAD = 0.03  # Up to this displacement of the parts, all tasks reach them [m].
 _FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
@@ -263,7 +263,7 @@ def demo(
         table=table,
         window=viewer,
         page=(web_host, web_port, None) if web else None,
-        real_time=rt or plant == "fri",  # cabinets wait for nobody, and a busy computer has other programs
+        real_time=rt or plant == "fri",  # A cabinet does not wait for a late answer of a busy computer.
         tasks=chosen,
         steps=work.steps,
         record=record,
@@ -334,7 +334,7 @@ def headset_check(
     cell = adapted(input, load_config(config))
     options = {"host": host, "port": port, "usb": usb, "certificate": certificate, "say": partial(say, console=console)}
     server: Any = make_input(input, cell, **options)
-    # From before the announcement on. KeyboardInterrupt would be lost where it comes in the middle of a finaliser.
+    # Signals are caught from before the announcement on. A KeyboardInterrupt in a finaliser would be lost.
     with stop_on_signals(stop.ask):
         server.start()
         try:

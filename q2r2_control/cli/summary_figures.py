@@ -1,4 +1,4 @@
-"""The summary of a run: first its verdict, then the figures of its result, and all others with ``--verbose``."""
+"""The summary of a run: its verdict, the figures of its result, and with ``--verbose`` all other figures."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from q2r2_control.wording import sentence
 
 
 def verdict_line(summary: RunSummary, failed: Iterable[str] = ()) -> str:
-    """One line of markup: whether the run kept what was promised and the arms did what was asked, or what is wrong.
+    """Return one line of markup that says whether the promises were kept and the arms followed, or else the faults.
 
-    ``failed`` says what else failed, such as tasks.
+    ``failed`` names further failures, such as tasks.
     """
     wrong = [*_broken(summary), *failed]
     if wrong:
@@ -34,7 +34,7 @@ def verdict_line(summary: RunSummary, failed: Iterable[str] = ()) -> str:
 
 
 def _broken(summary: RunSummary) -> Iterator[str]:
-    """Promises that were not kept, in words."""
+    """Yield the promises that were not kept, in words."""
     for name, arm in summary.arms.items():
         if not arm.followed:
             yield f"{name} arm is {arm.end_error_mm:.0f} mm from its reference at the end"
@@ -47,14 +47,14 @@ def _broken(summary: RunSummary) -> Iterator[str]:
 
 
 def _last_faults(summary: RunSummary) -> dict[str, Event]:
-    """The last event of each arm that something else than its button paused, or kept from being engaged."""
+    """Return the last event of each arm that was paused, or not engaged, by something other than its button."""
     between = (ArmState.PAUSING, ArmState.ALIGNING)
     last = {event.arm: event for event in summary.events if event.destination not in between}
     return {name: event for name, event in last.items() if is_fault(event)}
 
 
 def summary_table(summary: RunSummary, verbose: bool = False) -> Table:
-    """The figures of the run's result; with ``verbose``, times, limits and torques too."""
+    """Return a table of the run's result; with ``verbose``, it also has times, limits and torques."""
     figures = [*_result(summary), *(_details(summary) if verbose else _unusual(summary))]
     rows = ((name, Text.from_markup(value)) for name, value in figures)
     notes = () if verbose else ("--verbose has all figures",)
@@ -89,7 +89,7 @@ def _result(summary: RunSummary) -> Iterator[tuple[str, str]]:
 
 
 def _unusual(summary: RunSummary) -> Iterator[tuple[str, str]]:
-    """Figures that are told in any case where they are not zero."""
+    """Yield the figures that are shown even without ``verbose`` if they are not zero."""
     if summary.fallback_ticks or summary.uncertified_ticks:
         yield _stops(summary)
     if summary.rejected_targets:

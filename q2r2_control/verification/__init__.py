@@ -1,1 +1,1 @@
-"""Whether the controller keeps its promises: checked at every tick, under hostile input and injected faults."""
+"""Checks of the controller's promises at every tick, under hostile input and injected faults."""

@@ -16,22 +16,22 @@ from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 
 class Request(NamedTuple):
-    """Targets of one tick."""
+    """The targets of one tick."""
 
     targets: dict[str, Any]
-    unusable: frozenset[str] = frozenset()  # arms whose target has to be reported as rejected
+    unusable: frozenset[str] = frozenset()  # Arms whose target has to be reported as rejected.
 
 
-# From the tick within the segment and the last reference's joint positions (nv,) to the request.
+# A function of the tick within the segment and of the last reference's joint positions (nv,), which returns a request.
 Stream = Callable[[int, Array], Request]
-_TABLE = 0.2  # height of the top that is pressed on, as in the shipped cells [m]
-_TICK = 0.001  # that motions at work are played at [s]
-# Of the settings at the start, what gains change to; arms that separation slows long before contact test little.
+_TABLE = 0.2  # Height of the table's top, on which tools press, as in the shipped cells [m].
+_TICK = 0.001  # Tick at which work motions are played [s].
+# Factors on the first settings to which gains change. Arms that separation slows long before contact test little.
 _GAIN_SHARES = {
     **dict.fromkeys(("position_gain", "rotation_gain", "posture_gain", "max_linear_speed"), (0.1, 1.0, 2.0)),
     **{"separation_gain": (0.5, 1.0, 4.0), "stretch_gain": (0.1, 1.0, 10.0), "posture_weight": (0.1, 1.0, 100.0)},
 }
-_WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # [m]
+_WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Lower and upper corner [m].
 
 
 class Adversary:

@@ -1,6 +1,6 @@
 """The contract of the Cartesian controller, checked at every tick from its references alone.
 
-:meth:`Contract.check` raises at the first promise that is broken, :meth:`Contract.observe` keeps the worst margins.
+:meth:`Contract.check` raises at the first broken promise. :meth:`Contract.observe` keeps the worst margins.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepRepor
 from q2r2_control.verification.promises import PROMISES, RELATIVE, Margin, MeasuredDistances
 from q2r2_control.verification.tool_speeds import MeasuredToolSpeeds
 
-_NEWEST = 5000  # ticks whose accelerations are kept
-_ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the numbers
-_BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4  # share of the ticks that are sampled, and postures in each
-_STOP_SHARE, _STOP_SAMPLES = 0.005, 41
-_NEAR, _NEAR_SHARE = 1e-3, 10.0  # with less margin [m] so many times as many ticks are sampled
+_NEWEST = 5000  # Number of ticks whose accelerations are kept.
+_ROUNDING = 4.0 * np.finfo(np.float64).eps  # Rounding error of a difference, relative to the numbers.
+_BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4  # Share of sampled ticks, and postures between this tick and the last one.
+_STOP_SHARE, _STOP_SAMPLES = 0.005, 41  # Share of sampled ticks, and postures during a full stop.
+_NEAR, _NEAR_SHARE = 1e-3, 10.0  # Below this margin [m], so many times as many ticks are sampled.
 
 
 def time_of(dt: Any) -> float:
-    """Seconds that a tick of ``dt`` moves the reference by: 0 for what is no time, 0.1 s at most."""
+    """Return the time by which a tick of ``dt`` moves the reference [s]: 0 for an invalid time, and at most 0.1 s."""
     return min(float(dt), LONGEST_DT) if is_number(dt) and dt > 0.0 else 0.0
 
 
 class Contract:
     """Checks one reference after another, from a start at ``q`` [rad], ``v`` [rad/s], (nv,) each; by default at home.
 
-    A start outside the limits, too fast or in penetration is allowed: for what it breaks the promise is to recover, and
-    the margins say so. Distances between ticks and during full stops are measured by Coal, in ticks drawn by
-    ``random``, or in all of them with ``sample_all``. Ticks longer than one substep move along several parabolas that a
-    reference does not show; they are checked at the ticks.
+    A start outside the limits, too fast or in penetration is allowed. For the limits that it breaks, the promise is to
+    recover, and separate margins check that. Coal measures distances between ticks and during full stops, in ticks that
+    ``random`` draws, or in all ticks with ``sample_all``. A tick longer than one substep moves along several parabolas.
+    The reference does not show these, so only its end is checked.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Contract:
         self.start(robot.home if q is None else q, v)
 
     def start(self, q: Array, v: Array | None = None) -> None:
-        """The controller was reset to ``q`` [rad], ``v`` [rad/s], (nv,) each; without ``v`` at rest."""
+        """Begin again, after the controller was reset to ``q`` [rad], ``v`` [rad/s], (nv,) each; by default at rest."""
         v = np.zeros_like(q) if v is None else v
         self._measured.kept = self._controller.kept_distances
         self._q, self._v, self._stop = q.copy(), v.copy(), self._controller.stop_deceleration
@@ -81,13 +81,16 @@ class Contract:
         margins = self._measured.margins(q)
         self._from_rest = not v.any()
         self._apart = (margins >= -ROUNDING) & self._from_rest
-        # Whether a certificate must be known from now on. A start at rest with all pairs apart is certified by itself.
+        # Whether every tick must have a certificate now. A start at rest with all pairs apart is certified by itself.
         self._certain = self._from_rest and bool(self._apart.all())
         self._least = float(margins.min(initial=np.inf)) if self._certain else -np.inf
-        self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # duration [s], duration times |a|^2
+        self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # Duration [s], and duration times |a|^2.
 
     def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
-        """The controller has accepted ``openings``. If only its references tell so, this is not ``before_step``."""
+        """Note that the controller has accepted ``openings``.
+
+        ``before_step`` is False if this is known only after a step, from its reference.
+        """
         if before_step:
             self._stop = self._controller.stop_deceleration
         self._measured.set_openings(openings)
@@ -98,16 +101,16 @@ class Contract:
         self._asked_of_objects = kept_by_objects(self._robot, settings).values
 
     def _note_kept(self) -> None:
-        """Kept distances may fall to those that the settings ask for, and no farther."""
+        """Check that kept distances fall at most to those of the settings."""
         before, kept, settings = self._measured.kept, self._controller.kept_distances, self._controller.settings
         if settings is not self._settings:
             self._ask(settings)
         if len(before):
             self._note("withdrawn", float((np.minimum(before, self._asked) - kept).max()))
-        self._measured.kept = kept  # for which this tick has to be proven
+        self._measured.kept = kept  # This tick has to prove these distances.
 
     def _note_objects(self) -> None:
-        """Take over what pairs of objects keep, which never falls while they count but to what is asked for."""
+        """Take over the kept distances of objects. While a pair counts, its distance may fall only to the settings'."""
         held = self._controller.object_distances
         counted = np.isfinite(self._measured.held) & np.isfinite(held)
         if counted.any():
@@ -126,10 +129,13 @@ class Contract:
     def observe(
         self, reference: Reference, dt: Any, unusable: frozenset[str] | None = None, failed: bool = False
     ) -> dict[str, float]:
-        """Check one tick of ``dt`` [s]. Returns the keys of the promises that it broke, with the values seen.
+        """Check one tick of ``dt`` [s]; returns the keys of the promises that it broke, with their values.
 
-        ``unusable``: arms whose target has to be reported as rejected, and no others; None: not checked.
-        ``failed``: every solution of this tick was unusable, so that the stop has to be executed.
+        Args:
+            reference: The reference after the tick.
+            dt: Duration of the tick [s]; any invalid value is allowed.
+            unusable: Exactly the arms whose targets have to be reported as rejected; None for no check.
+            failed: Whether every solution of this tick was unusable, so that the stop has to be executed.
         """
         self._broken = {}
         q, v, h, report = reference.q, reference.v, time_of(dt), reference.report
@@ -168,7 +174,7 @@ class Contract:
         self.ticks += 1
 
     def tail_acceleration(self, duration: float = 0.5) -> float:
-        """Norm over the joints of the RMS acceleration over the last ``duration`` [s], in rad/s^2."""
+        """Return the norm over the joints of the RMS acceleration over the last ``duration`` [s], in rad/s^2."""
         total, time = 0.0, 0.0
         for h, square in reversed(self._newest):
             total, time = total + square, time + h
@@ -178,7 +184,7 @@ class Contract:
 
     @property
     def fallback_share(self) -> float:
-        """Share of ticks that did not execute the solver's solution."""
+        """The share of ticks that did not execute the solver's solution."""
         return self.fallbacks / max(self.ticks, 1)
 
     def _note(self, key: str, value: float) -> None:
@@ -196,12 +202,12 @@ class Contract:
             self._note("parabola", 0.0 if self._parabola else self._off_the_stop(q, v, h))
 
     def _off_the_stop(self, q: Array, v: Array, h: float) -> float:
-        """How far a tick of ``h`` [s] was from the stop that was known before it."""
+        """Return the deviation of a tick of ``h`` [s] from the stop that was known before it."""
         stop_q, stop_v = self._braked(self._q, self._v, self._stop, h)
         return max(float(np.abs(stop_q - q).max()), float(np.abs(stop_v - v).max()))
 
     def _braked(self, q: Array, v: Array, deceleration: Array, t: float | Array) -> tuple[Array, Array]:
-        """Position and velocity ``t`` [s] into a stop with a ``deceleration`` (nv,); ``t`` is a number or (s, 1)."""
+        """Return position and velocity at ``t`` [s] in a stop with ``deceleration`` (nv,); ``t`` may be (s, 1)."""
         time = np.minimum(t, np.abs(v) / deceleration)
         brake = np.sign(v) * deceleration
         return q + v * time - 0.5 * brake * time * time, v - brake * time
@@ -226,17 +232,17 @@ class Contract:
         self._can_stop |= self._stops_inside(q, v)
 
     def _excess_of(self, v: Array) -> Array:
-        """Speed above the limit (nv,) [rad/s]."""
+        """Return the speed above the limit (nv,) [rad/s]."""
         return np.asarray(np.maximum(np.abs(v) - self._v_max * (1.0 + RELATIVE), 0.0))
 
     def _stops_inside(self, q: Array, v: Array) -> npt.NDArray[np.bool_]:
-        """Joints inside their limits that full braking, begun one substep late, keeps there."""
+        """Return which joints are inside their limits, and stay there by full braking that begins one substep late."""
         end = q + v * np.abs(v) / (2.0 * self._a) + v * self._substep
         inside = (np.minimum(q, end) >= self._lower) & (np.maximum(q, end) <= self._upper)
         return np.asarray(inside, dtype=np.bool_)
 
     def _check_distance(self, least: float, certified: bool) -> None:
-        """``least`` is the least margin of a pair [m]."""
+        """Check distance and certificate of a tick; ``least`` is the least margin of a pair [m]."""
         if self._certain or (self._from_rest and self._least >= 0.0):
             self._note("distance", least)
         elif self._from_rest and self._least > -np.inf:
@@ -247,7 +253,7 @@ class Contract:
         self._least = least
 
     def _check_tools(self, q: Array, v: Array) -> None:
-        """At ``q`` [rad] and ``v`` [rad/s], (nv,) each or one row an instant, no tool is too fast."""
+        """Check the tools' speeds at ``q`` [rad] and ``v`` [rad/s], which are (nv,) or have a row for each instant."""
         if self._tool_limit is not None and self._certain:
             self._note("tool_speed", self._tools.fastest(q, v) / self._tool_limit)
 

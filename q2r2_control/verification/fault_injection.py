@@ -1,4 +1,4 @@
-"""Input of a soak: segments of hostile targets, uneven ticks, solvers that fail or work against us, and bad starts."""
+"""Input of a soak: segments of hostile targets, uneven ticks, failing or hostile solvers, and bad starts."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.adversary import Adversary, Stream
 
-# "towards_nearest": the vertex of the box that brings the pair with the least margin together fastest.
-# "corner": a random vertex, for a while. "again": the last answer, whatever the box is now.
-# "no_rows": the QP's solution without a separation row, which is straight on to the targets.
+# "towards_nearest" is the vertex of the QP's box that brings the pair with the least margin together fastest.
+# "corner" is a random vertex for some ticks. "again" is the last answer, even if the box has changed since.
+# "no_rows" is the QP's solution without separation rows, which goes straight to the targets.
 ATTACKS = ("towards_nearest", "corner", "again", "no_rows")
-_PATIENCE = 200  # ticks that one pair or one corner is pursued for, at most
-_CANDIDATES = 4  # the pairs with the least margins, of which one is pursued
+_PATIENCE = 200  # Most ticks for which one pair or one corner is pursued.
+_CANDIDATES = 4  # Number of pairs with the least margins, of which one is pursued.
 
 
 class WorstSolver:
-    """Makes the answers of one attack after another. Distances and their gradients are Coal's and Pinocchio's."""
+    """Makes the answers of attacks. Coal measures the distances, and Pinocchio their gradients."""
 
     def __init__(self, robot: Robot, random: np.random.Generator) -> None:
         self._random = random
@@ -40,7 +40,7 @@ class WorstSolver:
         self._rank = 0
 
     def answer(self, attack: str, problem: QpProblem, q: Array, kept: Array) -> Array:
-        """Next velocities (nv,) [rad/s] at the posture ``q`` (nv,), where pairs keep ``kept`` (p,) [m]."""
+        """Return velocities (nv,) [rad/s] at the posture ``q`` (nv,), where pairs keep ``kept`` (p,) [m]."""
         if attack == "again":
             return self._last
         self._left -= 1
@@ -56,7 +56,7 @@ class WorstSolver:
         return self._last
 
     def _gradient(self, q: Array, kept: Array) -> Array:
-        """Of the distance of a pair with one of the least margins, with respect to ``q`` (nv,) [m/rad]."""
+        """Return the gradient (nv,) of the distance of a pair with one of the least margins [m/rad]."""
         model, geometries = self._distances.model, self._distances.geometry
         data, geometry_data = self._distances.data, self._distances.geometry_data
         pin.computeJointJacobians(model, data, q)
@@ -67,29 +67,29 @@ class WorstSolver:
         return distance_gradient(model, data, geometries, geometry_data, nearest)
 
 
-# Solver failures after which the certified stop is due. A solution of absurd numbers is cut to the limits instead.
+# Solver failures that require the certified stop. A solution of absurd numbers is clipped to the limits instead.
 STOPPING_FAULTS = ("none", "nan", "one_nan", "infinite", "late")
 FAULTS = (*STOPPING_FAULTS, "absurd", "noise")
 _ATTACK_SHARES = (0.6, 0.15, 0.1, 0.15)
-_FAULTY, _ATTACKED = 0.2, 0.3  # share of the segments whose solver fails, or works against the arms
+_FAULTY, _ATTACKED = 0.2, 0.3  # Shares of the segments whose solver fails, or works against the arms.
 _TIMINGS = ("1 ms", "1 ms, jittering", "a few ms", "any", "tiny", "long", "partly invalid")
-_TIMING_SHARES = (0.42, 0.20, 0.15, 0.08, 0.05, 0.04, 0.06)  # of the segments
+_TIMING_SHARES = (0.42, 0.20, 0.15, 0.08, 0.05, 0.04, 0.06)  # Shares of the segments.
 _INVALID_DT: tuple[Any, ...] = (0.0, -0.001, math.nan, math.inf, -math.inf, None, "soon", 0.2, 5.0)
 _STARTS = ("home", "apart", "anywhere", "outside", "at limits", "moving", "too fast", "in penetration")
-LATE = 1.0  # [s]
-_DEEPEST = -0.03  # distance of a pair at a start in penetration [m]
+LATE = 1.0  # Solve time of a late solution [s].
+_DEEPEST = -0.03  # Least distance of a pair at a start in penetration [m].
 
 
 def untimed(solver: Solver, nv: int) -> Guard:
-    """``solver`` for a controller that takes its word for how long it took, so that nothing depends on the load."""
+    """Return ``solver`` with a guard that uses only its reported time, so that nothing depends on the load."""
     return Guard(solver, nv, clock=lambda: 0.0)
 
 
 class FaultySolver:
     """A real solver that fails as :attr:`fault` says: one of ``FAULTS`` or ``ATTACKS``, or None for a healthy one.
 
-    Its solve times are made up, so that no outcome depends on the load of the machine. ``worst`` answers while
-    :attr:`fault` is an attack that needs no solver; ``q`` (nv,) [rad] and ``kept`` (p,) [m] are what it aims by.
+    Its solve times are invented, so that no result depends on the load of the machine. ``worst`` answers while
+    :attr:`fault` is an attack that needs no solver, and uses ``q`` (nv,) [rad] and ``kept`` (p,) [m].
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class FaultySolver:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """The state that a controller is reset to."""
+    """The state to which a controller is reset."""
 
     name: str
     q: Array  # (nv,) [rad]
@@ -133,19 +133,19 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A stretch of ticks of one kind."""
+    """A sequence of ticks of one kind."""
 
     targets: str
     timing: str
     ticks: int
-    start: Start | None  # None: goes on from where the last segment ended
+    start: Start | None  # None if it continues from the end of the last segment.
     fault: str | None
-    fault_period: int  # the solver fails in every other period, an attack lasts [ticks]
+    fault_period: int  # The solver fails in every other period [ticks]. An attack lasts for the whole segment.
     stream: Stream
     dt: Callable[[], Any]
 
     def fault_at(self, tick: int) -> str | None:
-        """How the solver fails in a tick of this segment."""
+        """Return the fault of the solver in a tick of this segment, or None."""
         lasts = self.fault in ATTACKS or (tick // self.fault_period) % 2 == 0
         return self.fault if lasts else None
 
@@ -197,7 +197,7 @@ def _ticks(timing: str, random: np.random.Generator) -> Callable[[], Any]:
 
 
 class Starts:
-    """Draws what a controller is reset to."""
+    """Draws states to which a controller is reset."""
 
     def __init__(self, robot: Robot, kept: Array, random: np.random.Generator) -> None:
         self._robot, self._kept, self._random = robot, kept, random
@@ -223,7 +223,7 @@ class Starts:
         return self._random.uniform(self._robot.position_lower, self._robot.position_upper)
 
     def _apart(self) -> Array:
-        """A random posture with all pairs apart; home where none is found soon."""
+        """Return a random posture with all pairs apart, or home if none is found soon."""
         for _ in range(50):
             q = self._posture()
             if (self._robot.distance_values(q) >= self._kept).all():
@@ -231,7 +231,7 @@ class Starts:
         return self._robot.home.copy()
 
     def _in_penetration(self) -> Array:
-        """A posture between home and a random one in penetration, where the distance has just become too small."""
+        """Return a posture on the way from home to a random one in penetration, where a distance is just too small."""
         far = self._posture()
         for _ in range(50):
             if (self._robot.distance_values(far) < 0.0).any():
@@ -253,7 +253,7 @@ FINGERS = (*TABLE_ONLY, ContactPair(pair=("left_*_finger_*", "right_*_finger_*")
 
 
 def with_contact(config: Config, pairs: tuple[ContactPair, ...]) -> Config:
-    """The cell as it is where it allows contact, else with ``pairs`` that may touch."""
+    """Return the cell unchanged if it allows contact, else with ``pairs`` that may touch."""
     if config.control.contact_allowed:
         return config
     return config.model_copy(update={"control": config.control.model_copy(update={"contact_allowed": pairs})})

@@ -1,4 +1,4 @@
-"""A long run of a hostile policy through the whole pipeline; every promise of the contract is checked at every tick."""
+"""A long run of a hostile policy through the whole pipeline. Every promise of the contract is checked at each tick."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ COUNTED = {
     "fallbacks": "certified stops executed",
 }
 STREAMS = ("walk", "limits", "other_arm", "oscillate", "random", "broken", "late", "stall")
-_MOST, _LONGEST = 8, 0.4  # actions in a chunk, and what lies between them [s]
+_MOST, _LONGEST = 8, 0.4  # Most actions in a chunk, and the longest duration of a chunk [s].
 _STOPS = 1.0  # Time from the last action that counts until all arms are at rest [s].
-_PERIODS = (0.02, 0.1)  # between two actions [s]
-_TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # [m]
+_PERIODS = (0.02, 0.1)  # Range of the time between two actions [s].
+_TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Coordinates of far targets for tools [m].
 
 
 class _Segment(NamedTuple):
-    """A kind of stream, for so many ticks."""
+    """A stream of one kind that lasts some ticks."""
 
     stream: str
     space: ActionSpace
     ticks: int
-    every: int  # ticks from one chunk to the next
-    step: float  # of an action, at most [m or rad]
-    goal: Array  # numbers of an action, to which most streams lead
+    every: int  # Ticks from one chunk to the next.
+    step: float  # Largest step of an action [m or rad].
+    goal: Array  # The action to which most streams lead.
 
 
 class HostilePolicy:
-    """Draws actions at random; most begin where the arms are, or they would be refused and move nothing."""
+    """Draws actions at random. Most begin where the arms are, because others would be refused and move nothing."""
 
     def __init__(self, robot: Robot, random: np.random.Generator) -> None:
         self._robot, self._random = robot, random
@@ -60,7 +60,7 @@ class HostilePolicy:
         return self._random.uniform(self._robot.position_lower, self._robot.position_upper)
 
     def _postures_in_collision(self) -> list[Array]:
-        """Postures in which one arm is inside the other."""
+        """Return postures in which one arm is inside the other."""
         arms = tuple(self._robot.arms)
         names = [(pair.name_a, pair.name_b) for pair in self._robot.distances(self._robot.home)]
         between = [index for index, pair in enumerate(names) if {name.split("_")[0] for name in pair} == set(arms)]
@@ -72,7 +72,7 @@ class HostilePolicy:
         return found
 
     def draw(self, segment: _Segment, tick: Tick) -> tuple[Any, Any]:
-        """Actions and their times."""
+        """Draw actions and their times."""
         random, names = self._random, action_names(self._robot, segment.space)
         count = int(random.integers(1, _MOST + 1))
         period = random.uniform(*_PERIODS)
@@ -100,7 +100,7 @@ class HostilePolicy:
         return np.zeros(6 * len(self._robot.arms))
 
     def goal(self, stream: str, space: ActionSpace, step: float) -> Array:
-        """Where a stream leads to: for motions, the motion itself."""
+        """Draw the goal of a stream. In the space of tool motions, this is the motion of each action."""
         random, robot = self._random, self._robot
         q = self._posture()
         if stream == "limits":
@@ -118,7 +118,7 @@ class HostilePolicy:
         return np.concatenate(poses)
 
     def _broken(self, actions: Array, times: Array) -> tuple[Any, Any]:
-        """Actions that no policy should send."""
+        """Return actions that no policy should send."""
         random = self._random
         place = tuple(int(random.integers(size)) for size in actions.shape)
         actions[place] = random.choice([np.nan, np.inf, -np.inf, 1e300])
@@ -141,7 +141,7 @@ class PolicySoak:
     """Runs a cell with a hostile policy and no operator, on a plant that follows exactly."""
 
     def __init__(self, config: Config, seed: int, streams: Sequence[str] = STREAMS) -> None:
-        self._streams, self._round = streams, list[str]()  # each of them comes once a round
+        self._streams, self._round = streams, list[str]()  # Each stream comes once per round.
         config = config.model_copy(update={"control": config.control.timed(realtime=False)})
         self._cell, self._seed, self._period = config.name, seed, 1.0 / config.nominal_rate_hz
         self._input = PolicyInput()
@@ -165,11 +165,11 @@ class PolicySoak:
                 progress(f"tick {self._ticks} of {ticks}")
 
         self._pipeline.listeners.append(show)
-        log = logging.getLogger("q2r2_control.pipeline.operator_side")  # which tells of every fault
+        log = logging.getLogger("q2r2_control.pipeline.operator_side")  # It would log every fault.
         log.disabled = True
         try:
             self._pipeline.run(ticks * self._period, realtime=False)
-        except Exception as error:  # a policy ends no run
+        except Exception as error:  # A policy must not end the run.
             self._contract.raised()
             self._keep("exceptions", self._contract.margins["exceptions"], f"{type(error).__name__}: {error}")
         finally:
@@ -182,7 +182,7 @@ class PolicySoak:
             simulated_s=self._ticks * self._period,
             counts=dict(self._counts),
             margins=[*self._contract.margins.values(), self._rest],
-            memory_growth_mb=None,  # a summary keeps events up to a bound, which hostile actions reach
+            memory_growth_mb=None,  # The summary's bounded list of events would count as growth.
             broken=list(self._broken.values()),
         )
 
@@ -217,7 +217,7 @@ class PolicySoak:
             self._send(tick)
 
     def _keep(self, key: str, margin: Margin, error: str) -> None:
-        """The first time that a promise was broken, with the tick before."""
+        """Keep the first break of a promise, with the tick before."""
         q, v = (
             (self._pipeline.robot.home,) * 2 if self._last is None else (self._last.reference.q, self._last.reference.v)
         )

@@ -1,4 +1,4 @@
-"""The promises of the Cartesian controller, the worst value seen of each, and distances as Coal measures them."""
+"""The promises of the Cartesian controller, the worst value of each, and distances that Coal measures."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval, StepReport
 
-RELATIVE = 1e-9  # to which the contract promises limits
-COAL = 2e-6  # how exactly Coal measures a capsule from a box [m]
+RELATIVE = 1e-9  # Relative tolerance of the limits in the contract.
+COAL = 2e-6  # Error of Coal's distance between a capsule and a box [m].
 
-PROMISES = {  # key: name, unit, and what its value has to be
+PROMISES = {  # By key: name, unit, comparison and bound of the value.
     "exceptions": ("exceptions raised by step", "", "<=", 0.0),
     "not_finite": ("references that are not finite", "", "<=", 0.0),
     "unreported": ("unusable targets not reported", "", "<=", 0.0),
@@ -52,14 +52,14 @@ PROMISES = {  # key: name, unit, and what its value has to be
 
 @dataclass(slots=True)
 class Margin:
-    """One promise: ``worst`` has to stay at or below ``allowed`` (``sense`` "<=") or at or above it (">=")."""
+    """One promise. ``worst`` has to stay at or below ``allowed`` (``sense`` "<="), or at or above it (">=")."""
 
     name: str
     unit: str
     sense: str
     allowed: float
     worst: float = field(init=False)
-    tick: int | None = None  # of the worst
+    tick: int | None = None  # Tick of the worst value.
     checked: int = 0
     violations: int = 0
 
@@ -67,7 +67,7 @@ class Margin:
         self.worst = -math.inf if self.sense == "<=" else math.inf
 
     def note(self, value: float, tick: int) -> bool:
-        """Keep the worst; False where the promise is broken. A value that is not a number breaks it."""
+        """Keep the worst value, and return False if the promise is broken. NaN breaks it."""
         self.checked += 1
         sign = 1.0 if self.sense == "<=" else -1.0
         kept = sign * value <= sign * self.allowed
@@ -77,14 +77,15 @@ class Margin:
         return kept
 
     def described(self, value: float) -> str:
-        """One value of this promise beside what is allowed."""
+        """Return a text with one value of this promise and the allowed bound."""
         return f"{self.name}: {f'{value:.12g} {self.unit}'.rstrip()}, allowed {self.sense} {self.allowed:.12g}"
 
 
 class MeasuredDistances:
-    """Of every monitored pair, and of the pairs of held objects, less what they have to be.
+    """Margins of all monitored pairs and of the pairs of held objects: distances minus the kept distances.
 
-    ``kept`` (p,) and ``held`` (o,) [m] are what pairs and pairs of objects keep; minus infinity: it does not count.
+    ``kept`` (p,) and ``held`` (o,) are the kept distances of pairs and of pairs of objects [m]. A pair with minus
+    infinity does not count.
     """
 
     def __init__(self, robot: Robot, kept: Array) -> None:
@@ -93,36 +94,36 @@ class MeasuredDistances:
         self.kept = kept
         self._robot = robot
         self._at_corners = deeper_at_corners(collision_model_of(robot), kept)
-        self._fingers: CoalDistances | None = None  # None: all of their way
+        self._fingers: CoalDistances | None = None  # None if fingers may be anywhere on their way.
         objects = robot.objects.geometry.copy()
-        for pair in robot.collision_model.collisionPairs:  # which come before those of objects
+        for pair in robot.collision_model.collisionPairs:  # These pairs come before those of objects.
             objects.removeCollisionPair(pair)
         self._of_objects = CoalDistances(robot.model, objects)
         self.forget()
 
     def forget(self) -> None:
-        """Fingers may be anywhere on their way, and no object counts."""
+        """Forget openings and grasps: fingers may be anywhere on their way, and no object counts."""
         self._fingers = None
         self.held = np.full(len(self._robot.objects.pair_names()), -np.inf)
 
     def set_openings(self, openings: Mapping[str, Interval]) -> None:
-        """Between which openings each arm's gripper is; of an arm that is not named, all of the way."""
+        """Set the interval of each gripper's opening. The gripper of an arm that is not named may be anywhere."""
         model = collision_model_at(self._robot.collision_model, self._robot.finger_bodies, openings)
         self._fingers = CoalDistances(self._robot.model, model)
 
     def least_of(self, postures: Array) -> float:
-        """Least margin of a pair at any of ``postures`` (s, nv) [m]."""
+        """Return the least margin of a pair at any of ``postures`` (s, nv) [m]."""
         return min(
             min(float(self.margins(q).min(initial=np.inf)), float(self._object_margins(q).min(initial=np.inf)))
             for q in postures
         )
 
     def margins(self, q: Array) -> Array:
-        """How much farther apart than it has to be every pair is (p,) [m]."""
+        """Return the margin of every pair (p,): its distance minus its kept distance [m]."""
         return np.asarray(self._values(q) - self.kept + self._at_corners)
 
     def reported_margin(self, report: StepReport) -> float:
-        """Least margin that a report tells of, the nearest pair judged by what it has to keep here [m]."""
+        """Return the least margin in a report [m]. For its nearest pair, the kept distance of this object counts."""
         closest = frozenset(report.closest_pair)
         if closest in self._objects:
             return report.margin
@@ -130,10 +131,10 @@ class MeasuredDistances:
         return min(report.margin, report.closest_distance - kept)
 
     def compare(self, q: Array, report: StepReport) -> tuple[Array, list[float]]:
-        """The margins (p,) [m], and by how much the least distance and margin of a report are wrong [m].
+        """Return the margins (p,) [m], and the errors of the least distance and margin in a report [m].
 
-        Not compared are penetrations, whose depth Coal measures otherwise, pairs of objects and of moving obstacles,
-        and boxes that may be touched, which are rounded for the controller.
+        Some pairs are not compared. Coal defines the depth of a penetration differently. Boxes that may be touched are
+        rounded for the controller. Pairs of objects and of moving obstacles are not among the monitored pairs.
         """
         values, margins = self._values(q), self.margins(q)
         closest, tightest = frozenset(report.closest_pair), frozenset(report.tightest_pair)
@@ -145,13 +146,13 @@ class MeasuredDistances:
         return margins, wrong
 
     def _object_margins(self, q: Array) -> Array:
-        """The same of the pairs of held objects that are apart, or have to be [m]."""
+        """Return the margins of pairs of held objects that are apart, or have to be [m]."""
         if not np.isfinite(self.held).any():
             return np.zeros(0)
         values = self._of_objects.at(q)
-        seen = np.isfinite(self.held) & ((values > 0.0) | (self.held >= 0.0))  # Coal's depth is another quantity
+        seen = np.isfinite(self.held) & ((values > 0.0) | (self.held >= 0.0))  # Coal's depth is different.
         return (values - self.held)[seen]
 
     def _values(self, q: Array) -> Array:
-        """As :meth:`Robot.distance_values`, with fingers at the openings that the controller counts with."""
+        """Return :meth:`Robot.distance_values`, with fingers at the openings that the controller assumes."""
         return self._robot.distance_values(q) if self._fingers is None else self._fingers.at(q)

@@ -1,4 +1,4 @@
-"""A long adversarial run of the controller in which every promise of its contract is checked at every tick."""
+"""A long run of the controller under hostile input. Every promise of its contract is checked at every tick."""
 
 from __future__ import annotations
 
@@ -48,38 +48,38 @@ COUNTED = {
     "grasps": "grasps and releases",
     "changes": "changes of settings",
 }
-_LOOKS = (0.1, 0.4, 0.7, 1.0)  # shares of the ticks after which the memory is measured
-MEMORY_ALLOWED = 5.0  # [MB]
+_LOOKS = (0.1, 0.4, 0.7, 1.0)  # Shares of the ticks after which the memory is measured.
+MEMORY_ALLOWED = 5.0  # Allowed growth of the memory [MB].
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """The first time that a promise was broken, with the request at that tick."""
+    """The first break of a promise, with the request at that tick."""
 
     promise: str
     tick: int
     segment: str
-    since_segment: int  # ticks
+    since_segment: int  # Ticks since the segment began.
     q: Array  # (nv,) before the tick [rad]
-    v: Array  # (nv,) [rad/s]
-    targets: dict[str, Any]  # arm -> homogeneous matrix (4, 4)
+    v: Array  # (nv,) before the tick [rad/s]
+    targets: dict[str, Any]  # By arm, a homogeneous matrix (4, 4).
     dt: str
-    error: str  # of an exception
+    error: str  # Text of an exception.
 
 
 @dataclass(frozen=True, slots=True)
 class SoakReport:
-    """Results of a soak."""
+    """The results of a soak."""
 
     cell: str
     solver: str
     seed: int
     ticks: int
     simulated_s: float
-    counts: dict[str, int]  # see :data:`COUNTED`
+    counts: dict[str, int]  # See :data:`COUNTED`.
     margins: list[Margin]
-    memory_growth_mb: float | None  # see steady_growth; None where the system does not tell
-    broken: list[Violation]  # the first of each promise, in the order of their ticks
+    memory_growth_mb: float | None  # See steady_growth; None if not measured.
+    broken: list[Violation]  # The first violation of each promise, in the order of their ticks.
 
     @property
     def passed(self) -> bool:
@@ -88,7 +88,7 @@ class SoakReport:
         return lean and not any(margin.violations for margin in self.margins)
 
     def as_json(self) -> dict[str, Any]:
-        """Data for the JSON writer."""
+        """Return the data for the JSON writer."""
         data = {field.name: getattr(self, field.name) for field in fields(self)}
         return data | data.pop("counts") | {"passed": self.passed}
 
@@ -100,10 +100,10 @@ def run_soak(
     progress: Callable[[str], None] = lambda what: None,
     solver: Solver | None = None,
 ) -> SoakReport:
-    """Soak the controller of a cell; at ticks without a made-up fault the cell's solver, or ``solver``, is asked."""
+    """Soak the controller of a cell. At ticks without an injected fault, the cell's solver or ``solver`` is used."""
     robot = Robot.from_config(config)
     settings = config.control.timed(realtime=True)
-    # The solver gets no time limit: a soak that finds something has to find it again.
+    # The solver gets no time limit, because a soak that finds a fault has to find it again.
     simulated = config.control.timed(realtime=False)
     inner = solver_of(simulated, robot.model.nv) if solver is None else Guard(solver, robot.model.nv)
     name = config.control.solver if solver is None else type(solver).__name__
@@ -114,7 +114,7 @@ def run_soak(
 
 
 class Soak:
-    """Drives a controller through random segments and has every tick checked."""
+    """Drives a controller through random segments, and checks every tick."""
 
     def __init__(
         self, cell: str, controller: CartesianController, solver: FaultySolver, seed: int, solver_name: str = DAQP
@@ -150,7 +150,7 @@ class Soak:
         )
 
     def _ticks(self, ticks: int) -> Iterator[tuple[Segment, int]]:
-        """The segment of each tick and the tick within it; the controller is reset where a segment has a start."""
+        """Yield the segment of each tick and the tick within it. A segment with a start resets the controller."""
         left = ticks
         robot, settings = self._controller.robot, self._controller.settings
         kept = kept_distances(robot, settings).values
@@ -177,7 +177,7 @@ class Soak:
         self._change_cell()
         try:
             reference = self._controller.step(request.targets, dt)
-        except Exception as error:  # the contract promises none
+        except Exception as error:  # The contract promises that there is none.
             self._contract.raised()
             self._keep(tick, segment, since, request, dt, ["exceptions"], f"{type(error).__name__}: {error}")
             self._reset(self._controller.robot.home, np.zeros_like(self._q))
@@ -196,7 +196,7 @@ class Soak:
         self._counts["unsolved"] += reference.report.unsolved > 0 and fault is None
 
     def _change_cell(self) -> None:
-        """Openings of grippers, grasps and settings change as they like."""
+        """Change openings of grippers, grasps and settings at random."""
         if (opening := self._hostile.opening()) is not None:
             arm, interval = opening
             self._counts["openings"] += 1
@@ -222,13 +222,13 @@ class Soak:
 
 
 def steady_growth(memory: Sequence[float | None]) -> float | None:
-    """How much a leak may have added to the ``memory`` from the first of these measurements to the last [MB].
+    """Return the growth of ``memory`` that a leak may have caused from the first measurement to the last [MB].
 
-    A leak adds as much in each of the equal spans between them. The heap also grows until it has room for the largest
-    tick, which adds to some spans and not to the others. The least of them therefore counts, once for each span.
+    A leak adds the same amount in each of the equal spans between measurements. The heap also grows until it can hold
+    the largest tick, but only in some spans. Therefore the least growth of a span counts, multiplied by the spans.
 
     Args:
-        memory: Two or more measurements [MB], None where the system did not tell.
+        memory: Two or more measurements [MB]; None if the system gave no value.
 
     Returns:
         The growth [MB]; None if a measurement is missing.
@@ -240,9 +240,9 @@ def steady_growth(memory: Sequence[float | None]) -> float | None:
 
 
 def _memory_mb() -> float | None:
-    """Memory of this process after collecting garbage, without files [MB]; None where the system does not tell.
+    """Return the memory of this process after garbage collection, without files [MB]; None if it is not known.
 
-    Pages of libraries become resident whenever one of their functions is first called, however long that takes.
+    Files are left out, because pages of a library become resident at the first call of a function, at any time.
     """
     gc.collect()
     try:

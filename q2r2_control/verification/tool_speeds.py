@@ -1,4 +1,4 @@
-"""Speeds of tools as Pinocchio finds them, for a check that does not trust the kernels."""
+"""Speeds of tools that Pinocchio computes, for a check that does not use our kernels."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from q2r2_control.types import Array
 
 
 class MeasuredToolSpeeds:
-    """The fastest tool of a robot."""
+    """Computes the speed of a robot's fastest tool."""
 
     def __init__(self, robot: Robot) -> None:
         self._model, self._data = robot.model, robot.model.createData()
         self._frames = [arm.frame_id for arm in robot.arms.values()]
 
     def fastest(self, q: Array, v: Array) -> float:
-        """Speed of the fastest tool's origin [m/s] at ``q`` [rad], ``v`` [rad/s], (nv,) each or one row an instant."""
+        """Return the speed of the fastest tool's origin [m/s].
+
+        ``q`` [rad] and ``v`` [rad/s] are (nv,), or have one such row for each instant.
+        """
         return max(map(self._fastest, np.atleast_2d(q), np.atleast_2d(v)))
 
     def _fastest(self, q: Array, v: Array) -> float:

@@ -1,1 +1,1 @@
-"""Views of a run or a headset. They listen, nothing waits for them, and none needs ROS."""
+"""Views of a run or a headset. Nothing waits for a view, and no view needs ROS."""

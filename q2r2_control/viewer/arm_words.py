@@ -1,4 +1,4 @@
-"""Sentences on the arms of a run: why each is where it is, and what its operator can do next."""
+"""Sentences about the arms of a run: the reason for the state of each arm, and the next steps of its operator."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from q2r2_control.teleop.arm_states import ArmState, is_refusal
 from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.wording import sentence
 
-# A tool nearer to its target than this follows; what holds it back beyond that is said [m], [rad].
+# A tool within this distance of its target follows [m], [rad]. Beyond it, the sentence names what holds the tool back.
 _FOLLOWS, _TURNED = 0.005, 0.05
 _HELD_BY = {LimitKind.POSITION: "at its limit", LimitKind.VELOCITY: "as fast as it may turn"}
 _FOLLOWS_WHAT = {str(ArmState.CARRIED): "goes with the other arm", str(ArmState.POLICY): "follows the policy"}
@@ -24,11 +24,11 @@ _FOLLOWS_WHAT = {str(ArmState.CARRIED): "goes with the other arm", str(ArmState.
 class Told(NamedTuple):
     """The events of an arm that say why it is in its state."""
 
-    change: Event | None = None  # of its state
-    refusal: Event | None = None  # the newest one since
+    change: Event | None = None  # The last change of state.
+    refusal: Event | None = None  # The newest refusal since then.
 
     def after(self, event: Event) -> Told:
-        """The events that are told after one more ``event``. News that change nothing hide no reason."""
+        """Return the events to tell after one more ``event``. Events without a change of state hide no reason."""
         if event.source != event.destination:
             return Told(event)
         return Told(self.change, event) if is_refusal(event) else self
@@ -39,7 +39,7 @@ class Told(NamedTuple):
 
 
 def told_after(told: Mapping[str, Told], events: Iterable[Event]) -> dict[str, Told]:
-    """The events of each arm that are told after ``events``."""
+    """Return the events of each arm to tell after ``events``."""
     newest = dict(told)
     for event in events:
         newest[event.arm] = newest.get(event.arm, Told()).after(event)
@@ -47,28 +47,28 @@ def told_after(told: Mapping[str, Told], events: Iterable[Event]) -> dict[str, T
 
 
 class ArmWords:
-    """Makes sentences on the arms of one run, in the words of the device that drives them."""
+    """Makes sentences about the arms of one run, in the words of the device that drives them."""
 
     def __init__(
         self, joints: Mapping[str, Collection[str]], bindings: BindingSettings, device: DeviceWords = NO_WORDS
     ) -> None:
-        """``joints``: names of those that move each arm; ``bindings``: what the device's controls do."""
+        """Prepare sentences for arms with these ``joints``, by arm; ``bindings`` are the actions of the controls."""
         self._joints, self._bindings, self._device = joints, bindings, device
-        self.told: Mapping[str, Told] = {}  # of each arm
+        self.told: Mapping[str, Told] = {}  # By arm.
 
     def follow(self, events: Iterable[Event]) -> None:
-        """Keep what ``events`` tell."""
+        """Keep the ``events`` that tell the state of an arm."""
         self.told = told_after(self.told, events)
 
     def controls(self) -> dict[str, str]:
-        """In words what each control of a hand does that does something."""
+        """Return the action of each bound control of a hand, in words."""
         bound = {self._device.noun(binding.words): MEANINGS[binding.action] for binding in self._bindings.bound()}
         both = [self._device.noun(control) for control in ("lower", "upper") if control in self._device.nouns]
         chord = {} if len(both) < 2 else {" and ".join(both): "the headset's alignment: stops both arms until let go"}
         return bound | chord
 
     def why(self, tick: Tick, arm: str, binding: Collection[ActiveLimit]) -> str:
-        """Why ``arm`` is where it is. ``binding``: limits and pairs that held the last steps back, as in a report."""
+        """Return why ``arm`` is in its state. ``binding`` are limits that held the last steps back, as in a report."""
         if not tick.following:
             return "the run ends"
         if tick.states[arm] in (ArmState.ALIGNING, ArmState.HOMING):
@@ -88,7 +88,7 @@ class ArmWords:
         return sentence(reason, self._device)
 
     def next_press(self, tick: Tick, arm: str) -> str:
-        """Instructions for the operator of an arm, with their effects."""
+        """Return instructions for the operator of an arm, with their effects."""
         state, device, bindings = tick.states[arm], self._device, self._bindings
         if device.nobody:
             return f"nothing: {device.nobody}"
@@ -115,7 +115,7 @@ class ArmWords:
 
 
 def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[ActiveLimit]) -> str | None:
-    """The pair or limit of an arm that is nearest to what moves the tool, if any is at work."""
+    """Return the pair or limit that holds an arm back, if any: a pair of bodies first, then tool speed, then joints."""
     report = tick.reference.report
     pairs = [limit.names for limit in binding if limit.kind is LimitKind.SEPARATION]
     pairs = [pair for pair in pairs if any(body.startswith(f"{arm}_") for body in pair)]

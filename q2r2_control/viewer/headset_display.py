@@ -17,33 +17,37 @@ from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.state_colours import state_colour
 from q2r2_control.viewer.tightest_pair import TightestPair
 
-_DIGITS = 4  # of metres and quaternions
+_DIGITS = 4  # Decimals of metres and quaternions.
 
 
 class ShownTick(NamedTuple):
-    """The shown part of a run. Words are made where this is sent."""
+    """The shown part of a run at one tick. The process that sends the messages makes the words."""
 
     tick: Tick
-    binding: tuple[ActiveLimit, ...]  # limits that held a step back since the last one
-    told: Mapping[str, Told]  # of each arm
-    hands: Mapping[str, str]  # that drive each arm
-    moved: Array | None  # MuJoCo's positions of all that moves
+    binding: tuple[ActiveLimit, ...]  # Limits that held a step back since the last shown tick.
+    told: Mapping[str, Told]  # By arm.
+    hands: Mapping[str, str]  # By arm, the hand that drives it.
+    moved: Array | None  # MuJoCo's positions (qpos) of everything that moves.
     recording: str
 
 
 class RunDisplay:
-    """Makes messages, in the process that sends them, where the robot is read from its URDF."""
+    """Makes the messages of the display, in the process that sends them. The robot is read there from its URDF."""
 
     def __init__(self, run: ShownRobot, model: pin.Model, pairs: pin.GeometryModel, parts: Mapping[str, int]) -> None:
-        """``pairs`` of bodies of the controller's ``model`` are monitored; ``parts`` are :func:`places_of_parts`."""
+        """Prepare the display.
+
+        ``pairs`` are the monitored pairs of bodies of the controller's ``model``; ``parts`` are from
+        :func:`places_of_parts`.
+        """
         self._run, self._model, self._pairs, self._parts = run, model, pairs, parts
-        # The page knows what is in the operator's hands, and puts its words in.
+        # The page knows the device in the operator's hands, and replaces these names by the words for its controls.
         bound = {binding.control for binding in run.config.teleop.bindings.bound()}
         self._words = run.words(DeviceWords(nouns={control: f"{{{control}}}" for control in bound}))
 
     def scene(self) -> ShownScene:
-        """Meshes, each in the frame of a joint, and the loose parts."""
-        from q2r2_control.viewer.joint_tree import JointTree, colour_of  # for which trimesh is needed, an extra
+        """Return the meshes, each in the frame of a joint, and the loose parts."""
+        from q2r2_control.viewer.joint_tree import JointTree, colour_of  # It needs trimesh, which is an extra.
 
         self._tree, self._tightest = JointTree(self._run), TightestPair(self._model, self._pairs)
         self._data = self._tree.model.createData()
@@ -68,7 +72,7 @@ class RunDisplay:
         }
 
     def _joints_of_tool(self, joints: Array) -> list[int]:
-        """The last joint of an arm and all that it carries, as its fingers."""
+        """Return the last joint of an arm and all joints that it carries, such as fingers."""
         model = self._tree.model
         carried = [model.getJointId(self._run.joint_names[joints[-1]])]
         for joint in range(carried[0] + 1, model.njoints):
@@ -77,7 +81,7 @@ class RunDisplay:
         return carried
 
     def message(self, shown: ShownTick) -> ShownState:
-        """A moment of the run."""
+        """Return the message about one moment of the run."""
         tick, words = shown.tick, self._words
         words.told = shown.told
         pin.forwardKinematics(self._tree.model, self._data, self._tree.posture(tick.state.q, tick.grippers))
@@ -112,6 +116,6 @@ def _rounded(pose: pin.SE3) -> Seven:
 
 
 def _part(moved: Array, at: int) -> Seven:
-    """The pose of a part, whose quaternion MuJoCo writes w x y z."""
+    """Return the pose of a part with the quaternion x y z w. MuJoCo has w x y z."""
     x, y, z, qw, qx, qy, qz = moved[at : at + 7].round(_DIGITS).tolist()
     return x, y, z, qx, qy, qz, qw

@@ -1,4 +1,4 @@
-"""The messages of a headset as a table: live or once."""
+"""The messages of a headset as a table, which is either live or printed once."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ _COLUMNS = ("topic", "messages", "rate [Hz]", "age [s]", "last value")
 
 
 def topic_table(title: str, topics: Mapping[str, TopicStatistics | None], silent: Collection[str] = ()) -> Table:
-    """One row a topic, in the order given; None where nothing has come yet. Those in ``silent`` are marked."""
+    """Return a table with a row for each topic, in the given order. Topics in ``silent`` are marked.
+
+    The statistics of a topic are None if no message has come yet.
+    """
     return figure_table(title, _COLUMNS, _topic_rows(topics, silent))
 
 
@@ -37,7 +40,7 @@ def _topic_rows(topics: Mapping[str, TopicStatistics | None], silent: Collection
 
 
 def topic_line(name: str, topic: TopicStatistics | None, is_silent: bool) -> str:
-    """One topic in one line."""
+    """Return one topic as one line of text."""
     prefix = f"{name}: timeout, " if is_silent else f"{name}: "
     if topic is None:
         return f"{prefix}nothing yet"
@@ -45,7 +48,7 @@ def topic_line(name: str, topic: TopicStatistics | None, is_silent: bool) -> str
 
 
 def short_text(message: HandMessage) -> str:
-    """A message's main values, rounded."""
+    """Return the main values of a message, rounded."""
     if isinstance(message, HandPose):
         return f"{_numbers(message.position)} m, quaternion {_numbers(message.quaternion)}"
     if isinstance(message, HandTwist):
@@ -57,11 +60,11 @@ def short_text(message: HandMessage) -> str:
 
 
 def _numbers(values: Iterable[float]) -> str:
-    return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)  # without minus zero
+    return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)  # The addition of 0.0 turns -0.0 into 0.0.
 
 
 def headset_table(check: HeadsetCheck) -> Table:
-    """Connection, topics, and where the hands move."""
+    """Return a table of the connection, the topics, and the direction in which each hand moves."""
     statistics = check.statistics
     state = f"{statistics.peer} connected" if statistics.peer else "not connected"
     dialect = f", dialect {statistics.dialect}" if statistics.dialect else ""
@@ -77,7 +80,7 @@ def headset_table(check: HeadsetCheck) -> Table:
 
 @contextmanager
 def headset_display(console: Console) -> Iterator[Callable[[HeadsetCheck], None]]:
-    """Show the state of a headset: as a live table on a terminal; elsewhere only advice, when it changes."""
+    """Show the state of a headset as a live table on a terminal. Elsewhere, print only advice when it changes."""
     drawn, advised = -math.inf, tuple[str, ...]()
 
     def advise(check: HeadsetCheck) -> None:

@@ -1,4 +1,4 @@
-"""The run's side of its display on a headset: hands ticks to the input's process, and does what its buttons ask for."""
+"""The run's side of its display on a headset. It sends ticks to the input's process, and obeys its buttons."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from q2r2_control.viewer.headset_display import RunDisplay, ShownTick
 from q2r2_control.viewer.loose_parts import places_of_parts
 from q2r2_control.viewer.shown_robot import ShownRobot
 
-_PERIOD = 1.0 / 30.0  # between messages [s]
+_PERIOD = 1.0 / 30.0  # Time between messages [s].
 _EPISODE_OVER = (
     ReasonKind.EPISODE_ENDS,
     ReasonKind.EPISODE_SUCCEEDED,
@@ -33,21 +33,21 @@ class DisplayInput(Input, Protocol):
     """An input whose device shows the run, as a headset does."""
 
     def show_on(self, display: Display, requests: Mapping[HeadsetRequest, Callable[[], None]]) -> None:
-        """Show a run by ``display``; its buttons call ``requests``, in any thread. Before ``start``."""
+        """Show a run by ``display``. Its buttons call ``requests``, in any thread. To be called before ``start``."""
 
     def show(self, content: Any) -> bool:
-        """Show the newest state; False where the last one still waits. Never waits."""
+        """Show the newest state without waiting; return False if the last state is not sent yet."""
 
     def show_picture(self, jpeg: bytes) -> bool:
-        """Show the newest picture of a camera, as :meth:`show`; from any thread."""
+        """Show the newest picture of a camera, in the same way as :meth:`show`. Any thread may call this."""
 
 
 class HeadsetView:
-    """A listener of one run. A tick stores references, 30 times a second the input's process gets them."""
+    """A listener of one run. Each tick stores references, and the input's process gets them 30 times a second."""
 
     def __init__(self, source: DisplayInput, pipeline: Pipeline, recorded: bool) -> None:
         self._source, self._recorded = source, recorded
-        self._due = 0.0  # of the next message, by the clock on the wall [s]
+        self._due = 0.0  # Time of the next message, by the monotonic clock [s].
         self._binding: dict[ActiveLimit, None] = {}
         self._told: dict[str, Told] = {}
         self._episodes, self._open = 0, False

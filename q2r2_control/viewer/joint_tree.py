@@ -1,4 +1,4 @@
-"""A cell's robot as a tree of joints with meshes, of what the URDF shows."""
+"""A cell's robot as a tree of joints with the meshes of its URDF."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.shown_robot import ShownRobot
 
 Colour = tuple[int, int, int]
-_SHARP = 0.6  # an edge, which is not shaded as round [rad]
+_SHARP = 0.6  # An edge with a larger angle is shaded as sharp, not as round [rad].
 
 
 class JointTree:
-    """All joints that move, of arms and fingers, and the shapes that each carries."""
+    """All movable joints of arms and fingers, and the shapes that each of them carries."""
 
     def __init__(self, shown: ShownRobot) -> None:
         self.model = pin.buildModelFromXML(shown.urdf)
         self._index = {name: self.model.joints[self.model.getJointId(name)].idx_q for name in self.model.names[1:]}
         self._arms = np.array([self._index[name] for name in shown.joint_names])
-        self._strokes: dict[str, tuple[list[int], float, float]] = {}  # of each gripper: joints, closed, open
+        # Joints of each arm's gripper, and their closed and open position.
+        self._strokes: dict[str, tuple[list[int], float, float]] = {}
         for arm, config in shown.config.arms.items():
             joints = [self._index[name] for name in shown.fingers[arm]]
             self._strokes[arm] = joints, config.gripper.closed_position, config.gripper.open_position
@@ -42,7 +43,7 @@ class JointTree:
             for kind in (pin.GeometryType.VISUAL, pin.GeometryType.COLLISION)
         )
         drawn = {shape.parentFrame for shape in visual.geometryObjects}
-        # A link that is drawn as nothing is drawn as what may not be touched; an envelope would hide what it is around.
+        # A link without visual shapes shows its collision shapes. Envelopes would hide the shapes inside them.
         undrawn = (shape for shape in solid.geometryObjects if shape.parentFrame not in drawn)
         self._shapes = [
             *visual.geometryObjects,
@@ -50,7 +51,7 @@ class JointTree:
         ]
 
     def posture(self, q: Array, openings: Mapping[str, float]) -> Array:
-        """Positions (nq,) of all joints: arms at ``q`` (nv,), grippers at their ``openings``, 0 closed .. 1 open."""
+        """Return positions (nq,) of all joints, with arms at ``q`` (nv,) and grippers at ``openings`` (1 is open)."""
         full: Array = pin.neutral(self.model)
         full[self._arms] = q
         for arm, (joints, closed, opened) in self._strokes.items():
@@ -60,7 +61,7 @@ class JointTree:
         return full
 
     def meshes(self) -> Iterator[tuple[int, Colour, trimesh.Trimesh]]:
-        """Of each joint, by its index, and colour: all shapes in the joint's frame."""
+        """Yield the index of a joint, a colour, and the mesh of all its shapes of this colour, in the joint's frame."""
         found: dict[tuple[int, Colour], list[trimesh.Trimesh]] = {}
         for shape in self._shapes:
             mesh = mesh_of(shape.geometry)

@@ -1,4 +1,4 @@
-"""The live table of a run, which a thread draws: a tick only stores a reference."""
+"""The live table of a run. A thread draws it, so that each tick only stores a reference."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from q2r2_control.viewer.arm_words import ArmWords
 from q2r2_control.wording import limit_name
 
 _REFRESH_RATE = 6.0  # [Hz]
-# The loop gets the interpreter back within this time from drawing, which takes milliseconds of Python at a time [s].
+# A drawing thread needs milliseconds of Python at a time. The loop gets the interpreter back after this time [s].
 _SWITCH_INTERVAL = 2e-5
 _LIMITS_SHOWN, _BAR = 4, 20
-_NEAR = 0.01  # a pair with less to spare is coloured [m]
+_NEAR = 0.01  # A pair with a smaller margin is coloured [m].
 
 
 class LiveTable:
@@ -37,10 +37,10 @@ class LiveTable:
         *,
         simulated_time: bool = False,
     ) -> None:
-        """``words`` are those of the run's arms.
+        """Prepare the table; ``words`` makes the sentences about the run's arms.
 
-        ``steps`` of the work, from when on and in words, of a run that takes ``duration``, both in [s].
-        ``simulated_time`` is True if the table shall say how fast the run is, compared with real time.
+        ``steps`` are the steps of the work, each with its begin [s] and its name, for a run with a known ``duration``
+        [s]. If ``simulated_time`` is True, the table compares the speed of the run with real time.
         """
         self._title, self._words = title, words
         self._steps, self._duration = steps, duration
@@ -49,7 +49,7 @@ class LiveTable:
         self._binding: dict[ActiveLimit, None] = {}
         self._repelled: dict[str, None] = {}
         self._simulated_time = simulated_time
-        self._drawn = (time.monotonic(), 0, 0.0)  # when, after how many ticks, and the time of the run then [s]
+        self._drawn = (time.monotonic(), 0, 0.0)  # The last drawing: time [s], count of ticks, and time of the run [s].
 
     def __call__(self, tick: Tick) -> None:
         """Store one tick."""
@@ -64,8 +64,8 @@ class LiveTable:
     def shown(self, console: Console) -> Iterator[None]:
         """Show the table on ``console`` for as long as the context lasts, if it is a terminal.
 
-        Lines that are printed meanwhile come above the table. The loop must print nothing: it would wait for the
-        terminal.
+        Lines that are printed during this time appear above the table. The loop must print nothing, because it would
+        wait for the terminal.
         """
         if not console.is_terminal:
             yield
@@ -84,7 +84,7 @@ class LiveTable:
             yield
         finally:
             sys.setswitchinterval(before)
-            with suppress(OSError):  # the terminal is gone
+            with suppress(OSError):  # The terminal may be closed.
                 live.stop()
 
     def _drawn_table(self) -> Table | str:
@@ -94,7 +94,7 @@ class LiveTable:
             return f"no live table: {type(error).__name__}: {error}"
 
     def render(self) -> Table:
-        """The table at this moment."""
+        """Return the table at this moment."""
         tick, (then, counted, reached), now = self._newest, self._drawn, time.monotonic()
         self._drawn = now, self._count, 0.0 if tick is None else tick.t
         passed = max(now - then, 1e-9)

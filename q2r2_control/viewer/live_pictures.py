@@ -1,4 +1,4 @@
-"""Pictures of one camera of the simulated cell for those who look on, taken in a process of their own."""
+"""Pictures of one camera of the simulated cell for spectators. A process of its own takes them."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.process.helper_process import HelperProcess
 from q2r2_control.summary.tick import Tick
 
-_NICENESS = 19  # loop and hands go first
-_QUALITY = 70  # of JPEG
+_NICENESS = 19  # The loop and the hands have priority.
+_QUALITY = 70  # The quality of JPEG.
 _logger = logging.getLogger(__name__)
 
 
 class PictureSetup(NamedTuple):
-    """The first request."""
+    """The first request to the process that takes pictures."""
 
-    model: bytes  # an mujoco.MjModel, pickled
+    model: bytes  # A pickled mujoco.MjModel.
     name: str
     camera: CameraConfig
 
 
 def main(requests: Iterator[Any], answer: Callable[[bytes], None]) -> None:
-    """Answer a JPEG for each request, which says where everything is."""
+    """Answer each request with a JPEG. After the setup, each request holds MuJoCo's positions (qpos)."""
     setup = next(requests, None)
     if setup is None:
         return
@@ -45,7 +45,7 @@ def main(requests: Iterator[Any], answer: Callable[[bytes], None]) -> None:
 
 
 class LivePictures(AbstractContextManager["LivePictures"]):
-    """A listener of one run, as a context around it. Where it fails, a line says so and the run goes on."""
+    """A listener of one run, and a context around it. If it fails, it logs one line and the run goes on."""
 
     def __init__(
         self,
@@ -56,14 +56,17 @@ class LivePictures(AbstractContextManager["LivePictures"]):
         show: Callable[[bytes], object],
         watched: Callable[[], bool],
     ) -> None:
-        """``show`` gets ``most`` pictures a second while ``watched``, in its own thread. Raises :class:`OSError`."""
+        """Start the process; raises :class:`OSError`.
+
+        ``show`` gets up to ``most`` pictures a second in a thread of its own, as long as ``watched`` returns True.
+        """
         self._plant, self._period, self._watched = plant, 1.0 / min(camera.rate, most), watched
-        self._due = 0.0  # by the clock on the wall [s]
+        self._due = 0.0  # Time of the next picture, by the monotonic clock [s].
 
         def pass_on(jpeg: bytes) -> None:
             show(jpeg)
 
-        # Room for one request: a newer picture is better than a queue.
+        # Only one request may wait, because a newer picture is better than a queue of old ones.
         self._process = HelperProcess("takes pictures", __name__, pass_on, room=1, idle=None, **ENVIRONMENT)
         self._process.send(PictureSetup(pickle.dumps(plant.model), name, camera))
         self._told = False

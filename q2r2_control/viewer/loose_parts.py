@@ -1,4 +1,4 @@
-"""The loose parts of a simulated cell. Not for processes that only draw, which need no simulator."""
+"""The loose parts of a simulated cell. Processes that only draw must not import this: they need no simulator."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 
 
 def places_of_parts(plant: object, config: Config) -> dict[str, int]:
-    """Loose parts of a simulated cell by name, and where in MuJoCo's positions the pose of each begins."""
+    """Return the loose parts of a simulated cell by name, with the index in qpos at which the pose of each begins."""
     if not isinstance(plant, MujocoPlant):
         return {}
     return {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in config.mujoco.objects}

@@ -1,4 +1,4 @@
-"""The robot of a cell, as a process that draws it gets it."""
+"""The robot of a cell in the form that is sent to a process that draws it."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from q2r2_control.viewer.arm_words import ArmWords
 
 @dataclass(frozen=True)
 class ShownRobot:
-    """All that a tree of joints with meshes is made of."""
+    """The data from which a tree of joints with meshes is built."""
 
     config: Config
     urdf: str
     joint_names: tuple[str, ...]
-    joints: Mapping[str, Array]  # of each arm, indices of ``joint_names``
-    fingers: Mapping[str, tuple[str, ...]]  # of each arm, joints of its gripper
+    joints: Mapping[str, Array]  # By arm, indices of ``joint_names``.
+    fingers: Mapping[str, tuple[str, ...]]  # By arm, the joints of its gripper.
 
     @classmethod
     def of(cls, robot: Robot, config: Config) -> Self:
@@ -34,6 +34,6 @@ class ShownRobot:
         )
 
     def words(self, device: DeviceWords) -> ArmWords:
-        """Sentences on the arms, in the words of the ``device`` that drives them."""
+        """Return the maker of sentences about the arms, in the words of the ``device`` that drives them."""
         joints = {arm: [self.joint_names[index] for index in its] for arm, its in self.joints.items()}
         return ArmWords(joints, self.config.teleop.bindings, device)

@@ -1,4 +1,4 @@
-"""The colour of each state of an arm, and of obstacles that move, the same on every display: r g b."""
+"""The colours (r g b) of the states of an arm and of moving obstacles. They are the same on every display."""
 
 from __future__ import annotations
 
@@ -25,5 +25,5 @@ def state_colour(state: str) -> Colour:
 
 
 def obstacle_colour(report: ObstacleReport) -> Colour:
-    """RED for one that moves and whose report is so old that arms keep farther away from it."""
+    """Return RED if the obstacle moves and its report is so old that arms keep farther away, else AMBER."""
     return RED if report.obstacle.speed > 0.0 and report.age > REPORT_AGE else AMBER

@@ -14,18 +14,18 @@ from rich.table import Table
 from rich.text import Text
 
 Cell = Text | str | float | None
-_NARROWEST_NAME = 12  # names are folded, but not below this
+_NARROWEST_NAME = 12  # A column of names is folded, but not to fewer characters than this.
 _WIDEST = 1000
 
 
 def figure_table(
     title: str, columns: Sequence[str], given: Iterable[Sequence[Cell]], notes: Sequence[str] = ()
 ) -> Table:
-    """A table of figures and names under headings; ``notes`` are lines below it.
+    """Return a table of figures and names under headings; ``notes`` are lines below it.
 
-    A heading's unit, which follows its last space, stands in a second line. A column with a unit or with numbers keeps
-    to the right and is never cut; others go on in the next line. A row of one cell is the heading of the rows below.
-    Where the console is too narrow even so, the table is wider than the console: print it by :func:`print_table`.
+    The unit of a heading follows its last space, and is put into a second line. A column with a unit or with numbers is
+    aligned to the right and is never cut. Other columns continue in the next line. A row of one cell is the heading of
+    the rows below. If the console is too narrow, the table is wider than it. Therefore use :func:`print_table`.
     """
     given = list(given)
     rows = [tuple(map(_shown, row)) for row in given]
@@ -51,7 +51,7 @@ def figure_table(
 
 
 def print_table(table: Table, console: Console) -> None:
-    """Print a table without cutting figures off, which may take lines that are longer than the console's."""
+    """Print a table without cutting figures off. Its lines may be longer than those of the console."""
     of_title, table.min_width = table.min_width, None
     needed = Measurement.get(console, console.options.update(max_width=_WIDEST), table).minimum
     table.min_width, table.width = of_title, needed if needed > console.width else None
@@ -59,7 +59,7 @@ def print_table(table: Table, console: Console) -> None:
 
 
 def record_table(title: str, records: Sequence[Any], notes: Sequence[str] = ()) -> Table:
-    """A row for each field of ``records``, dataclasses of one type, and a column for each of them.
+    """Return a table with a row for each field of ``records``, dataclasses of one type, and a column for each record.
 
     The first field names the columns. A field that holds several figures has one cell for all of them.
     """
@@ -72,7 +72,7 @@ def record_table(title: str, records: Sequence[Any], notes: Sequence[str] = ()) 
 
 
 def short_figure(value: float | None) -> str:
-    """Three significant digits or so: two after the point below 10, one below 100, none above."""
+    """Return about three significant digits: two decimals below 10, one decimal below 100, and none above."""
     if value is None:
         return "-"
     digits = 2 if abs(value) < 9.995 else 1 if abs(value) < 99.95 else 0
@@ -80,7 +80,7 @@ def short_figure(value: float | None) -> str:
 
 
 def _shown(cell: Cell) -> Text:
-    """Cells are never markup: a unit in brackets would be."""
+    """Return a cell as Text, because Rich would read a unit in brackets as markup."""
     if isinstance(cell, Text):
         return cell
     return Text(str(cell) if isinstance(cell, str | int) else short_figure(cell))

@@ -1,4 +1,4 @@
-"""Where the pair of bodies is that has the least to spare."""
+"""The place of the pair of bodies that has the smallest margin."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class TightestPair:
         pin.updateGeometryPlacements(self._model, self._data, self._pairs, self.placed, q)
 
     def ends(self, report: StepReport) -> Array | None:
-        """The nearest points (2, 3) [m] of the pair, of bodies as placed; None if it is not known."""
+        """Return the nearest points (2, 3) of the pair, with the bodies as placed [m]; None if it is not known."""
         if report.tightest_pair not in self._names or not math.isfinite(report.margin):
             return None
         result = pin.computeDistance(self._pairs, self.placed, self._names.index(report.tightest_pair))

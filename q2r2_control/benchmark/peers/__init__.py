@@ -1,1 +1,1 @@
-"""Public controllers to compare with, each in a module of its own, which alone imports its package."""
+"""Public controllers for comparison. Each is in a module of its own, and only that module imports its package."""

@@ -16,7 +16,7 @@ from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# Peer -> the package that it needs, whose name its module and its class have here.
+# By peer, the package that it needs. Its module and its class here have the name of the package.
 PEERS = {
     "roboplan": "roboplan",
     "roboplan, 10 nearest": "roboplan",
@@ -26,40 +26,41 @@ PEERS = {
 }
 WITHOUT_ACCELERATION_LIMIT = ("mink",)
 INSTALL = install_line("bench")
-NEAREST_ROWS = 10  # separation rows of a peer that is given the nearest pairs only
-DETECTION_DISTANCE = 0.25  # pairs farther apart than this need no exact distance [m]
+NEAREST_ROWS = 10  # Separation rows of a peer that gets only the nearest pairs.
+DETECTION_DISTANCE = 0.25  # Pairs farther apart than this need no exact distance [m].
 
 
 class BenchController(Protocol):
     """A controller that runs open loop: it integrates its own configuration."""
 
     name: str
-    limitations: str  # which parts of our contract it cannot keep, in a few words
+    limitations: str  # The parts of our contract that it cannot keep, in a few words.
 
     def reset(self, q: Array) -> None:
         """Start at rest at ``q`` (nv,) [rad], in the order of ``Robot.joint_names``."""
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """One tick: positions [rad] and velocities [rad/s] after it, (nv,) each. Raises where it has no solution."""
+        """Do one tick; return positions [rad] and velocities [rad/s], (nv,) each. Raises if it has no solution."""
 
     def hold(self) -> tuple[Array, Array]:
-        """The tick after a failure: the same positions, at rest."""
+        """Return the same positions at rest, as the tick after a failure."""
 
 
 class PeerSettings:
-    """Our settings in the units of the peers, for ticks of ``dt`` [s]: gains per tick, limits with our margins."""
+    """Our settings in the units of the peers, for ticks of ``dt`` [s]: gains per tick, and limits with our margins."""
 
     def __init__(self, robot: Robot, config: Config, dt: float) -> None:
         control = config.control
         self.robot, self.config, self.dt = robot, config, dt
-        self.position_gain = control.position_gain * dt  # part of the tool's position error that a tick removes
-        self.posture_gain = control.posture_gain * dt  # part of the posture error that a tick removes
-        self.posture_cost = float(control.posture_weight**0.5)  # square root of its weight against the tool's 1
+        self.position_gain = control.position_gain * dt  # Share of the tool's position error that a tick removes.
+        self.posture_gain = control.posture_gain * dt  # Share of the posture error that a tick removes.
+        self.posture_cost = float(control.posture_weight**0.5)  # Root of its weight; a tool has 1.
         self.velocity = robot.velocity_limit * control.velocity_scale  # (nv,) [rad/s]
         self.acceleration = robot.capped_acceleration(control.acceleration_limit)  # (nv,) [rad/s^2]
         self.lower = robot.position_lower + control.position_margin  # (nv,) [rad]
         self.upper = robot.position_upper - control.position_margin  # (nv,) [rad]
-        # The smallest distance that we keep of any pair: peers know one for all, and none is refused our work [m].
+        # The smallest distance that we keep for any pair [m]. Peers have one distance for all pairs, and with this one
+        # no peer has to avoid postures that ours may take.
         self.min_distance = float(kept_distances(robot, control).values.min(initial=control.min_distance))
         home = compose(config).home.items()
         # Home positions of joints that move no tool, such as fingers.
@@ -67,19 +68,19 @@ class PeerSettings:
 
 
 def make_peer(name: str, setup: PeerSettings) -> BenchController:
-    """Build a peer of ``PEERS``. Raises what its package raises."""
+    """Build a peer of ``PEERS``; raises any exception of its package."""
     module = importlib.import_module(f"q2r2_control.benchmark.peers.{PEERS[name]}")
     peer: BenchController = getattr(module, PEERS[name].capitalize())(setup, name)
     return peer
 
 
 def is_installed(name: str) -> bool:
-    """Whether a peer's package can be found."""
+    """Return whether a peer's package can be found."""
     return importlib.util.find_spec(PEERS[name]) is not None
 
 
 def build_peers(names: Sequence[str], setup: PeerSettings) -> tuple[list[BenchController], list[str]]:
-    """The peers that can be built, and a line on each of ``names``: its limitations, or why there is none."""
+    """Return the peers that can be built, and a line for each name with its limitations or why it is missing."""
     peers, notes = list[BenchController](), list[str]()
     for name in names:
         if not is_installed(name):
@@ -88,16 +89,16 @@ def build_peers(names: Sequence[str], setup: PeerSettings) -> tuple[list[BenchCo
         try:
             peers.append(make_peer(name, setup))
             notes.append(f"{name}: {peers[-1].limitations}")
-        except Exception as error:  # a package of another version may raise anything
+        except Exception as error:  # Another version of a package may raise anything.
             notes.append(f"{name}: cannot be built for this cell: {type(error).__name__}: {error}")
     return peers, notes
 
 
 class Leading:
-    """A peer that is given its targets ahead along their way."""
+    """A peer whose targets are moved ahead of time along their paths, to make up for its lag."""
 
     def __init__(self, peer: BenchController, gain: float) -> None:
-        """``gain`` of the peer's tools [1/s]."""
+        """Wrap ``peer``, whose tools have the ``gain`` [1/s]."""
         self.name, self.limitations = peer.name, peer.limitations
         self._peer, self._gain = peer, gain
         self._last: Mapping[str, pin.SE3] = {}
@@ -107,7 +108,7 @@ class Leading:
         self._peer.reset(q)
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """The peer's, towards where each target would be after 1 / gain, going on as since the last tick."""
+        """Do the peer's tick with targets moved on by 1 / gain [s] at their speed since the last tick."""
         before, self._last = self._last or targets, targets
         share, ahead = 1.0 / (self._gain * dt), {}
         for arm, pose in targets.items():

@@ -1,13 +1,13 @@
 """embodiK: prioritised differential inverse kinematics in C++, on Pinocchio and Coal.
 
-Has position, velocity and acceleration limits and keeps the nearest pairs apart, not by a QP but by joints and rows
-that are held at their limits one by one. They can contradict each other; it says so then. It knows nothing of braking
-distances. It is given the same URDF as roboplan, with our bodies as its collision shapes, the same pairs, and rows for
-the ten nearest, whatever their distance: by itself it has them within five times the distance kept, which is 5 mm here.
-Tools go as near to their targets as limits allow (MIN_ERROR). By itself it scales a tool's whole velocity down until
-all limits hold (SCALE), and then stood 47 mm from a target in free air. Both tools have the first priority and the
-posture the second one: its weights are gains, and a posture cannot have a small weight against a tool. Fingers, joints
-there, may not move.
+embodiK has position, velocity and acceleration limits, and keeps the nearest pairs apart. There is no QP: joints and
+rows are held at their limits one by one. Limits can contradict each other, and it reports that. Braking distances are
+not considered. It gets the same URDF as roboplan, with our bodies as its collision shapes, and the same pairs. It has
+rows for the ten nearest pairs at any distance. By default it has rows only within five times the kept distance, which
+is 5 mm here. Tools get as near to their targets as limits allow (MIN_ERROR). By default it reduces a tool's whole
+velocity until all limits hold (SCALE), and then stopped 47 mm from a target in free air. Both tools have the first
+priority and the posture the second one, because weights are gains here: a posture cannot have a small weight against a
+tool. Fingers, which are joints in its model, must not move.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from q2r2_control.types import Array
 
 
 class Embodik:
-    """See the module."""
+    """embodiK as a controller of the bench; see the module."""
 
     limitations = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
 
@@ -61,7 +61,7 @@ class Embodik:
         self.reset(robot.home)
 
     def _limit_joints(self, setup: PeerSettings) -> None:
-        """Our limits, and 0 rad/s for the fingers. Position limits are those of the URDF."""
+        """Set our limits, and 0 rad/s for the fingers. Position limits are those of the URDF."""
         solver = self._solver
         velocity, acceleration = np.zeros(self._model.nv), np.full(self._model.nv, setup.acceleration.max())
         velocity[self._indices], acceleration[self._indices] = setup.velocity, setup.acceleration

@@ -1,9 +1,9 @@
 """mink: differential inverse kinematics as one QP, on MuJoCo.
 
-Has position and velocity limits and collision avoidance for chosen pairs of geometries, but no acceleration limit. Its
-collision bound divides a distance by dt and is compared with a displacement of one tick. The gain that lets a pair
-close in at our rate is therefore our gain times dt squared. It drops pairs of a body and its parent. It is given the
-simulation's MuJoCo model, with every monitored capsule; the fingers, joints there, are frozen by equalities.
+mink has position and velocity limits and collision avoidance for chosen pairs of geometries, but no acceleration limit.
+Its collision bound divides a distance by dt, and is compared with a displacement of one tick. Therefore the gain with
+which a pair closes in at our rate is our gain times dt squared. mink drops pairs of a body and its parent. It gets the
+MuJoCo model of the simulation, with every monitored capsule. The fingers are joints there, and equalities freeze them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from q2r2_control.types import Array
 
 
 class Mink:
-    """See the module."""
+    """mink as a controller of the bench; see the module."""
 
     limitations = "no acceleration limit; no braking distance to pairs; no pairs of body and parent; no certificate"
 
@@ -32,7 +32,7 @@ class Mink:
         control, robot = setup.config.control, setup.robot
         bare = setup.config.model_copy(update={"mujoco": setup.config.mujoco.model_copy(update={"objects": {}})})
         self._model = build_model(robot, bare)
-        # Pairs that the simulation lets pass through each other are to be avoided all the same.
+        # Pairs that may pass through each other in the simulation have to be avoided here too.
         self._model.geom_contype[:] = self._model.geom_conaffinity[:] = 1
         joints = [self._model.joint(name) for name in robot.joint_names]
         self._q_index = np.array([joint.qposadr[0] for joint in joints])
@@ -94,10 +94,13 @@ class Mink:
 
 
 def _mujoco_names(urdf: str) -> dict[str, str]:
-    """Pinocchio's name of each collision shape, LINK_0, LINK_1, ..., and MuJoCo's: the URDF's, but of the floor."""
+    """Return MuJoCo's names of collision shapes by Pinocchio's names LINK_0, LINK_1, ...
+
+    MuJoCo has the names of the URDF, except for the floor.
+    """
     shapes = {
         f"{link.get('name')}_{index}": shape.get("name", "")
         for link in ET.fromstring(urdf).iterfind("link")
         for index, shape in enumerate(link.findall("collision"))
     }
-    return shapes | {f"{FLOOR}_0": FLOOR}  # a plane in the simulation
+    return shapes | {f"{FLOOR}_0": FLOOR}  # The floor is a plane in the simulation.

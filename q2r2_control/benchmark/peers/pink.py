@@ -1,9 +1,9 @@
 """pin-pink: differential inverse kinematics as one QP, on Pinocchio and Coal.
 
-Has position, velocity and acceleration limits and a barrier on the nearest pairs, all hard, so that they can contradict
-each other: it raises then. The barrier knows nothing of braking distances. It is given the same Pinocchio model, the
-same capsules and pairs as ours, and rows for the ten nearest. For all pairs it takes six times as long. Its damping
-towards a safe displacement, gain 1 by itself, is off, since it slows the tools down at ticks of 1 ms.
+Pink has position, velocity and acceleration limits and a barrier on the nearest pairs. All are hard, so that they can
+contradict each other, and then it raises. The barrier does not consider braking distances. Pink gets the same Pinocchio
+model, capsules and pairs as ours, and rows for the ten nearest pairs. With all pairs it takes six times as long. Its
+damping towards a safe displacement, with the default gain 1, is off, because it slows the tools at ticks of 1 ms.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from q2r2_control.types import Array
 
 
 class Pink:
-    """See the module."""
+    """Pink as a controller of the bench; see the module."""
 
     limitations = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
 

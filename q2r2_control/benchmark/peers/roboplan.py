@@ -1,13 +1,13 @@
 """roboplan: OInK, differential inverse kinematics as one QP in C++, on Pinocchio, Coal and ProxQP.
 
-Has position, velocity and acceleration limits and a barrier on the nearest pairs. All are hard, so that they can
-contradict each other; it raises then. By itself its solver would look for the nearest feasible problem instead. That
-follows some targets more closely, but took up to a minute in one tick, and is off. Its iterations are a tenth of the
-usual, since single ticks still took minutes. The barrier knows nothing of braking distances. It is given the same URDF
-with our margins in its position limits, and our bodies in place of its collision shapes. It has the same pairs, the
-smallest distance that we keep, and rows for every pair or for the ten nearest. Its solver's tolerance is left as it is
-(1e-6 rad a tick): tighter ones cost it up to two minutes in one tick. Its damping towards a safe displacement, gain 1
-by itself, is off: with it the tools hardly follow at ticks of 1 ms.
+roboplan has position, velocity and acceleration limits and a barrier on the nearest pairs. All are hard, so that they
+can contradict each other, and then it raises. By default its solver looks for the nearest feasible problem instead.
+That follows some targets more closely, but took up to a minute in one tick, and is off. The iterations are limited to a
+tenth of the default, because single ticks still took minutes. The barrier does not consider braking distances. roboplan
+gets the same URDF with our margins in its position limits, and our bodies in place of its collision shapes. It has the
+same pairs, the smallest distance that we keep, and rows for every pair or for the ten nearest. The tolerance of its
+solver is the default (1e-6 rad per tick), because smaller ones took up to two minutes in one tick. The damping towards
+a safe displacement, with the default gain 1, is off, because with it the tools hardly follow at ticks of 1 ms.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ITERATIONS = 1000
 
 
 class Roboplan:
-    """See the module."""
+    """roboplan as a controller of the bench; see the module."""
 
     limitations = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
 
@@ -54,7 +54,7 @@ class Roboplan:
         posture = optimal_ik.ConfigurationTask(
             self._ik,
             robot.home,
-            np.full(nv, control.posture_weight),  # a weight as it is, where the others square a cost
+            np.full(nv, control.posture_weight),  # A plain weight. The others square a cost.
             optimal_ik.ConfigurationTaskOptions(task_gain=setup.posture_gain),
         )
         self._tasks = [*self._frame_tasks.values(), posture]
@@ -103,7 +103,7 @@ class Roboplan:
 
 
 def _watch_pairs(scene: core.Scene, robot: Robot) -> None:
-    """Have the scene watch the links of our pairs and no others."""
+    """Let the scene check the links of our pairs, and no others."""
     links = sorted({link_of(geometry.name) for geometry in robot.collision_model.geometryObjects})
     watched = {frozenset((link_of(a), link_of(b))) for a, b in pair_names(robot.collision_model)}
     pairs = list(combinations(links, 2))

@@ -1,1 +1,1 @@
-"""Between ROS and the package's own data: messages in and out, and whether the other side can be relied on."""
+"""Conversion between ROS messages and the package's own data, and checks whether the other side can be relied on."""

@@ -1,4 +1,4 @@
-"""Reports of one arm's teleoperation: to its hand as vibrations, to the log, to RViz, to a recording."""
+"""Report on one arm's teleoperation: to its hand as vibrations, to the log, to RViz and to a recording."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ from q2r2_control.wording import event_line
 if TYPE_CHECKING:
     from q2r2_control.loop.control_loop import ArmConditions
 
-_AXIS_LENGTH, _AXIS_WIDTH, _PATH_WIDTH, _BALL = 0.1, 0.008, 0.004, 0.04  # [m]
+_AXIS_LENGTH, _AXIS_WIDTH, _PATH_WIDTH, _BALL = 0.1, 0.008, 0.004, 0.04  # Sizes of markers [m].
 _PATH_POINTS = 200
-_PATH_STEP = 0.005  # between two points of the path [m]
+_PATH_STEP = 0.005  # Distance between two points of the path [m].
 _RGB = ((1.0, 0.1, 0.1), (0.1, 0.8, 0.1), (0.2, 0.3, 1.0))
 _SIDES = {"left": (0.1, 0.6, 1.0), "right": (1.0, 0.55, 0.1)}
-_PAUSED = 0.35  # opacity
-_MARKER_PERIOD, _CONDITION_PERIOD = 0.05, 0.04  # [s]
+_PAUSED = 0.35  # Opacity of the markers while the arm is paused.
+_MARKER_PERIOD, _CONDITION_PERIOD = 0.05, 0.04  # Times between two messages [s].
 
 
 class TargetMarkers:
-    """Markers of one arm. Axes and ball are in the tool's frame, so a paused target sits on the robot's actual pose."""
+    """The markers of one arm. Axes and ball are in the tool's frame, so that a paused target is at the actual tool."""
 
     def __init__(self, arm: str, tool_frame: str, world_frame: str) -> None:
         self._arm, self._tool_frame, self._world_frame = arm, tool_frame, world_frame
         self._path: deque[Array] = deque(maxlen=_PATH_POINTS)
 
     def at(self, target: pin.SE3 | None, tool: pin.SE3 | None, engaged: bool, now: float) -> list[Marker]:
-        """Markers at ``now`` [s] of a target and a tool in the world frame; none while the tool is not known."""
+        """Return the markers of a target and a tool in the world frame at ``now`` [s]; none without a known tool."""
         if tool is None:
             return []
         shown = target if engaged and target is not None else tool
@@ -85,17 +85,17 @@ def _point(position: Array) -> Point:
 
 
 class ArmFeedback:
-    """Tells it, and keeps what was told last."""
+    """Reports on one arm, and keeps its last event."""
 
     def __init__(self, node: BaseNode, arm: str, values: ArmParameters, hand: HandIntake) -> None:
         self._node, self._hand = node, hand
         self.haptics = HapticPulses(values.teleop.haptics)
-        self.last_line, self.last_kind = "not engaged yet", ""  # of the last event; the kind of its first cause
-        self.paused = "not engaged yet"  # by the last event that let the arm hold
+        self.last_line, self.last_kind = "not engaged yet", ""  # The last event, and the kind of its first cause.
+        self.paused = "not engaged yet"  # The last event that let the arm hold.
         self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
         self._markers = node.create_publisher(Marker, "visualization_marker", 10)
         self._shown = 0.0
-        # For recordings.
+        # These publishers are for recordings.
         flags, events, target = map(node.name_in_set, (arm_flags(arm), arm_events(arm), asked_target(arm)))
         self._flags = node.create_publisher(Float64MultiArray, flags, RECORDED_QOS)
         self._events = node.create_publisher(String, events, RECORDED_QOS)
@@ -120,11 +120,15 @@ class ArmFeedback:
         hand: str,
         now: float,
     ) -> None:
-        """Of one tick at ``now`` [s]: what the ``target`` has become, ``sent`` to the controller, world frame."""
+        """Publish the report of one tick at ``now`` [s].
+
+        ``sent`` is the pose that was sent to the controller for ``target``, in the world frame.
+        """
         if self._flags.get_subscription_count():
             if (command := target.command) is not None:
                 self._target.publish(stamped_pose(command, WORLD, now))
-            numbers = (engaged, target.slip, target.slip_angle, target.gripper, gripper.opening)  # as ARM_FIELDS
+            # The numbers are in the order of ARM_FIELDS.
+            numbers = (engaged, target.slip, target.slip_angle, target.gripper, gripper.opening)
             self._flags.publish(Float64MultiArray(data=[float(number) for number in numbers]))
         self.haptics.slip(target.slip, target.slip_angle)
         self.haptics.grasps(gripper.holds)
@@ -134,7 +138,7 @@ class ArmFeedback:
             self._shown = now
             if not self._markers.get_subscription_count():
                 return
-            asked = None if sent is None else with_offset(sent, target.offset)  # where the tool is to be
+            asked = None if sent is None else with_offset(sent, target.offset)  # The goal of the tool.
             for marker in self._drawn.at(asked, tool, engaged, now):
                 self._markers.publish(marker)
 
@@ -148,7 +152,7 @@ class _Condition(BaseModel):
 
 
 class ConditionPublishers:
-    """Publishes the condition of each arm that somebody listens to."""
+    """Publishes the conditions of the arms while somebody listens."""
 
     def __init__(self, node: BaseNode, arms: Any, conditions: ArmConditions) -> None:
         self._conditions = conditions
@@ -169,7 +173,7 @@ class ConditionPublishers:
 
 
 def listen_to_condition(node: BaseNode, controller: str, arm: str, notice: Callable[[ArmCondition], None]) -> None:
-    """Call ``notice`` with what the controller of this name says of an arm."""
+    """Call ``notice`` with each condition of an arm that the controller reports."""
     topic = f"{controller}/condition/{arm}"
 
     def take(message: String) -> None:

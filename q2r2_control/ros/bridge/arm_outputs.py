@@ -1,4 +1,4 @@
-"""Where one arm's target goes: straight to the controller that moves the arm, or through the built-in controller."""
+"""Send one arm's target to the controller that moves the arm, directly or through the built-in controller."""
 
 from __future__ import annotations
 
@@ -25,21 +25,22 @@ from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.hand_motion import MAX_OFFSET
 
-_POSE = 2  # of moveit_msgs/srv/ServoCommandType
-# Reports of the built-in controller on an arm that takes a stream of targets.
+_POSE = 2  # The constant POSE of moveit_msgs/srv/ServoCommandType.
+# States in which the built-in controller reports that an arm accepts a stream of targets.
 _READY = ("holding", "following", "homing")
-_ANSWER = 0.2  # the controller has told of all earlier streams by then [s]
-_LOOK_PERIOD = 0.04  # of asking the graph for it [s]
+_ANSWER = 0.2  # After this time the controller has reported the end of all earlier streams [s].
+_LOOK_PERIOD = 0.04  # Time between two queries of the graph for the controller [s].
 _STATE_TYPE = "std_msgs/msg/String"
-_SILENT = 2.0  # a controller that has not reported for so long does not answer; it reports twice a second [s]
-_RETRY = 1.0  # the service is called again if it has not answered for this long [s]
+_SILENT = 2.0  # A controller without a report for this time does not answer. It reports twice a second [s].
+_RETRY = 1.0  # The service is called again after this time without an answer [s].
 
 
 class ArmOutputs:
-    """In mode raw one output. In mode filtered ``first`` drives the built-in controller, whose result is relayed.
+    """The outputs of one arm: one in mode raw, and up to two in mode filtered.
 
-    The relay starts when the arm is engaged and the built-in controller's tool is where the arm's tool is. It goes on
-    through pauses, so that the arm comes to rest as the built-in controller does.
+    In mode filtered, ``first`` drives the built-in controller, and its result is relayed to the arm's controller. The
+    relay starts when the arm is engaged and the built-in controller has its tool at the arm's tool. It continues in
+    pauses, so that the arm comes to rest as the built-in controller does.
     """
 
     def __init__(self, node: BaseNode, arm: str, values: ArmParameters, safe_target: PoseTopic) -> None:
@@ -60,23 +61,23 @@ class ArmOutputs:
                 self.first = theirs
         self._all = [self.first] if self._last is None else [self.first, self._last]
         self._follows: FollowWatch | None = None
-        # The built-in controller's name, where hands' targets go to it; and where it moves the arm, also home.
+        # The name of the built-in controller if it gets the hand's targets; and its name if it also moves the arm home.
         self.builtin = values.builtin_node if self.first.preset is BUILTIN else None
         self.home_controller = None if self._filtered else self.builtin
         if self.first.preset is BUILTIN:
-            # Twice the usual timeout: the targets have to arrive first, and then the answer.
+            # The timeout is twice the usual one, because the targets have to arrive first, and then the answer.
             self._follows = FollowWatch(node, values.builtin_node, arm, 2.0 * values.listener_timeout)
         service = preset.command_type
         self._command_type = None if service is None else CommandType(node, service.format(ctrl=values.prefix))
-        self._safe_problem: Reason | None = self._safe_target.problem  # why the relay could not begin now
+        self._safe_problem: Reason | None = self._safe_target.problem  # Why the relay cannot begin now.
         self._relaying = False
         raw = not self._filtered and preset is not BUILTIN
-        # Of the built-in controller the arm's node knows the reference, which may rightly stand still.
+        # The built-in controller needs no such watch: its reference is known here, and may stand still for a reason.
         self._stands = StandstillWatch(LAGGING_TOOL) if raw else None
         self._node, self._arm = node, arm
 
     def limit(self, guard: GuardSettings) -> None:
-        """Other limits of the targets that go to the preset's controller, from the next one on."""
+        """Change the limits of the targets for the preset's controller, from the next target on."""
         output = self._last if self._filtered else self.first
         if output is not None:
             output.guard.change(guard)
@@ -88,7 +89,7 @@ class ArmOutputs:
 
     @property
     def unready(self) -> Reason | None:
-        """Why the arm may not be engaged yet."""
+        """The reason why the arm may not be engaged yet, or None."""
         if unready := next((unready for output in self._all if (unready := output.unready)), None):
             return unready
         if self._last is not None and not self._relaying:
@@ -101,7 +102,7 @@ class ArmOutputs:
 
     @property
     def homing(self) -> tuple[bool, Reason | None]:
-        """Whether the built-in controller says that it goes home, and how the last way ended by itself."""
+        """Whether the built-in controller reports that it goes home, and how the last way home ended by itself."""
         return (False, None) if self._follows is None else (self._follows.homing, self._follows.homing_outcome)
 
     @property
@@ -118,7 +119,7 @@ class ArmOutputs:
         return {output.topic: output.sent for output in self._all}
 
     def take_fault(self, now: float) -> Reason | None:
-        """Check the controllers; returns once why the arm has to pause because of one."""
+        """Check the controllers. If the arm has to pause because of one, return the reason once."""
         faults = [output.take_fault(now) for output in reversed(self._all)]
         if self._last is not None and faults[0] is not None:
             self._relaying = False
@@ -130,13 +131,16 @@ class ArmOutputs:
         return _refused(next((fault for fault in faults if fault), None))
 
     def standstill(self, tool: pin.SE3 | None, received: float, now: float) -> Reason | None:
-        """A reason where the controller takes targets and does not move the tool, measured then [s]."""
+        """Return a reason if the controller receives targets and does not move the tool, else None.
+
+        ``received`` is the time at which the tool was measured [s].
+        """
         asked = self.first.last_sent
         if self._stands is None or tool is None or asked is None or not self.first.following:
             return None
         if (way := self._stands.look(asked.translation, tool.translation, received, now)) is None:
             return None
-        self.forget(now)  # nothing is repeated that it would go to in one leap
+        self.forget(now)  # A repeated target could make the arm jump.
         takers = f" {name}" if (name := takers_of(self._node, self.first.topic)) else ""
         return _refused(standing(self._arm, takers, way, "m"))
 
@@ -162,12 +166,12 @@ class ArmOutputs:
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
-        # A stream starts at the measured tool: the safe target may differ from it by the arm's steady-state offset.
+        # A stream starts at the measured tool, from which the safe target may differ by the arm's steady-state offset.
         self._last.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
         return _refused(fault)
 
     def away(self, safe: pin.SE3 | None, tool: pin.SE3 | None) -> Reason | None:
-        """A reason where the built-in controller has its tool elsewhere: no target of this one would be followed."""
+        """Return a reason if the built-in controller has its tool elsewhere, so that it would not follow this arm."""
         if safe is None or tool is None:
             return None
         distance, angle = apart(safe, tool)
@@ -183,32 +187,32 @@ class ArmOutputs:
 
 
 class FollowWatch:
-    """Whether the built-in controller follows the targets of an arm, as it publishes on ``~/following/<arm>``.
+    """Watches whether the built-in controller follows an arm's targets, by its topic ``~/following/<arm>``.
 
-    It drops a stream for reasons of its own, such as missing joint states. It then accepts only a new one, for which
-    the arm has to be paused. A controller is ready only while it reports on ``~/state``: it may have no joint states,
-    or be another one, whose terms the built-in controller's targets do not keep.
+    The controller drops a stream for its own reasons, such as missing joint states. After that it accepts only a new
+    stream, for which the arm has to be paused. The controller is ready only while it reports on ``~/state``. Otherwise
+    it may have no joint states, or be another controller, for which these targets are not made.
     """
 
     def __init__(self, node: BaseNode, controller: str, arm: str, timeout: float) -> None:
         self.controller, self._arm, self._timeout = controller, arm, timeout
         self._topic = f"{controller}/following/{arm}"
         self._follows: bool | None = None
-        self._since = math.inf  # targets have been sent and not followed [s]
-        self._followed_since = math.inf  # targets have been sent and followed [s]
+        self._since = math.inf  # Time since which targets have been sent and not followed [s].
+        self._followed_since = math.inf  # Time since which targets have been sent and followed [s].
         self._node, self._state_topic = node, f"{controller}/state"
-        self._unready: Reason | None = None  # by the newest report
-        self._starts, self._reported_at = 0, -math.inf  # the newest report came then [s]
-        self._is_there, self._looked = False, -math.inf  # whether somebody reports, and when the graph was asked [s]
-        self.homing = False  # whether it says that it goes home
-        self.homing_outcome: Reason | None = None  # of the last way, where that ended by itself
-        self.gripper_held = ""  # what keeps the gripper from going farther
+        self._unready: Reason | None = None  # Why it is not ready, by the newest report.
+        self._starts, self._reported_at = 0, -math.inf  # Starts of the controller, and time of the newest report [s].
+        self._is_there, self._looked = False, -math.inf  # Whether a node reports, and when the graph was asked [s].
+        self.homing = False  # Whether the controller reports that it goes home.
+        self.homing_outcome: Reason | None = None  # How the last way home ended, if by itself.
+        self.gripper_held = ""  # The pair of bodies that stops the gripper.
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, self._state_topic, self._on_state, 1)
 
     @property
     def unready(self) -> Reason | None:
-        """Why the controller would follow no stream of targets now."""
+        """The reason why the controller would not follow a stream of targets now, or None."""
         if (now := time.monotonic()) - self._looked > _LOOK_PERIOD:
             self._looked, self._is_there = now, bool(self._node.count_publishers(self._state_topic))
         if not self._is_there:
@@ -221,12 +225,12 @@ class FollowWatch:
         return Reason.of(ReasonKind.TOPIC_SILENT, topic=self._state_topic, source="", age=age)
 
     def notice(self, starts: int) -> None:
-        """The reports of an earlier controller do not count; ``starts``: how often one has appeared."""
+        """Forget the reports of an earlier controller; ``starts`` counts how often a controller has appeared."""
         if starts != self._starts:
             self._starts, self._reported_at, self._unready = starts, -math.inf, None
 
     def refusal(self, sending: bool, now: float) -> Reason | None:
-        """A reason if targets are ``sending`` and are followed no more, or not yet after the timeout."""
+        """Return a reason if targets are sent, and are followed no more or not yet after the timeout; else None."""
         if self.homing:
             return None
         followed = sending and self._follows is True
@@ -234,7 +238,7 @@ class FollowWatch:
             self._since = math.inf
             self._followed_since = min(self._followed_since, now) if followed else math.inf
             return None
-        # The end of a stream before this one may be told late, when this one has not been answered yet.
+        # The report on the end of an earlier stream may come late, before this stream is answered.
         dropped = now - self._followed_since > _ANSWER
         self._since, self._followed_since = min(self._since, now), math.inf
         if not (dropped or now - self._since > self._timeout):
@@ -270,7 +274,7 @@ class FollowWatch:
 
 
 class CommandType:
-    """Tells MoveIt Servo after each of its starts that targets are poses. :class:`ConfigError` without moveit_msgs."""
+    """Sets MoveIt Servo to poses after each of its starts; raises :class:`ConfigError` without moveit_msgs."""
 
     def __init__(self, node: BaseNode, service: str) -> None:
         try:
@@ -279,14 +283,14 @@ class CommandType:
             raise ConfigError(f"{service} is a service of moveit_msgs, which cannot be imported: {error}") from None
         self._service, self._client = service, node.create_client(self._kind, service)
         self._starts, self._agreed, self._asked = -1, False, -math.inf
-        self._answer: Any = None  # future of the last call
+        self._answer: Any = None  # The future of the last call.
 
     @property
     def unready(self) -> Reason | None:
         return None if self._agreed else Reason.of(ReasonKind.NO_POSE_COMMANDS, service=self._service)
 
     def step(self, starts: int, now: float) -> None:
-        """Call the service if that is due; ``starts``: how often the controller has appeared."""
+        """Call the service if a call is due; ``starts`` counts how often the controller has appeared."""
         if starts != self._starts:
             self._starts, self._agreed, self._asked, self._answer = starts, False, -math.inf, None
         if self._answer is not None and self._answer.done():

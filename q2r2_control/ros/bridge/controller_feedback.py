@@ -1,9 +1,10 @@
 """Outputs of the built-in controller besides joint commands: safe targets, the arms that follow, openings of grippers.
 
-Fingers and what they hold are bodies. A gripper's client tells the opening that is wanted, and the one that was
-commanded last, on the topic of the arm's targets with ``/wanted_opening`` after it. It commands what
-``~/opening/<arm>`` answers: the wanted opening, and the one that is proven, 0 closed .. 1 fully open. Without a client,
-measured fingers, or with another controller of the arms, fingers count as all of their way.
+Fingers and held objects are bodies, which must not collide. Openings are 0 closed .. 1 fully open. The client of a
+gripper publishes the wanted opening and the last commanded one, on the topic of the arm's targets with
+``/wanted_opening`` at its end. On ``~/opening/<arm>`` the controller answers with the wanted opening and the proven
+one, which the client commands. Without a client, without measured fingers, or with another controller of the arms,
+fingers may be anywhere on their way.
 """
 
 from __future__ import annotations
@@ -37,19 +38,19 @@ from q2r2_control.ros.monitoring import publish_in_time
 from q2r2_control.types import Array, Reference, RobotState, StepStatus
 
 _STATUSES = tuple(StepStatus)
-# Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].
+# Time until a gripper moves to a granted opening [s]. The answer has to arrive, and ten goals are sent per second.
 GRIPPER_DELAY = 0.3
-_DISCOVERY = 1.0  # until what was published before this node began has arrived, on a busy machine too [s]
+_DISCOVERY = 1.0  # Time until earlier messages have arrived at a new node, even on a busy machine [s].
 _UNMEASURED = "its fingers are not in the joint states, or nothing is proven while the arms are stopped"
-_MARKER_PERIOD = 0.1  # [s]
-_FAR, _NEAR = 0.10, 0.02  # green beyond the first distance, red below the second [m]
+_MARKER_PERIOD = 0.1  # Time between two markers [s].
+_FAR, _NEAR = 0.10, 0.02  # The marker is green beyond the first distance, and red below the second [m].
 
 
 class ControllerFeedback:
-    """Publishes all but openings, tick by tick; each only while somebody listens."""
+    """Publishes all outputs except openings, tick by tick, and most of them only while somebody listens."""
 
     def __init__(self, node: BaseNode, controller: CartesianController, targets: TargetIntake, every: int) -> None:
-        """``every``: ticks from one safe target to the next."""
+        """Make the publishers; ``every`` is the number of ticks from one safe target to the next."""
         self._node, self._controller, self._targets, self._every = node, controller, targets, every
         self._ticks = 0
         self._reference: Reference | None = None
@@ -63,11 +64,11 @@ class ControllerFeedback:
         self._distances = node.create_publisher(Marker, "~/distances", 10)
         self._recorded_reference = node.create_publisher(JointTrajectory, node.name_in_set(REFERENCE), RECORDED_QOS)
         self._recorded_tick = node.create_publisher(Float64MultiArray, node.name_in_set(CONTROLLER_TICK), RECORDED_QOS)
-        self._last = 0.0  # tick [s]
-        self._shown = 0.0  # [s]
+        self._last = 0.0  # Time of the last tick [s].
+        self._shown = 0.0  # Time of the last marker [s].
 
     def publish(self, reference: Reference, state: RobotState, now: float, dt: float, decided: float) -> None:
-        """Of one tick of ``dt`` at ``now`` [s]; see :func:`publish_in_time`."""
+        """Publish the outputs of one tick of ``dt`` at ``now`` [s]. See :func:`publish_in_time` for ``decided``."""
         self._reference = reference
         self._conditions.update(reference.report, state, now)
         self._ticks += 1
@@ -85,7 +86,7 @@ class ControllerFeedback:
                 publish_in_time(publisher, fill_pose(self._templates[arm], tool, now), decided)
 
     def tell_followed(self, follows: Callable[[str], bool]) -> None:
-        """Say of each arm whether its targets are followed, when that changes."""
+        """Publish for each arm whether its targets are followed, when that changes."""
         for arm, publisher in self._following.items():
             if (followed := follows(arm)) != self._follows[arm]:
                 self._follows[arm] = followed
@@ -98,7 +99,7 @@ class ControllerFeedback:
                 self._distances.publish(_distance_marker(points, self._node.now))
 
     def _record(self, reference: Reference, now: float, step: float, decided: float) -> None:
-        """Return the message with the reference of a tick and the report of the step."""
+        """Publish the reference of a tick and the report of the step for a recording."""
         passed = now - self._last if self._ticks > 1 else step
         point = JointTrajectoryPoint(
             positions=reference.q.tolist(), velocities=reference.v.tolist(), accelerations=reference.a.tolist()
@@ -107,7 +108,7 @@ class ControllerFeedback:
         message.header.stamp = time_message(now)
         self._recorded_reference.publish(message)
         report = reference.report
-        # In the order of tick_fields.
+        # The numbers are in the order of tick_fields.
         numbers = (
             *(self._ticks, now, passed, step, time.monotonic() - decided, report.solve_time),
             *(_STATUSES.index(report.status), report.certified, report.fallback),
@@ -130,15 +131,15 @@ def _distance_marker(points: Array, now: float) -> Marker:
 
 
 class GripperLimits:
-    """Asks the control loop for openings, and answers with those that it grants."""
+    """Requests openings of grippers from the control loop, and publishes the granted ones."""
 
     def __init__(self, node: BaseNode, config: Config, loop: ControlLoop, targets: Mapping[str, str]) -> None:
-        """``targets``: topic of the targets of each arm whose gripper may ask."""
+        """Listen to grippers; ``targets`` are the topics of targets, by arm."""
         self._node, self._loop, self._began = node, loop, time.monotonic()
         robot = loop.controller.robot
         self._fingers = Fingers(robot, config)
-        self._measured: dict[str, tuple[float, float]] = {}  # arm -> opening, and when it was measured [s]
-        self.wanted: dict[str, float] = {}  # arm -> opening, 0 closed .. 1 fully open
+        self._measured: dict[str, tuple[float, float]] = {}  # By arm, the opening and the time of its measurement [s].
+        self.wanted: dict[str, float] = {}  # By arm, the wanted opening: 0 closed .. 1 fully open.
         self._answered: dict[str, tuple[float, float]] = {}
         self._answers: dict[str, Any] = {}
         for arm in (arm for arm in targets if arm in self._fingers.arms or arm in robot.objects.by_arm):
@@ -148,20 +149,20 @@ class GripperLimits:
 
     @property
     def held(self) -> dict[str, str]:
-        """Arm -> what keeps its gripper from the wanted opening."""
+        """By arm, the reason why its gripper does not get the wanted opening."""
         openings = self._loop.granted_openings.items()
         held = {arm: _UNMEASURED for arm, (wanted, granted) in openings if granted != wanted}
         pairs = self._loop.held_grippers.items()
         return held | {arm: f"{'|'.join(pair)} would come too close" for arm, pair in pairs}
 
     def take_joint_state(self, message: JointState | JointNumbers) -> None:
-        """Note what a message says of fingers; what it says of other joints is not looked at."""
+        """Store the positions of fingers in a message. Other joints are ignored."""
         if self._answers:
             now = self._node.now
             self._measured |= {arm: (opening, now) for arm, opening in self._fingers.openings(message).items()}
 
     def openings(self, now: float) -> dict[str, float]:
-        """Of the arms whose fingers were measured just now, 0 closed .. 1 fully open; a little beyond is possible."""
+        """Return the openings of arms with current measurements of fingers: 0 closed .. 1 open, or slightly beyond."""
         return {
             arm: opening
             for arm, (opening, at) in self._measured.items()
@@ -169,9 +170,9 @@ class GripperLimits:
         }
 
     def awaits(self, now: float) -> bool:
-        """Whether the opening of a measured gripper may have been commanded, and is not known here yet.
+        """Return whether a measured gripper may have a commanded opening that is not known here yet.
 
-        Its fingers would count as all of their way: arms that rest near something with closed grippers would back off.
+        Without it, fingers may be anywhere on their way, and arms at rest near an object would move away from it.
         """
         if time.monotonic() - self._began > _DISCOVERY:
             return False
@@ -191,7 +192,7 @@ class GripperLimits:
             return
         wanted, commanded = told
         if arm not in self.wanted and commanded == commanded:
-            # Asked for before this node began, maybe long ago: the gripper is where it was commanded to be, and stays.
+            # This opening was requested before the node began, maybe long ago. The gripper stays at its last command.
             now = self._node.now
             self._loop.resume_gripper(arm, wanted, commanded, self.openings(now), now)
             self.answer()

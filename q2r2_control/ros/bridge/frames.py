@@ -1,4 +1,4 @@
-"""Where one frame is in another, now: from /tf and /tf_static, or from a topic of poses."""
+"""The current pose of one frame in another, from /tf and /tf_static or from a topic of poses."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.targets import SequenceWatch
 
 _TF, _TF_STATIC = "tf", "tf_static"
-# Two publishers whose poses of a frame differ by more do not tell of the same robot [m], [rad].
+# Two publishers whose poses of a frame differ by more than this are about different robots [m], [rad].
 _SAME = 0.05, 0.1
-_REMEMBERED = 2.0  # such a difference [s]
-_PAUSE = 1.0  # after a silence of this long a publisher may have been restarted [s]
-_KEPT = 16  # messages that one node of a process has read and another may still have to
+_REMEMBERED = 2.0  # Time for which such a difference is remembered [s].
+_PAUSE = 1.0  # After a silence of this time a publisher may have been restarted [s].
+_KEPT = 16  # Messages that are kept, because another node of the process may have to read them too.
 
 
 class ReadTransform:
@@ -39,12 +39,12 @@ class ReadTransform:
 
     def __init__(self, read: TransformNumbers) -> None:
         self.child_frame_id, self.frame_id, self.numbers = _name(read.child), _name(read.parent), read.numbers
-        self.is_pose = is_pose(self.numbers)  # false for numbers that are not finite, or no unit quaternion
+        self.is_pose = is_pose(self.numbers)  # False for numbers that are not finite, or no unit quaternion.
         self._pose: pin.SE3 | None = None
 
     @property
     def pose(self) -> pin.SE3:
-        """Made when it is asked for: of the links of an arm few are."""
+        """The pose, which is computed at its first use, because most links of an arm are never used."""
         if self._pose is None:
             self._pose = pose_of_numbers(self.numbers)
             assert self._pose is not None
@@ -56,36 +56,34 @@ _read = transforms_reader()
 
 @lru_cache(maxsize=_KEPT)
 def read_transforms(message: bytes) -> Sequence[ReadTransform]:
-    """The transforms in a serialized TFMessage, else SerdeError; read once for all nodes of a process."""
+    """Return the transforms in a serialized TFMessage, which is read once for all nodes; raises SerdeError."""
     return tuple(map(ReadTransform, _read(message)))
 
 
 class Placement(NamedTuple):
-    """Where a frame is in another."""
+    """The pose of a frame in another one."""
 
     pose: pin.SE3
-    received: float  # the oldest receipt time of the transforms in it [s]; inf: all of them are static
+    received: float  # The oldest receipt time of its transforms [s]; inf if all of them are static.
 
 
 class FrameTree:
-    """Newest transforms by their receipt time; nothing is interpolated, and a history is not kept."""
+    """The newest transforms, without interpolation and history."""
 
     def __init__(self) -> None:
-        self._edges: dict[
-            str, tuple[ReadTransform, float]
-        ] = {}  # of each frame where it is, and when that was received
-        self._found: dict[tuple[str, str], Placement] = {}  # since a transform last came
-        self._used: set[str] = set()  # frames on the way between those that were found
-        self._all = True  # a frame was looked for in vain: any transform may be on the way to it
+        self._edges: dict[str, tuple[ReadTransform, float]] = {}  # By frame, its transform and receipt time [s].
+        self._found: dict[tuple[str, str], Placement] = {}  # Placements that were found since the last transform.
+        self._used: set[str] = set()  # Frames in the chains of transforms that were found.
+        self._all = True  # Whether a frame was not found, so that any transform may be needed.
 
     def set(self, transform: ReadTransform, received: float) -> None:
-        """Store one transform, received then [s], inf: static; one without a pose is ignored."""
+        """Store one transform with its receipt time [s], inf for a static one. One without a pose is ignored."""
         if transform.is_pose:
             self._edges[transform.child_frame_id] = transform, received
             self._found.clear()
 
     def find(self, frame: str, within: str) -> Placement | None:
-        """Pose of ``frame`` in ``within``; None if no chain of transforms connects them."""
+        """Return the pose of ``frame`` in ``within``; None if no chain of transforms connects them."""
         if (found := self._found.get((frame, within))) is not None:
             return found
         up = dict(self.upwards(within))
@@ -95,23 +93,23 @@ class FrameTree:
                 place = self._found[frame, within] = Placement(pose, received)
                 self._used.update(up, (name for name, _ in self.upwards(frame)))
                 self._all = False
-                return place  # a transform that comes meanwhile makes what was found forgotten
+                return place  # The next transform clears the placements that were found.
         self._all = True
         return None
 
     def wants(self, frame: str) -> bool:
-        """Whether where ``frame`` is matters for what was looked for: of the links of a robot few do."""
+        """Return whether the pose of ``frame`` is needed. Few links of a robot are."""
         return self._all or frame in self._used
 
     def moves_far(self, transform: ReadTransform) -> bool:
-        """Whether the frame is elsewhere in a transform than it was in the last one."""
+        """Return whether a transform moves its frame far from the last one."""
         before = self._edges.get(transform.child_frame_id)
         if before is None or not transform.is_pose:
             return False
         return any(np.greater(apart(before[0].pose, transform.pose), _SAME))
 
     def upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
-        """The frame and all its ancestors, with the frame's pose in each; ends also if parents form a ring."""
+        """Yield the frame and all its ancestors, with the frame's pose in each. A ring of parents also ends."""
         frame, pose, received = _name(frame), pin.SE3.Identity(), math.inf
         seen: set[str] = set()
         while frame not in seen:
@@ -126,22 +124,22 @@ class FrameTree:
 class FrameListener:
     """Keeps a :class:`FrameTree` up to date for a node, and notices two publishers that disagree about a frame.
 
-    Publishers are told apart by the numbers of their messages, which some middleware does not give. Two that send the
-    same poses, such as robot_state_publisher beside a simulation, are as good as one.
+    Publishers are distinguished by the sequence numbers of their messages, which some middlewares do not give. Two
+    publishers of the same poses, such as robot_state_publisher beside a simulation, are allowed.
     """
 
     def __init__(self, node: Any) -> None:
         self.tree = FrameTree()
         self._node = node
-        self._numbers: defaultdict[str, SequenceWatch] = defaultdict(SequenceWatch)  # of messages with a frame
+        self._numbers: defaultdict[str, SequenceWatch] = defaultdict(SequenceWatch)  # By frame.
         self._publishers = Publishers(node, [_TF])
-        self._disagree: dict[str, float] = {}  # frames of which two publishers say different things, and when [s]
+        self._disagree: dict[str, float] = {}  # By disputed frame, the time of the last difference [s].
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(TFMessage, _TF, self._take, 100, raw=True)
         node.create_subscription(TFMessage, _TF_STATIC, self._take_fixed, latched, raw=True)
 
     def conflict(self, frame: str) -> Reason | None:
-        """A reason while two publishers disagree about ``frame`` or what it hangs on."""
+        """Return a reason while two publishers disagree about ``frame`` or its ancestors, else None."""
         if not self._disagree:
             return None
         now = time.monotonic()
@@ -169,7 +167,7 @@ class FrameListener:
     def _read(self, topic: str, message: bytes) -> Sequence[ReadTransform]:
         try:
             return read_transforms(message)
-        except SerdeError:  # which is some other node's fault
+        except SerdeError:  # Another node is at fault.
             self._node.drop(f"/{topic}", f"{len(message)} bytes")
             return ()
 
@@ -183,12 +181,12 @@ class ToolFrame:
 
     def __init__(self, node: BaseNode, frame: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
-        self.received = -math.inf  # the newest pose was [s]
+        self.received = -math.inf  # Receipt time of the newest pose [s].
         self._publishers = Publishers(node, [_TF])
         self.problem: Reason | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
-        """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
+        """Return the newest pose at ``now`` [s], or None if it is not known. Then ``problem`` says why."""
         placement = self._tree.find(self._frame, self._world)
         if placement is not None:
             self.received = placement.received
@@ -204,12 +202,12 @@ class ToolFrame:
 
 
 class PoseTopic:
-    """The pose on a topic, in the world; the message's frame is looked up on /tf."""
+    """The pose on a topic, in the world frame. The frame of the message is looked up on /tf."""
 
     def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._node, self._tree, self._world, self._timeout = node, tree, world, timeout
-        self._newest: tuple[str, int, float] | None = None  # its frame, its stamp [ns], and when it was received [s]
-        self._pose: pin.SE3 | None = None  # of the newest, in the message's frame
+        self._newest: tuple[str, int, float] | None = None  # Frame, stamp [ns] and receipt time [s].
+        self._pose: pin.SE3 | None = None  # The newest pose, in the message's frame.
         self.topic, self._publishers = topic, Publishers(node, [topic])
         self.problem: Reason | None = None
         node.create_subscription(
@@ -237,16 +235,16 @@ class PoseTopic:
 
     @property
     def received(self) -> float:
-        """When the newest message came [s]; -inf: none has."""
+        """Receipt time of the newest message [s]; -inf if there is none."""
         return -math.inf if self._newest is None else self._newest[2]
 
     @property
     def stamp(self) -> int | None:
-        """The newest message's own, by its sender's clock [ns]; None: there is none."""
+        """Stamp of the newest message by its sender's clock [ns]; None if there is none."""
         return None if self._newest is None else self._newest[1]
 
     def take_silence(self, now: float) -> Reason | None:
-        """A reason, returned once, if poses came and have stopped coming."""
+        """Return a reason once if poses came and have stopped, else None."""
         if self._newest is None or now - self._newest[2] <= self._timeout:
             return None
         self.at(now)
@@ -256,7 +254,7 @@ class PoseTopic:
     def _take(self, message: bytes, now: float) -> None:
         try:
             read = read_pose(message)
-        except SerdeError as error:  # which is its sender's fault
+        except SerdeError as error:  # The sender is at fault.
             self._node.drop(self.topic, str(error))
             return
         self._newest, self._pose = (read.frame, read.stamp, now), pose_of_numbers(read.numbers)

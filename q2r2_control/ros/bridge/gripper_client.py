@@ -14,27 +14,27 @@ from std_msgs.msg import Float64MultiArray
 from q2r2_control.config.external import GripperSettings, GripperType
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, BaseNode
 
-_RESULT_TIMEOUT = 10.0  # of a goal [s]
-_ANSWER_TIMEOUT = 1.0  # of the controller that grants openings [s]
-_MOVE_PERIOD, _MOVE_STEP = 0.1, 0.01  # between two goals of a gripper that follows a trigger [s], of the stroke
+_RESULT_TIMEOUT = 10.0  # Longest time to wait for the result of a goal [s].
+_ANSWER_TIMEOUT = 1.0  # Longest time to wait for the controller that grants openings [s].
+_MOVE_PERIOD, _MOVE_STEP = 0.1, 0.01  # For a gripper that follows a trigger: time between goals [s], share of stroke.
 
 
 def wanted_topic(target_topic: str) -> str:
-    """Where the sender of an arm's targets asks for openings."""
+    """Return the topic on which the sender of an arm's targets requests openings."""
     return f"{target_topic}/wanted_opening"
 
 
 class OpeningGrants:
-    """One arm's gripper; openings are 0 closed .. 1 fully open.
+    """Requests openings of one arm's gripper from the built-in controller: 0 closed .. 1 fully open.
 
-    It tells the wanted opening, and the one that was commanded last. A controller that starts anew then knows where the
-    gripper may be, and does not take an old wish for a new one.
+    It publishes the wanted opening and the last commanded one. From these, a restarted controller knows where the
+    gripper may be, and does not take an old request for a new one.
     """
 
     def __init__(self, node: BaseNode, controller: str, arm: str, target_topic: str) -> None:
-        """``controller``: the built-in one's name; ``target_topic``: where the arm's targets go."""
+        """Prepare requests to the built-in ``controller``, on a topic beside the arm's ``target_topic``."""
         self._wanted, self._commanded = math.nan, math.nan
-        self._answer: tuple[float, float] | None = None  # what was wanted, and what is granted of it
+        self._answer: tuple[float, float] | None = None  # The wanted opening, and the granted one.
         self._publisher = node.create_publisher(Float64MultiArray, wanted_topic(target_topic), LATCHED_QOS)
         self._node, self._topic = node, f"{controller}/opening/{arm}"
         node.create_subscription(Float64MultiArray, self._topic, self._on_answer, LATCHED_QOS)
@@ -45,11 +45,11 @@ class OpeningGrants:
 
     @property
     def granted(self) -> float | None:
-        """The opening that may be commanded now, on the way to the one that was asked for; None: not answered yet."""
+        """The opening on the way to the requested one that may be commanded now; None before an answer."""
         return None if self._answer is None or self._answer[0] != self._wanted else self._answer[1]
 
     def ask(self, opening: float) -> None:
-        """Ask for an opening, until another one is asked for."""
+        """Request an opening until the next request."""
         self._wanted = opening
         self._tell()
 
@@ -68,26 +68,26 @@ class OpeningGrants:
 
 
 class GripperClient:
-    """Opens and closes one gripper; no call waits.
+    """Opens and closes one gripper. No call waits.
 
-    ``closed`` is its known state, open before the first result. A gripper that has stalled holds an object, which is
-    success whatever the status of the goal. A topic gives no result: there the state changes with the command. With
-    ``grants`` it is commanded no farther than the built-in controller allows, until it is where it was asked to be.
+    ``closed`` is its known state, which is open before the first result. A gripper that has stalled holds an object,
+    which is a success for any status of the goal. A topic gives no result, so that the state changes with the command.
+    With ``grants``, each command goes only as far as the built-in controller allows, until the request is fulfilled.
     """
 
     def __init__(self, node: Node, name: str, settings: GripperSettings, grants: OpeningGrants | None = None) -> None:
         self.closed = False
-        self.holds = False  # closed on something, as the result of the last goal says
+        self.holds = False  # Whether it closed on an object, by the result of the last goal.
         self.problem: str | None = None
         self._node, self._name, self._settings, self._grants = node, name, settings, grants
-        self._goal_closed: bool | None = None  # closed or not, while a goal is under way
-        self._position: float | None = None  # that the gripper told last
-        self._sent, self._asked = -math.inf, 1.0  # what was asked for last: when [s], and the opening
-        self._commanded: float | None = None  # the last opening that was commanded
-        self._begins = False  # nothing was commanded yet of what was asked for
-        self._commanded_at = -math.inf  # [s]
-        self._waits = False  # for more to be granted
-        self._closes = False  # it is a smaller one than that of the goal before
+        self._goal_closed: bool | None = None  # Whether the current goal closes it; None without a goal.
+        self._position: float | None = None  # The last position that the gripper reported.
+        self._sent, self._asked = -math.inf, 1.0  # The last request: its time [s] and its opening.
+        self._commanded: float | None = None  # The last commanded opening.
+        self._begins = False  # Whether no command was sent for the last request yet.
+        self._commanded_at = -math.inf  # Time of the last command [s].
+        self._waits = False  # Whether it waits until the whole request is granted.
+        self._closes = False  # Whether the last request is a smaller opening than the one before.
         self._goals = 0
         self._publisher = self._client = None
         if settings.action_type is GripperType.FLOAT64_MULTI_ARRAY:
@@ -105,14 +105,14 @@ class GripperClient:
 
     @property
     def opening(self) -> float:
-        """0 closed .. 1 open, as the gripper told with its last goal; 1 before the first, -inf where it cannot tell."""
+        """The opening that the gripper reported last: 0 closed .. 1 open; 1 before any, -inf if it cannot report."""
         if self._client is None or self._position is None:
             return -math.inf if self._client is None else 1.0
         closed, opened = self._settings.closed_position, self._settings.open_position
         return min(max((self._position - closed) / (opened - closed), 0.0), 1.0)
 
     def toggle(self, now: float) -> None:
-        """Ask for the opposite of the gripper's state, or of the state that it is moving to."""
+        """Request the opposite of the gripper's state, or of the state to which it moves."""
         closed = self._asked < 0.5 if self._waits else self.closed if self._goal_closed is None else self._goal_closed
         self.command(not closed, now)
 
@@ -120,13 +120,13 @@ class GripperClient:
         self._ask(0.0 if close else 1.0, now)
 
     def move(self, opening: float, now: float) -> None:
-        """Ask for an opening, 0 closed .. 1 open, as often as a trigger moves: ten times a second at most."""
+        """Request an opening, 0 closed .. 1 open, if a trigger has moved, at most ten times a second."""
         moved = abs(opening - self._asked) >= _MOVE_STEP or (opening in (0.0, 1.0) and opening != self._asked)
         if moved and not 0.0 <= now - self._sent < _MOVE_PERIOD:
             self._ask(opening, now)
 
     def _ask(self, opening: float, now: float) -> None:
-        """Request an opening from the gripper. Without an action server ``problem`` says so, and nothing is kept."""
+        """Request an opening. Without a server for the gripper, ``problem`` says so, and the request is dropped."""
         self._closes = opening < self._asked or (opening == self._asked and self._closes)
         self.holds = self.holds and self._closes
         self.problem, self._asked, self._sent, self._waits = None, opening, now, False
@@ -134,7 +134,7 @@ class GripperClient:
             self.problem = f"no gripper server at {self._name}"
             self._ask_to_stay()
             return
-        self._goals += 1  # what goals before this one lead to is not asked for any more
+        self._goals += 1  # The results of earlier goals are ignored.
         if self._client is not None:
             self._goal_closed = opening < 0.5
         self._begins, self._waits = True, self._grants is not None and self._grants.answered
@@ -144,7 +144,7 @@ class GripperClient:
             self._command(opening, now)
 
     def _go_on(self, now: float) -> None:
-        """Command what is granted. A gripper goes no farther because its controller has ended."""
+        """Command the granted opening. If the controller has ended or does not answer, the gripper stays."""
         assert self._grants is not None
         granted = self._grants.granted
         if not self._grants.answered:
@@ -191,7 +191,7 @@ class GripperClient:
         answer.add_done_callback(lambda future: self._answered(future.result(), number))
 
     def check(self, now: float) -> None:
-        """Go on with what is granted; give up a goal that is not answered in time."""
+        """Continue with granted openings, and give up a goal without a result in time."""
         if self._waits:
             self._go_on(now)
         elif self._goal_closed is not None and now - self._commanded_at > _RESULT_TIMEOUT:
@@ -216,11 +216,11 @@ class GripperClient:
 
     def _done(self, answer: Any, number: int) -> None:
         if number != self._goals or self._goal_closed is None:
-            return  # another goal has taken its place
+            return  # Another goal has replaced it.
         result = answer.result
         self._note(result)
         if self._waits:
-            return  # on the way to where it was asked to be
+            return  # The gripper is on the way to the requested opening.
         if answer.status == GoalStatus.STATUS_SUCCEEDED or result.stalled or result.reached_goal:
             self.closed, self.holds = self._goal_closed, bool(result.stalled) and self._closes
             self._end(None)
@@ -235,6 +235,6 @@ class GripperClient:
 
     def _end(self, problem: str | None) -> None:
         self._goal_closed, self.problem, self._waits = None, problem, False
-        self._goals += 1  # later answers to this goal are ignored
+        self._goals += 1  # Later answers to this goal are ignored.
         if problem is not None:
             self._node.get_logger().warning(problem)

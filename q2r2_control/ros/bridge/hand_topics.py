@@ -1,4 +1,4 @@
-"""The topics of a headset's hands: publishers and subscriptions."""
+"""Publishers and subscriptions for the topics of a headset's hands."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from q2r2_control.ros.commanders import OnePublisher
 from q2r2_control.ros.monitoring import Publishers, node_of
 from q2r2_control.types import SIDES, HandInputs, HandSample, HapticFeedback
 
-_DEPTH = 10  # of publishers that are reliable, so that any subscriber matches
+_DEPTH = 10  # Queue length of publishers, which are reliable, so that any subscriber matches.
 _KINDS: dict[MessageType, tuple[type, Callable[[Any], HandMessage]]] = {
     MessageType.POSE: (PoseStamped, convert.hand_pose),
     MessageType.TWIST: (Twist, convert.hand_twist),
@@ -34,12 +34,12 @@ _KINDS: dict[MessageType, tuple[type, Callable[[Any], HandMessage]]] = {
 
 @lru_cache(maxsize=32)
 def _serialized(inputs: HandInputs) -> bytes:
-    """The message of a hand's controls, which rest for most of the time."""
+    """Return the message of a hand's controls, which change seldom."""
     return bytes(serialize_message(convert.inputs_message(inputs)))
 
 
 class HandPublishers:
-    """Publishes the messages of a headset on topics of the same names; used by one thread."""
+    """Publishes the messages of a headset on topics of the same names. Only one thread may use it."""
 
     def __init__(self, node: Node, hands: Iterable[str] = SIDES, kinds: Iterable[MessageType] = tuple(_KINDS)) -> None:
         self._node = node
@@ -49,11 +49,11 @@ class HandPublishers:
         self._publishers = {
             name: node.create_publisher(_KINDS[topic.kind][0], name, _DEPTH) for name, topic in topics.items()
         }
-        self._template = lru_cache(maxsize=8)(convert.pose_template)  # of each frame
+        self._template = lru_cache(maxsize=8)(convert.pose_template)  # By frame.
         self.sent: dict[str, int] = {publisher.topic_name: 0 for publisher in self._publishers.values()}
 
     def publish(self, topic: str, message: HandMessage, frame: str, t: float) -> None:
-        """Publish at once. A pose is in ``frame`` at ``t`` [s]; other messages have neither."""
+        """Publish at once. A pose is in ``frame`` at ``t`` [s]. Other messages have no frame and no time."""
         publisher = self._publishers[topic]
         self.sent[publisher.topic_name] += 1
         if isinstance(message, HandPose):
@@ -66,9 +66,9 @@ class HandPublishers:
     def publish_sample(
         self, sample: HandSample, frame: str = "", twist: Callable[[], HandTwist | None] = lambda: None
     ) -> None:
-        """Publish a sample's messages on those topics that somebody takes; a pose with a fault is left out.
+        """Publish a sample's messages on topics that have subscribers. A pose with a fault is left out.
 
-        ``twist`` makes the hand's, where somebody takes it.
+        ``twist`` returns the velocity of the hand, and is called only if its topic has subscribers.
         """
         for kind in (MessageType.INPUTS, MessageType.TWIST, MessageType.POSE):
             topic = self._topics.get((sample.hand, kind))
@@ -84,7 +84,7 @@ class HandPublishers:
                 self.publish(topic, message, frame, sample.pose_stamp)
 
     def subscribers(self, hand: str) -> int:
-        """How many subscribers the topics of ``hand`` have, a recorder aside."""
+        """Return the number of subscribers of the topics of ``hand``, without a recorder."""
         publishers = [publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand]
         recorder = f"{self._node.get_namespace().rstrip('/')}{RECORDER}"
         matched = sum(publisher.get_subscription_count() for publisher in publishers)
@@ -113,9 +113,9 @@ def subscribe_to_haptics(node: Node, vibrate: Callable[[HapticFeedback], None]) 
 
 
 class HandIntake:
-    """Topics of the hand that drives an arm; those of the other hand from when it first does.
+    """Subscribes to the topics of the hand that drives an arm, and of the other hand after it first drives the arm.
 
-    Messages come as ``on_pose`` and ``on_inputs``, which give them to :meth:`put_pose` and :meth:`put_inputs`.
+    Messages go to ``on_pose`` and ``on_inputs``, which pass them to :meth:`put_pose` and :meth:`put_inputs`.
     """
 
     def __init__(
@@ -127,21 +127,21 @@ class HandIntake:
         on_inputs: Callable[[OVR2ROSInputs], None],
     ) -> None:
         self._node, self._timeout = node, timeout
-        # Without a callback that wants to see it, a pose need not become a message first.
+        # Without a callback, a pose does not have to be converted into a message.
         take_pose = self.put_pose if on_pose is None else on_pose
         self._callbacks = (
             (PoseStamped, "pose", take_pose, on_pose is None),
             (OVR2ROSInputs, "inputs", on_inputs, False),
         )
-        self._publishers: dict[str, Publishers] = {}  # of each hand
+        self._publishers: dict[str, Publishers] = {}  # By hand.
         self._haptics: dict[str, Any] = {}
-        self._one: dict[str, OnePublisher] = {}  # of each hand
+        self._one: dict[str, OnePublisher] = {}  # By hand.
         self._samples = SampleQueue()
-        self._received = -math.inf  # the message that is being taken was [s]
+        self._received = -math.inf  # Receipt time of the message in progress [s].
         self.follow(hand)
 
     def follow(self, hand: str) -> None:
-        """Take what this hand sends from now on; nothing that came before counts."""
+        """Take the messages of this hand from now on. Earlier messages do not count."""
         self.hand = hand
         self._samples.take()
         self._pose: tuple[HandPose, float] | None = None
@@ -158,10 +158,10 @@ class HandIntake:
         self._one[hand] = OnePublisher(self._node, topics)
 
     def put_pose(self, message: PoseStamped | bytes) -> None:
-        """A pose, serialized or not."""
+        """Take a pose, serialized or not."""
         try:
             self._pose = convert.hand_pose(message), self._received
-        except SerdeError as error:  # which is its sender's fault
+        except SerdeError as error:  # The sender is at fault.
             self._node.drop(_topic(self.hand, "pose"), str(error))
             return
         self._put()
@@ -175,11 +175,11 @@ class HandIntake:
 
     @property
     def stamps(self) -> tuple[float, float]:
-        """Receipt times of the newest pose and inputs; -inf before the first [s]."""
+        """Return the receipt times of the newest pose and inputs [s]; -inf before the first."""
         return -math.inf if self._pose is None else self._pose[1], self._inputs[1]
 
     def silence(self, now: float) -> Reason | None:
-        """A reason if data are missing, and from which node: poses are needed to move, buttons to stop."""
+        """Return a reason if poses, which are needed to move, or buttons, which are needed to stop, are missing."""
         ages = {what: now - stamp for what, stamp in zip(("pose", "inputs"), self.stamps, strict=True)}
         missing = {what: age for what, age in ages.items() if age > self._timeout}
         if not missing:
@@ -193,7 +193,7 @@ class HandIntake:
 
     @property
     def conflict(self) -> Reason | None:
-        """A reason if the hand has more than one publisher: the arm would follow both in turns."""
+        """Return a reason if the hand has more than one publisher, because the arm would follow both in turns."""
         return self._one[self.hand].conflict()
 
     def feel(self, pulse: HapticFeedback) -> None:

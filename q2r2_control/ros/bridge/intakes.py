@@ -39,7 +39,7 @@ from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import ArmTiming, Array, RobotState
 from q2r2_control.wording import sentence
 
-_SHARED = "joint_states"  # The topic if no other one is asked for.
+_SHARED = "joint_states"  # The default topic.
 _LATEST = 0.02  # By how much later than usual a target may arrive, so that its stamp still tells when it is due [s].
 _OLD = 0.5  # A target that is older than the one before by this much was made before its sender stood still [s].
 # Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period.
@@ -59,7 +59,7 @@ class TargetFrame(NamedTuple):
     """The frame of target poses."""
 
     name: str
-    pose: pin.SE3  # in the world
+    pose: pin.SE3  # In the world frame.
 
 
 class TargetIntake:
@@ -168,41 +168,42 @@ class JointIntake:
     def __init__(
         self, node: BaseNode, robot: Robot, needs_external_torque: bool = False, told_by_drivers: bool = False
     ) -> None:
-        """``needs_external_torque``: no state is good without it.
+        """Declare the parameters; raises :class:`ConfigError`.
 
-        Raises :class:`ConfigError` without its topic, unless it is ``told_by_drivers``.
+        With ``needs_external_torque``, no state is good without external torques, and their topic must be set unless
+        they are ``told_by_drivers``.
         """
         self._node, self._needs_external_torque = node, needs_external_torque
-        self._topics: dict[str, list[str]] = {}  # the arms whose joints each topic carries
+        self._topics: dict[str, list[str]] = {}  # By topic, the arms whose joints it carries.
         for arm in robot.arms:
             topic = node.parameter(f"{arm}.joint_states_topic", _SHARED, "carries all joints of this arm")
             self._topics.setdefault(topic, []).append(arm)
         self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
         self._others = {topic: tuple(set(robot.arms).difference(its)) for topic, its in self._topics.items()}
-        self._stamps = np.full(len(robot.joint_names), -math.inf)  # when each joint was measured, (nv,) [s]
+        self._stamps = np.full(len(robot.joint_names), -math.inf)  # Time of each joint's measurement (nv,) [s].
         # For each topic and list of names in a message, the names of our joints in it, and their indices.
         self._parts: dict[tuple[str, tuple[str, ...]], tuple[list[str], list[int]]] = {}
-        self._periods = dict.fromkeys(self._topics, _LONGEST_PERIOD)  # between messages, as a rule [s]
+        self._periods = dict.fromkeys(self._topics, _LONGEST_PERIOD)  # By topic, the mean time between messages [s].
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
         what = 'external torques of all joints, for admittance and vibrations: effort of a JointState; "": none'
         self._external_topic = node.parameter("external_torque_topic", "", what)
         if needs_external_torque and not self._external_topic and not told_by_drivers:
             raise ConfigError("admittance.enabled = true: set the parameter external_torque_topic, which it needs")
-        self._external: Array | None = None  # newest (nv,) [Nm]
+        self._external: Array | None = None  # The newest external torques (nv,) [Nm].
         self._external_stamp = -math.inf
         self._joint_names = list(robot.joint_names)
         self._publishers = Publishers(node, self._topics)
         self._values = np.zeros((3, len(robot.joint_names)))
         self._turns = TurnCounter(robot)
-        self.state: RobotState | None = None  # the newest of all arms
-        self._own_names: set[str] = set()  # topics on which the arms' own names have come
-        self.theirs: dict[str, str] = {}  # names of joints that an arm's driver calls otherwise, by ours
-        # From drivers that tell: why arms do not follow, and where they are held near measured ones, (nv,) [rad].
+        self.state: RobotState | None = None  # The newest state of all arms.
+        self._own_names: set[str] = set()  # Topics on which the arms' own names have come.
+        self.theirs: dict[str, str] = {}  # By our name of a joint, the different name that its driver uses.
+        # Reports of drivers: why arms do not follow, and near which posture (nv,) they hold the arms [rad].
         self.driver_fault: Callable[[], Reason | None] = lambda: None
         self.driver_held: Callable[[Array], Array | None] = lambda q: None
 
     def subscribe(self, take: TakeState, look: Look) -> None:
-        """Pass states of all arms, or what is wrong, to ``take`` with the time [s], and each message to ``look``."""
+        """Pass states of all arms, or a fault, to ``take`` with the time [s], and each message to ``look``."""
         for topic in self._topics:
             on_message = partial(self._on_message, take, look, topic, joint_state_reader())
             self._node.create_subscription(JointState, topic, on_message, STREAM_QOS, raw=True)
@@ -210,17 +211,17 @@ class JointIntake:
             self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
 
     def source(self) -> str:
-        """The publishers of the oldest joint states, for the middle of a sentence."""
+        """Return the publishers of the oldest joint states, for the middle of a sentence."""
         topic = min(self._topics, key=self._stamp)
         where = f" on {topic}" if len(self._topics) > 1 else ""
         return self._publishers.source(topic) + where
 
     def _stamp(self, topic: str) -> float:
-        """When the joint of a topic was measured that was longest ago [s]."""
+        """Return the time of the oldest measurement of a topic's joints [s]."""
         return float(self._stamps[self._joints[topic]].min())
 
     def timings(self, now: float) -> dict[str, ArmTiming]:
-        """When arms with topics of their own are measured, at ``now`` [s]; empty: one driver moves all, or none yet."""
+        """Return timings at ``now`` [s] of arms with separate topics; none if all share one or there is no state."""
         if len(self._topics) < 2 or self.state is None:
             return {}
         silent = {topic: now - self._stamp(topic) for topic in self._topics}
@@ -235,7 +236,7 @@ class JointIntake:
     ) -> None:
         try:
             message = read(data)
-        except SerdeError:  # which is some other node's fault
+        except SerdeError:  # Another node is at fault.
             self._node.drop(topic, f"{len(bytes(data))} bytes")
             return
         look(message)
@@ -248,7 +249,7 @@ class JointIntake:
         elif names := self._named_otherwise(topic, message.name):
             joints = list(self._joints[topic])
         else:
-            return  # of a gripper or another robot
+            return  # The message is about a gripper or another robot.
         now = self._node.now
         part = robot_state(message, names, now)
         if isinstance(part, str):
@@ -279,9 +280,9 @@ class JointIntake:
         return text if len(self._topics) == 1 else f"{topic}: {text}"
 
     def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], list[int]]:
-        """The joints of a topic that a message names, for each arm may have a publisher of its own on it."""
+        """Return the joints of a topic that are in a message. Each arm may have its own publisher on the topic."""
         if (part := self._parts.get((topic, given))) is None:
-            if len(self._parts) >= _PARTS:  # somebody sends other names each time
+            if len(self._parts) >= _PARTS:  # A publisher sends new names each time.
                 self._parts.clear()
             pairs = zip(self._names[topic], self._joints[topic], strict=True)
             found = [(name, int(joint)) for name, joint in pairs if name in given]
@@ -291,7 +292,7 @@ class JointIntake:
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
         """Return the sender's own names of an arm's joints, if they can be known. They are logged once."""
         names = self._names[topic]
-        # Any robot may publish on the usual topic, and one that has sent the arm's own names means no others.
+        # Any robot may publish on the default topic. A topic that has carried the arm's own names needs no others.
         if topic == _SHARED or len(self._topics[topic]) > 1 or topic in self._own_names:
             return []
         theirs = called_otherwise(tuple(names), tuple(given), self._others[topic])
@@ -302,12 +303,12 @@ class JointIntake:
         return list(theirs.values()) if theirs.items() <= self.theirs.items() else []
 
     def take_external(self, torques: Array) -> None:
-        """External torques of all joints, (nv,) [Nm]."""
+        """Store the external torques of all joints (nv,) [Nm]."""
         self._external, self._external_stamp = torques, self._node.now
 
     def _on_external(self, message: JointState) -> None:
         if not set(message.name) >= set(self._joint_names):
-            return  # of another robot
+            return  # The message is about another robot.
         effort = dict(zip(message.name, message.effort, strict=False))
         torques = np.array([effort.get(name, math.nan) for name in self._joint_names])
         if len(message.effort) == len(message.name) and np.isfinite(torques).all():
@@ -328,11 +329,11 @@ class Fingers:
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Those with a gripper."""
+        """The arms with a gripper."""
         return tuple(self._grippers)
 
     def openings(self, message: JointState | JointNumbers) -> dict[str, float]:
-        """Of the arms whose fingers are in the message, 0 closed .. 1 fully open; a little beyond is possible."""
+        """Return the openings of arms whose fingers are in the message: 0 closed .. 1 open, or slightly beyond."""
         found: dict[str, float] = {}
         if len(message.position) != len(message.name):
             return found

@@ -1,4 +1,4 @@
-"""Joint commands out, on one topic or one an arm; the parameter ``output`` chooses the drive and its messages."""
+"""Send joint commands, on one topic or on one for each arm. The parameter ``output`` selects drive and messages."""
 
 from __future__ import annotations
 
@@ -34,24 +34,27 @@ NONE = "none"
 
 
 class Kind(ABC):
-    """One kind of message. Made with the control loop's period [s] and the robot; encoded it may be serialized."""
+    """One kind of message, for the control loop's period [s] and a robot."""
 
-    topic: ClassVar[str]  # where no other is asked for
-    older: str | None = None  # last part of the topic in older releases of the receiver, which gets it too
-    mode = CommandMode.POSITION  # of the drive whose commands it carries
-    joints_each: int | None = None  # that a message has to have; None: any number
-    message: Any  # its type
+    topic: ClassVar[str]  # The default topic.
+    older: str | None = None  # The last part of the topic in older releases of the receiver, which gets it too.
+    mode = CommandMode.POSITION  # The mode of the drive whose commands it carries.
+    joints_each: int | None = None  # The number of joints that a message must have; None for any number.
+    message: Any  # The type of the messages.
 
     def __init__(self, period: float, robot: Robot) -> None:
         self._due, self._model = Duration(sec=int(period), nanosec=int(1e9 * (period % 1.0))), robot.model
 
     @abstractmethod
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
-        """A message about the joints with these names and velocity indices; ``t``: of the node's clock [s]."""
+        """Return a message, possibly serialized, about the joints with these names and velocity indices.
+
+        ``t`` is the time of the node's clock [s].
+        """
 
 
 class TrajectoryOutput(Kind):
-    """JointTrajectory with one point, due after a period: what joint_trajectory_controller calls a setpoint."""
+    """A JointTrajectory with one point that is due after a period, as a setpoint for joint_trajectory_controller."""
 
     topic = "joint_trajectory"
     message = JointTrajectory
@@ -62,7 +65,7 @@ class TrajectoryOutput(Kind):
 
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> bytes:
         numbers = [*command.q[joints].tolist(), *command.v[joints].tolist()]
-        # Stamp 0 is now, whatever the receiver's clock says.
+        # Stamp 0 means now for any clock of the receiver.
         return self._template(tuple(names)).fill(numbers, 0.0)
 
     def _make(self, names: tuple[str, ...]) -> Template:
@@ -77,7 +80,7 @@ class TrajectoryOutput(Kind):
 
 
 class PositionArray(Kind):
-    """Float64MultiArray in the order of the joints, as forward_command_controller takes them."""
+    """A Float64MultiArray in the order of the joints, for forward_command_controller."""
 
     topic = "position_commands"
     message = Float64MultiArray
@@ -92,11 +95,11 @@ class VelocityArray(PositionArray):
 
 
 class TorqueArray(PositionArray):
-    topic, mode, field = "torque_commands", CommandMode.TORQUE, "tau"  # gravity and Coriolis are in them
+    topic, mode, field = "torque_commands", CommandMode.TORQUE, "tau"  # Torques contain gravity and Coriolis.
 
 
 class JointStates(Kind):
-    """JointState with positions and velocities by name."""
+    """A JointState with positions and velocities by name."""
 
     topic = "joint_commands"
     message = JointState
@@ -106,7 +109,7 @@ class JointStates(Kind):
 
 
 class LbrPosition(Kind):
-    """LBRJointPositionCommand of lbr_fri_idl, one topic an arm."""
+    """An LBRJointPositionCommand of lbr_fri_idl, on one topic for each arm."""
 
     topic, joints_each, older = "{arm}/command/lbr_joint_position_command", 7, "joint_position"
     type_name = "LBRJointPositionCommand"
@@ -120,9 +123,9 @@ class LbrPosition(Kind):
 
 
 class LbrTorque(LbrPosition):
-    """LBRTorqueCommand of lbr_fri_idl: torques without gravity, which the KUKA bears itself.
+    """An LBRTorqueCommand of lbr_fri_idl, with torques without gravity, which KUKA's cabinet compensates itself.
 
-    Each carries the measured position, since the driver ignores torques beside a position that is NaN.
+    Each message carries the measured position, because the driver ignores torques with a position of NaN.
     """
 
     topic, mode, older = "/{arm}/command/lbr_torque_command", CommandMode.TORQUE, "torque"
@@ -162,36 +165,36 @@ class Channel(NamedTuple):
     """One topic and the joints that its messages are about."""
 
     names: list[str]
-    joints: np.ndarray  # velocity indices in the robot's order
+    joints: np.ndarray  # Velocity indices in the robot's order.
     publisher: WatchedPublisher
-    optional: bool = False  # nothing is sent as long as nobody listens
+    optional: bool = False  # Whether messages are sent only while somebody listens.
 
     @property
     def namespace(self) -> str | None:
-        """Of a driver whose topic is <namespace>/command/<topic>; None where it is none."""
+        """The namespace of a driver whose topic is <namespace>/command/<topic>, or None for another topic."""
         namespace, command, _ = self.publisher.topic_name.rpartition("/command/")
         return namespace if command else None
 
 
 class JointOutput:
-    """Where references go. Without channels, ``output: none``, another controller moves the arms."""
+    """Sends references to the arms. Without channels (``output: none``), another controller moves the arms."""
 
     def __init__(self, drive: Drive, kind: Kind, channels: list[Channel]) -> None:
         self.drive, self._kind, self._channels, self._listeners = drive, kind, channels, 0
-        self.theirs: Mapping[str, str] = {}  # names of joints that the receiver calls otherwise, by ours
-        self.withheld: Collection[str] = ()  # namespaces of drivers that get nothing
+        self.theirs: Mapping[str, str] = {}  # By our name of a joint, the receiver's different name.
+        self.withheld: Collection[str] = ()  # Namespaces of drivers that get no commands.
 
     def watch(self, node: BaseNode) -> CommandWatch:
         return CommandWatch(node, self._kind.message, [channel.publisher for channel in self._channels])
 
     def takers(self, node: BaseNode, joints: np.ndarray) -> str:
-        """Who takes the commands of the joints with these velocity indices: " /node", or "" where that is not known."""
+        """Return the receivers of commands for joints with these velocity indices: " /node", or "" if not known."""
         topics = [one.publisher.topic_name for one in self._channels if np.isin(joints, one.joints).all()]
         names = (takers_of(node, topic) for topic in topics)
         return next((f" {name}" for name in names if name), "")
 
     def send(self, command: Command, state: RobotState, t: float, decided: float) -> None:
-        """Send a command of the tick at ``t`` [s] of the node's clock; ``decided``: see :func:`publish_in_time`."""
+        """Send a command of the tick at ``t`` [s] by the node's clock. See :func:`publish_in_time` for ``decided``."""
         for channel in self._channels:
             if channel.namespace in self.withheld or (channel.optional and not channel.publisher.listeners):
                 continue
@@ -204,15 +207,15 @@ class JointOutput:
         return {channel.publisher.topic_name: channel.publisher.sent for channel in self._channels}
 
     def end(self, state: RobotState, t: float) -> None:
-        """Send what holds the arms where no more commands come, for drives that need it."""
+        """Send a last command that holds the arms, for drives that need one."""
         command = self.drive.last_command(state, {})
         if command is not None and command.mode is self.drive.mode:
             self.send(command, state, t, time.monotonic())
 
     def driver_namespaces(self, robot: Robot) -> dict[str, str]:
-        """Where each arm's driver is in ROS, for outputs ``lbr_*``: it tells of its session beside its command topic.
+        """Return the namespace of each arm's driver for outputs ``lbr_*``, in which it reports its session.
 
-        Raises :class:`ConfigError` for a topic by which that place is not known.
+        Raises :class:`ConfigError` for a command topic that does not tell the namespace.
         """
         found: dict[str, str] = {}
         for arm, its in robot.arms.items() if self._kind.older is not None else ():
@@ -226,17 +229,19 @@ class JointOutput:
         return found
 
     def waits(self) -> bool:
-        """Whether nothing should be sent in this tick, so that the last command can be acknowledged.
+        """Return whether nothing should be sent in this tick, so that the last command can be acknowledged.
 
-        The reference must not go on meanwhile: it would leave as one jump afterwards.
+        The reference must not move on during this time, because it would be sent as one jump afterwards.
         """
-        return True in [channel.publisher.waits() for channel in self._channels]  # all are asked: each has its own gap
+        # All publishers are asked, because each has its own gap.
+        return True in [channel.publisher.waits() for channel in self._channels]
 
     def listener_fault(self, off_reference: bool) -> Reason | None:
-        """A reason where what took the commands is gone, or is not alone any more; to be asked before each is sent.
+        """Return a reason if the receiver of the commands has gone, or if there is a new one; else None.
 
-        Asked only where the arms are ``off_reference``, since looking costs a message now and then, and not of torques.
-        Arms that yield are off their reference by design, and a torque for where they are is no jump.
+        It is called before each command. Receivers are checked only while the arms are ``off_reference``, because a
+        check costs a message at times. Torques are not checked: arms that yield are off their reference by design, and
+        a torque for the measured posture is no jump.
         """
         publishers = [channel.publisher for channel in self._channels]
         before, self._listeners = self._listeners, sum(publisher.listeners for publisher in publishers)
@@ -250,12 +255,15 @@ class JointOutput:
 
 
 def joints_of(robot: Robot, arms: Iterable[str]) -> np.ndarray:
-    """Velocity indices of the joints that move some of ``arms``, in the robot's order."""
+    """Return the velocity indices of the joints that move any of ``arms``, in the robot's order."""
     return np.unique(np.concatenate([robot.arms[arm].joints for arm in arms]))
 
 
 def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period: float) -> JointOutput:
-    """The output called ``name`` on its parameters' topics; ``period`` of the loop [s]. Raises :class:`ConfigError`."""
+    """Make the output ``name`` on the topics of its parameters; raises :class:`ConfigError`.
+
+    ``period`` is that of the loop [s].
+    """
     what = "arms that do not follow and whose joint positions nobody acknowledges are given up after [s]"
     timeout = node.parameter("listener_timeout", STREAM_TIMEOUT, what, within=(0.1, 5.0))
     topics = _topics(name, node, robot)
@@ -281,7 +289,7 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
 
 
 def _topics(name: str, node: BaseNode, robot: Robot) -> dict[str, str]:
-    """The topic that carries each arm's joints; arms with the same one share its messages."""
+    """Return the topic that carries each arm's joints. Arms with the same topic share its messages."""
     what = "joint commands of all arms, {arm} stands for an arm's name; \"\": the output's usual one"
     shared = node.parameter("output_topic", "", what) or ("" if name == NONE else KINDS[name].topic)
     topics: dict[str, str] = {}

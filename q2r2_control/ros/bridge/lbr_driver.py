@@ -1,4 +1,4 @@
-"""The arms as lbr_fri_ros2_stack tells of them: the state of each FRI session, and the external torques."""
+"""The reports of the drivers of lbr_fri_ros2_stack: the state of each FRI session, and the external torques."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.types import Array, CommandMode
 
-STATE_TOPICS = {"lbr_state": "for Jazzy", "state": "of 2024"}  # of a driver, and the releases that name it so
-_SILENT = 0.5  # a driver that has been heard and says nothing for longer is gone [s]
-_RESTART = 1.0  # a driver's process takes longer to be started anew [s]
-_SAG = 0.01  # of measured joints below what is commanded; beyond it somebody else has moved the arm [rad]
+STATE_TOPICS = {"lbr_state": "for Jazzy", "state": "of 2024"}  # A driver's topics, and the releases that have them.
+_SILENT = 0.5  # A driver without a message for this time has gone [s].
+_RESTART = 1.0  # The restart of a driver's process takes longer than this [s].
+_SAG = 0.01  # Largest distance of measured joints from commanded ones, unless something else moved the arm [rad].
 _WANTED = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
 class LbrDrivers:
-    """Listens to the drivers of the arms. Commands count in commanding active only, as with :class:`FriPlant`.
+    """Listens to the drivers of the arms. Commands count only in COMMANDING_ACTIVE, as with :class:`FriPlant`.
 
-    Commands overlay a motion of the cabinet's own, whose position (``ipo_joint_position``) stays where the session
-    began. The first command of a session equals it. Within a session the arm is held at the last command instead.
-    An arm whose driver never told of commanding active is not ready: joint states come without a session too.
+    Commands overlay a motion of the cabinet, whose position (``ipo_joint_position``) stays where the session began. The
+    first command of a session equals this position. After it, the arm is held at the last command. An arm is not ready
+    until its driver reports COMMANDING_ACTIVE, because joint states also come without a session.
     """
 
     def __init__(
@@ -39,12 +39,13 @@ class LbrDrivers:
         mode: CommandMode,
         on_torques: Callable[[Array], None],
     ) -> None:
-        """``namespaces`` of the drivers, by arm. ``on_torques`` gets external torques (nv,) [Nm] of all arms."""
+        """Listen to the drivers in ``namespaces``, by arm; ``on_torques`` gets the external torques (nv,) [Nm]."""
         self._node, self._robot, self._namespaces, self._mode = node, robot, dict(namespaces), mode
         self._on_torques, self._torques = on_torques, np.zeros(robot.model.nv)
-        self._held = np.full(robot.model.nv, np.nan)  # NaN: no session, or nothing is known [rad]
-        self._newest: dict[str, tuple[Any, float]] = {}  # of each arm, and when it came [s]
-        # Namespaces of drivers whose session has ended since commands began: what still comes is no first command.
+        self._held = np.full(robot.model.nv, np.nan)  # [rad]; NaN without a session, or if not known.
+        self._newest: dict[str, tuple[Any, float]] = {}  # By arm, the newest state and its time [s].
+        # Namespaces of drivers whose session has ended since commands began. Further commands would not fit as a first
+        # command of a new session.
         self.withheld: set[str] = set()
         kind = import_module("lbr_fri_idl.msg").LBRState
         for arm, namespace in self._namespaces.items():
@@ -53,7 +54,7 @@ class LbrDrivers:
                 node.create_subscription(kind, topic, partial(self._on_state, arm, topic), STREAM_QOS)
 
     def fault(self) -> Reason | None:
-        """Why an arm cannot be commanded, or None."""
+        """Return why an arm cannot be commanded, or None."""
         now = self._node.now
         for arm, namespace in self._namespaces.items():
             if arm not in self._newest:
@@ -68,9 +69,9 @@ class LbrDrivers:
         return None
 
     def held(self, q: Array) -> Array | None:
-        """Where the arms are held, which the next command has to equal, (nv,) [rad]; None: torques move them.
+        """Return the posture (nv,) at which the arms are held, which the next command has to equal [rad].
 
-        An arm of which nothing near its measured ``q`` (nv,) [rad] is known is held there.
+        An arm without such a posture near its measured ``q`` (nv,) [rad] is held at ``q``. With torques, return None.
         """
         if self._mode is not CommandMode.POSITION:
             return None
@@ -82,14 +83,14 @@ class LbrDrivers:
         return held
 
     def begin(self) -> None:
-        """The next command is the first one after the controller was activated."""
+        """Let the next command be the first one after the controller was activated."""
         self.withheld.clear()
         for arm, (state, _) in self._newest.items():
             if state.session_state != Session.COMMANDING_ACTIVE:
                 self.withheld.add(self._namespaces[arm])
 
     def commanded(self, q: Array) -> None:
-        """``q`` (nv,) [rad] was sent."""
+        """Note that ``q`` (nv,) [rad] was sent."""
         for arm, namespace in self._namespaces.items():
             if namespace not in self.withheld:
                 joints = self._robot.arms[arm].joints
@@ -106,7 +107,7 @@ class LbrDrivers:
             release = STATE_TOPICS[topic.rpartition("/")[2]]
             self._node.get_logger().info(f"{topic}: the driver of the {arm} arm, with the topics of releases {release}")
         elif now - self._newest[arm][1] > _RESTART:
-            self._held[joints] = np.nan  # the driver may have been started anew, and does not tell
+            self._held[joints] = np.nan  # The driver may have been restarted without a report.
         if not active:
             self._held[joints] = np.nan
             self.withheld.add(self._namespaces[arm])
@@ -121,12 +122,12 @@ class LbrDrivers:
 
 
 def load_controller(name: str, namespace: str) -> str:
-    """The command that starts a controller or broadcaster of the driver in this namespace."""
+    """Return the command that starts a controller or broadcaster of the driver in this namespace."""
     return f"ros2 control load_controller --set-state active {name} -c {namespace}/controller_manager"
 
 
 def session_fault(arm: str, state: Any, mode: CommandMode) -> Reason | None:
-    """Why an arm in this state follows no commands of this mode, or None."""
+    """Return why an arm in this state does not follow commands of this mode, or None."""
     if state.session_state != Session.COMMANDING_ACTIVE:
         return Reason.of(
             ReasonKind.FRI_SESSION,
@@ -143,5 +144,5 @@ def session_fault(arm: str, state: Any, mode: CommandMode) -> Reason | None:
 
 
 def _word(kind: type[IntEnum], value: int) -> str:
-    """In words; a number that a later version of FRI may have stays one."""
+    """Return the name of a value, or its number if only a later version of FRI knows it."""
     return in_words(kind(value)) if value in list(kind) else str(value)

@@ -1,4 +1,4 @@
-"""Settings that change while a node runs. Those set together change as a whole or not at all, with the reason."""
+"""Settings that change while a node runs. Settings that are set together change all, or none with a reason."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.parameters import may_be_none, range_of, stance_of
 
-if TYPE_CHECKING:  # arms' nodes have no controller, and need not wait for its kernels
+if TYPE_CHECKING:  # The nodes of arms have no controller, and must not wait for its kernels.
     from q2r2_control.compliance.impedance import ImpedanceController
     from q2r2_control.control.controller import CartesianController
     from q2r2_control.supervision.joint_watch import ExternalSettings, WatchSettings
     from q2r2_control.supervision.target_stream import StreamSettings
 
-# Of the controller's watching: field, parameter, what it is, least and greatest value.
+# Settings of the controller's checks: field, parameter, description, least and greatest value.
 _Table = tuple[tuple[str, str, str, float, float], ...]
 _STREAMS: _Table = (
     ("timeout", "target_timeout", "an arm without targets for this long holds [s]", 0.02, 2.0),
@@ -42,7 +42,7 @@ _MIRROR = ("mirror", "mirror_reflected")
 
 
 class LiveArmParameters:
-    """Parameters ``teleop.*``, ``guard.*`` and ``mirror`` of an arm's node."""
+    """The parameters ``teleop.*``, ``guard.*`` and ``mirror`` of an arm's node."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class LiveArmParameters:
         guard: GuardSettings,
         apply: Callable[[TeleopSettings, GuardSettings], str | None],
     ) -> None:
-        """``apply``: takes the changed settings, or returns why that is not possible now."""
+        """Watch the parameters; ``apply`` takes changed settings, or returns why they cannot change now."""
         self._node, self._teleop, self._guard, self._apply = node, teleop, guard, apply
         node.add_on_set_parameters_callback(self._on_set)
 
@@ -72,12 +72,12 @@ class LiveArmParameters:
 
 
 def make_control_live(node: BaseNode, controller: CartesianController) -> None:
-    """Parameters ``control.*``: what of a controller's settings may change, of which its own method decides."""
+    """Declare the parameters ``control.*`` for settings that may change. The controller accepts or refuses a change."""
     for name in LIVE:
         field = ControllerSettings.model_fields[name]
         value, within = getattr(controller.settings, name), range_of(field)
         if name == "min_distance":
-            within = 0.0, max(CLEARANCE, value)  # pydantic keeps the bounds of an annotated type elsewhere
+            within = 0.0, max(CLEARANCE, value)  # The bounds of its type are not in the field.
         node.parameter(f"control.{name}", value, field.description or name, read_only=False, within=within)
 
     def on_set(parameters: Sequence[Parameter]) -> SetParametersResult:
@@ -89,12 +89,12 @@ def make_control_live(node: BaseNode, controller: CartesianController) -> None:
 
 
 def make_impedance_live(node: BaseNode, impedance: ImpedanceController) -> None:
-    """Parameters of the impedance in torque mode, which ramps to what is set."""
+    """Declare the parameters of the impedance in torque mode, which ramps to new values."""
     for name in LIVE_IMPEDANCE:
         field = ImpedanceSettings.model_fields[name]
         value, bounds = getattr(impedance.settings, name), range_of(field)
         assert bounds is not None
-        # Ends of a parameter's range are allowed, and none of these may be 0.
+        # The ends of a parameter's range are allowed values, and no such parameter may be 0.
         within = max(bounds[0], min(0.1, value)), bounds[1]
         node.parameter(name, value, f"{field.description}; changes over ramp_time", read_only=False, within=within)
 
@@ -108,7 +108,7 @@ def make_impedance_live(node: BaseNode, impedance: ImpedanceController) -> None:
 def make_watching_live(
     node: BaseNode, streams: StreamSettings, watch: WatchSettings, external: ExternalSettings
 ) -> None:
-    """Timeouts and tolerances of the controller's node, which are read at every tick."""
+    """Declare the timeouts and tolerances of the controller's node, which are read at every tick."""
     settings: dict[str, tuple[Any, str]] = {}
     for target, table in ((streams, _STREAMS), (watch, _WATCH), (external, _EXTERNAL)):
         for field, name, what, least, greatest in table:
@@ -127,7 +127,7 @@ def make_watching_live(
 
 
 def is_of_teleop(name: str) -> bool:
-    """Whether a parameter is of the teleoperation that all arms have in common."""
+    """Return whether a parameter belongs to the teleoperation that all arms share."""
     return name in _MIRROR or name.startswith("teleop.")
 
 
@@ -137,10 +137,10 @@ def _within(prefix: str, changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _changed(settings: Model, prefix: str, changes: Mapping[str, Any]) -> Model:
-    """The same settings with those changed that are under ``prefix``. Raises :class:`ConfigError`."""
+    """Return the settings with the changes of parameters under ``prefix``; raises :class:`ConfigError`."""
     values = settings.model_dump()
     for name, value in _within(prefix, changes).items():
-        *path, last = name.split(".")  # the parameter was declared from the model, so the field is there
+        *path, last = name.split(".")  # The field exists, because the model declared the parameter.
         part, model = values, type(settings)
         for each in path:
             part, model = part[each], model.model_fields[each].annotation  # type: ignore[assignment]

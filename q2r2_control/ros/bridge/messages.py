@@ -1,4 +1,4 @@
-"""Conversion between ROS messages and the dataclasses of ``types.py``; times inside are receipt times [s]."""
+"""Conversion between ROS messages and the dataclasses of ``types.py``, in which times are receipt times [s]."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from q2r2_control.recording.messages import measured
 from q2r2_control.ros.bridge.wire import JointNumbers, Template, read_pose
 from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, RobotState
 
-_UNIT = 1e-3  # a quaternion's norm may be off by this
-_OLDEST = 0.1  # a message waits for the next tick, and no longer: more is a clock that was set [s]
+_UNIT = 1e-3  # Allowed error of a quaternion's norm.
+_OLDEST = 0.1  # Messages wait only for the next tick. A greater age means that the clock was set [s].
 
 
 def ended_topic(target_topic: str) -> str:
-    """Where the sender of an arm's targets says that it ends the stream in order, because the operator paused."""
+    """Return the topic on which the sender of targets ends a stream in order, because the operator paused."""
     return f"{target_topic}/ended"
 
 
 def seconds(stamp: Time) -> float:
-    """A message's stamp in seconds of its sender's clock."""
+    """Return a message's stamp by its sender's clock [s]."""
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
@@ -40,29 +40,29 @@ def nanoseconds(stamp: Time) -> int:
 
 
 def age(info: Mapping[str, Any]) -> float:
-    """How long ago the middleware received a message [s], by the information that a subscription passes with it."""
+    """Return the time since the middleware received a message [s]. A subscription passes ``info`` with the message."""
     return min(max((time.time_ns() - int(info["received_timestamp"])) * 1e-9, 0.0), _OLDEST)
 
 
 def delay(info: Mapping[str, Any]) -> float:
-    """How long a message was on its way [s], by the clocks of both hosts; NaN where the middleware does not know."""
+    """Return the travel time of a message [s] by the clocks of both hosts; NaN if the middleware does not know it."""
     sent, received = int(info["source_timestamp"]), int(info["received_timestamp"])
     return (received - sent) * 1e-9 if sent and received else math.nan
 
 
 def time_message(t: float) -> Time:
-    """``t`` [s] as a stamp; not negative."""
+    """Return ``t`` [s] as a stamp, which is never negative."""
     whole, part = divmod(max(t, 0.0), 1.0)
     return Time(sec=int(whole), nanosec=min(round(part * 1e9), 999_999_999))
 
 
 def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
-    """A pose in ``frame`` at ``t`` [s], with a unit quaternion x y z w."""
+    """Return the message of a pose in ``frame`` at ``t`` [s], with a unit quaternion x y z w."""
     return _stamped(pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs(), frame, t)
 
 
 def _stamped(position: Array, quaternion: Array, frame: str, t: float) -> PoseStamped:
-    message = PoseStamped()  # filled as it is, since to make its parts takes twice as long
+    message = PoseStamped()  # The message is filled in place, because making its parts takes twice as long.
     p, o = message.pose.position, message.pose.orientation
     p.x, p.y, p.z = position.tolist()
     o.x, o.y, o.z, o.w = quaternion.tolist()
@@ -71,19 +71,19 @@ def _stamped(position: Array, quaternion: Array, frame: str, t: float) -> PoseSt
 
 
 def pose_of(message: Pose) -> pin.SE3 | None:
-    """The pose of a message, its quaternion normalised; None for numbers that are not finite or no rotation."""
+    """Return the pose of a message with a normalised quaternion; None if its numbers are no finite pose."""
     p, o = message.position, message.orientation
     return pose_of_numbers((p.x, p.y, p.z, o.x, o.y, o.z, o.w))
 
 
 def is_pose(numbers: Sequence[float]) -> bool:
-    """Whether a position and a quaternion x y z w are finite, and the quaternion a rotation."""
+    """Return whether a position and a quaternion x y z w are finite, and the quaternion is a rotation."""
     # A sum or a norm with NaN or infinity in it is not finite.
     return math.isfinite(sum(numbers[:3])) and abs(math.hypot(*numbers[3:]) - 1.0) <= _UNIT
 
 
 def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
-    """The pose of a position and a quaternion x y z w; None as in :func:`pose_of`."""
+    """Return the pose of a position and a quaternion x y z w; None as in :func:`pose_of`."""
     if not is_pose(numbers):
         return None
     pose = np.array(numbers)
@@ -92,14 +92,14 @@ def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
 
 
 def hand_pose(message: PoseStamped | bytes) -> HandPose:
-    """A hand's pose, unchecked. Raises SerdeError for bytes that are no PoseStamped."""
+    """Return a hand's pose, unchecked; raises SerdeError for bytes that are no PoseStamped."""
     stamp, frame, numbers = read_pose(message)
     values = np.array(numbers)
     return HandPose(values[:3], values[3:], stamp * 1e-9, frame)
 
 
 def pose_template(frame: str) -> Template:
-    """A PoseStamped in ``frame``, whose numbers are a position and a quaternion x y z w."""
+    """Return the template of a PoseStamped in ``frame``. Its numbers are a position and a quaternion x y z w."""
 
     def make(numbers: Iterator[float], stamp: Any) -> PoseStamped:
         message = PoseStamped()
@@ -112,14 +112,14 @@ def pose_template(frame: str) -> Template:
 
 
 def fill_pose(template: Template, pose: pin.SE3, t: float) -> bytes:
-    """The message of a pose at ``t`` [s], as :func:`stamped_pose` makes it."""
+    """Return the serialized message of a pose at ``t`` [s], with the contents of :func:`stamped_pose`."""
     numbers = pin.SE3ToXYZQUAT(pose)
     numbers[3:] /= math.hypot(*numbers[3:].tolist())
     return template.fill(numbers.tolist(), t)
 
 
 def joint_state_template(names: Sequence[str], q: bool = True, v: bool = True, tau: bool = True) -> Template:
-    """A JointState of these joints, whose numbers are positions, velocities and torques; those that are not: none."""
+    """Return the template of a JointState with positions ``q``, velocities ``v`` and torques ``tau``, if wanted."""
 
     def make(numbers: Iterator[float], stamp: Any) -> JointState:
         fields = [list(islice(numbers, len(names))) if given else [] for given in (q, v, tau)]
@@ -131,7 +131,7 @@ def joint_state_template(names: Sequence[str], q: bool = True, v: bool = True, t
 
 
 def hand_twist(message: Twist) -> HandTwist:
-    """A hand's velocity, unchecked."""
+    """Return a hand's velocity, unchecked."""
     return HandTwist(*(np.array([vector.x, vector.y, vector.z]) for vector in (message.linear, message.angular)))
 
 
@@ -149,17 +149,17 @@ def inputs_message(inputs: HandInputs) -> OVR2ROSInputs:
 
 
 def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t: float) -> JointState:
-    """Joint positions [rad], velocities [rad/s] and torques [Nm] at ``t`` [s]."""
+    """Return a message with joint positions [rad], velocities [rad/s] and torques [Nm] at ``t`` [s]."""
     message = JointState(name=list(names), position=q.tolist(), velocity=v.tolist(), effort=tau.tolist())
     message.header.stamp = time_message(t)
     return message
 
 
 def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: float) -> RobotState | str:
-    """State in the order of ``names``, received at ``t`` [s]; or what is wrong with the message, in one line.
+    """Return the state in the order of ``names``, received at ``t`` [s], or the fault of the message in one line.
 
-    Other joints in the message are ignored. Velocities and torques may be missing as a whole and are then zero. So
-    are those that are not measured, see :func:`measured`.
+    Other joints in the message are ignored. Velocities and torques are zero if all of them are missing, or if they are
+    not measured, see :func:`measured`.
     """
     order = order_of(tuple(message.name), tuple(names))
     if isinstance(order, str):
@@ -181,11 +181,11 @@ def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: flo
 
 @lru_cache(maxsize=64)
 def called_otherwise(names: tuple[str, ...], given: tuple[str, ...], others: tuple[str, ...]) -> dict[str, str]:
-    """By each of an arm's joints the one of the ``given`` names that differs in its beginning; {} unless all have one.
+    """Return the sender's name for each of an arm's joints, among the ``given`` names; {} unless all are found.
 
-    A joint left_A1 may be lbr_A1 or A1 elsewhere: its last part tells, where it tells one only. It may be left_joint_1
-    too, where names that are alike but for their number have all the numbers. Names that begin with one of ``others``,
-    the other arms, are those of the wrong arm, and none is taken then.
+    A joint left_A1 may be lbr_A1 or A1 for the sender. It is found by its last part if only one given name has this
+    part. It may also be left_joint_1, if names that differ only in their number have all the numbers of the joints. If
+    a given name begins with one of ``others``, which are the other arms, no name is used.
     """
     if any(name.startswith(f"{other}_") for name in given for other in others):
         return {}
@@ -206,9 +206,9 @@ def _stem_and_number(name: str) -> tuple[str, str]:
     return stem, name[len(stem) :]
 
 
-@lru_cache(maxsize=64)  # publishers send the same names again and again
+@lru_cache(maxsize=64)  # Publishers send the same names again and again.
 def order_of(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
-    """Where each of ``names`` is among those that were given; or what is wrong with these, in one line."""
+    """Return the index of each of ``names`` among the ``given`` ones, or the fault of these in one line."""
     if len(set(given)) != len(given):
         return "a joint is named twice"
     if missing := [name for name in names if name not in given]:

@@ -1,4 +1,4 @@
-"""Moving obstacles of the built-in controller, as markers that RViz shows too."""
+"""The moving obstacles of the built-in controller come as markers, which RViz also shows."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.messages import pose_of, seconds
 
 TOPIC = "~/obstacles"
-_OLDEST = 10.0  # [s]
+_OLDEST = 10.0  # Greatest age of a marker; older ones count as this old [s].
 
 
 class ObstacleIntake:
-    """Passes on each :class:`Marker`: ``ns`` is the obstacle's name, and ``text`` has its bounds as YAML.
+    """Passes each :class:`Marker` to the controller. ``ns`` is the obstacle's name, ``text`` has its bounds as YAML.
 
-    The bounds are ``speed``, ``acceleration`` and ``speed_now``, see :class:`MovingObstacle`. A cylinder stands for the
-    capsule around it. The action DELETE takes an obstacle away.
+    The bounds are ``speed``, ``acceleration`` and ``speed_now``, see :class:`MovingObstacle`. A cylinder becomes the
+    capsule around it. The action DELETE removes an obstacle.
     """
 
     def __init__(self, node: BaseNode, controller: CartesianController) -> None:
         self._node, self._controller = node, controller
-        self._said: str | None = None  # the last warning, which is not repeated
+        self._said: str | None = None  # The last warning, which is not repeated.
         if controller.settings.moving_obstacles:
             node.create_subscription(Marker, TOPIC, self._on_marker, 10)
 
@@ -44,7 +44,7 @@ class ObstacleIntake:
 
 
 def obstacle_of(message: Marker, now: float) -> MovingObstacle | None:
-    """The obstacle of a marker that came at ``now`` [s], or None: it is gone.
+    """Return the obstacle of a marker that came at ``now`` [s], or None if the marker removes it.
 
     Raises :class:`RobotError` or :class:`ConfigError`.
     """

@@ -1,4 +1,4 @@
-"""Parameters of an arm controller, and any settings model as parameters of a node."""
+"""The parameters of an arm controller, and the conversion of any settings model into parameters of a node."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from q2r2_control.types import QUEST_CONTROLS
 
 @dataclass(frozen=True, slots=True)
 class ArmDefaults:
-    """Defaults of an arm's parameters: of the constructor of :class:`BaseArmController`, then of the cell."""
+    """The defaults of an arm's parameters, from the constructor of :class:`BaseArmController` or from the cell."""
 
-    arm_name: str  # left or right
+    arm_name: str  # "left" or "right".
     ctrl_prefix: str
     base_frame_id: str
     end_effector_link_name: str
@@ -42,14 +42,14 @@ class ArmDefaults:
 class ArmParameters:
     """The checked parameters of an arm controller."""
 
-    base_frame: str  # that the controller reads its targets in
-    world_frame: str  # whose axes the hand's are
+    base_frame: str  # The frame of the controller's targets.
+    world_frame: str  # The frame whose axes are those of the hand.
     tool_frame: str
-    controller: str  # name of the controller's node
-    prefix: str  # for the preset's {ctrl}
+    controller: str  # The name of the controller's node.
+    prefix: str  # The text for {ctrl} in the preset.
     target_topic: str
-    current_pose_topic: str  # "": from /tf
-    builtin_node: str  # name of the built-in controller's node
+    current_pose_topic: str  # "" for the pose from /tf.
+    builtin_node: str  # The name of the built-in controller's node.
     builtin_prefix: str
     tool_timeout: float  # [s]
     listener_timeout: float  # [s]
@@ -63,9 +63,9 @@ class ArmParameters:
 
 
 def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
-    """Declare all parameters and check them together. Raises :class:`ConfigError`.
+    """Declare all parameters and check them together; raises :class:`ConfigError`.
 
-    Defaults are the cell's where the parameter ``config`` names one, and else the ones that are ``given``.
+    The defaults are those of the cell if the parameter ``config`` names one, and else the ``given`` ones.
     """
     arm, declare = given.arm_name, node.parameter
     config = declare("config", "", 'YAML of the cell, whose teleop and external are defaults of these; "": none')
@@ -109,7 +109,7 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
 
 
 def teleop_defaults(mirror: bool, filter_window_size: int | None) -> TeleopSettings:
-    """The stance that Quest2ROS2's two arguments of an arm's constructor ask for."""
+    """Return the settings for the two arguments of an arm's constructor in Quest2ROS2."""
     teleop = TeleopSettings(stance=Stance.MIRROR if mirror else Stance.SIDE_BY_SIDE)
     if filter_window_size is None:
         return teleop
@@ -127,7 +127,7 @@ def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
     if cell.external is None:
         return given
     external, theirs = cell.external, cell.external.arm(side)
-    takes_poses = external.terms.takes_poses  # else rate and topic are those of joint commands, of another node
+    takes_poses = external.terms.takes_poses  # If not, rate and topic belong to joint commands.
     return replace(
         given,
         preset=external.preset,
@@ -164,7 +164,7 @@ def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
 
 
 def stance_of(mirror: bool, reflected: bool) -> Stance:
-    """The stance of ``mirror`` and ``mirror_reflected``. Raises :class:`ConfigError`."""
+    """Return the stance for ``mirror`` and ``mirror_reflected``; raises :class:`ConfigError`."""
     if reflected and not mirror:
         raise ConfigError("parameter mirror_reflected = True: allowed with mirror = True only")
     return Stance.SIDE_BY_SIDE if not mirror else Stance.MIRROR_REFLECTED if reflected else Stance.MIRROR
@@ -173,7 +173,7 @@ def stance_of(mirror: bool, reflected: bool) -> Stance:
 def settings_from_parameters(
     node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str] = frozenset(), *, read_only: bool = True
 ) -> Model:
-    """Declare ``prefix.field`` for every field of ``default`` but those left out; returns the settings they make."""
+    """Declare ``prefix.field`` for every field of ``default`` that is not left out; return the resulting settings."""
     values = _values(node, prefix, default, leave_out, read_only)
     return validated(type(default), f"parameter {prefix}.", values)
 
@@ -205,12 +205,12 @@ def _value(node: BaseNode, name: str, default: Any, field: FieldInfo, read_only:
 
 
 def may_be_none(field: FieldInfo) -> bool:
-    """Whether a setting may be none; its parameter then is 0, which no such field allows."""
+    """Return whether a setting may be None. Its parameter is 0 then, which such a field never allows itself."""
     return type(None) in getattr(field.annotation, "__args__", ())
 
 
 def range_of(field: FieldInfo) -> tuple[float, float] | None:
-    """The closed range of a field, if it has one; whether the ends are allowed is checked by the model."""
+    """Return the closed range of a field, or None. The model checks whether the ends are allowed."""
     least = [getattr(entry, name) for entry in field.metadata for name in ("ge", "gt") if hasattr(entry, name)]
     greatest = [getattr(entry, name) for entry in field.metadata for name in ("le", "lt") if hasattr(entry, name)]
     return (float(least[0]), float(greatest[0])) if least and greatest else None

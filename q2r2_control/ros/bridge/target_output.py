@@ -1,4 +1,4 @@
-"""The last step before the controller of an arm: it gets targets on its preset's terms, or none."""
+"""The last step before the controller of an arm, which gets only targets on the terms of its preset."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.tick_pacer import PoseRateLimiter
 from q2r2_control.teleop.arm_states import ArmState
 
-_GRAPH_PERIOD = 0.1  # of asking the graph for subscribers [s]
-# After a subscriber appeared the graph is asked at every tick, because it knows an endpoint before it knows its node.
+_GRAPH_PERIOD = 0.1  # Time between two queries of the graph for subscribers [s].
+# After a subscriber appeared, the graph is asked at every tick, because it knows an endpoint before it knows its node.
 # Until the node is known nothing is sent: it may be the restarted controller, whose first target must not be a jump.
-# If that takes longer than this, an engaged arm is paused [s].
+# If the node is not known after this time, an engaged arm is paused [s].
 _NAME_TIMEOUT = 3.0
-_LAST_ON_ITS_WAY = 0.03  # a stream's last target and its end are on two topics: the end must not overtake it [s]
-# A tool farther from a held target than this was moved by something else: the target is not repeated.
+# Time from a stream's last target to its end, which is on another topic and must not arrive before the target [s].
+_LAST_ON_ITS_WAY = 0.03
+# A tool farther from a held target than this was moved by something else, and the target is not repeated.
 _HELD = 0.15, 0.6  # [m, rad]
 
 
 class TargetOutput:
     """Publishes one arm's target to one controller, through a :class:`PoseRateLimiter`.
 
-    The limiter starts at the tool, so engaging moves nothing. When the target ends the limiter brakes, and then the
-    last pose is repeated or not, as the preset says. It is never repeated when the tool is elsewhere, nor to a
-    controller that was restarted: both would be a jump.
+    The limiter starts at the tool, so that engaging moves nothing. When the target ends, the limiter brakes, and the
+    preset says whether the last pose is repeated then. The pose is never repeated if the tool is elsewhere, nor to a
+    restarted controller, because both would be a jump.
     """
 
     def __init__(
@@ -53,23 +54,23 @@ class TargetOutput:
         self._node, self._controller, self._frame = node, controller, frame
         self._template = pose_template(frame)
         self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
-        self.topic = self._publisher.topic_name  # as the graph knows it
+        self.topic = self._publisher.topic_name  # The full name.
         self._one = OnePublisher(node, [self.topic])
         self._unknown_node = Reason.of(ReasonKind.SUBSCRIBER_UNKNOWN, topic=self.topic)
         self._wrench = None
         if preset.zero_wrench is not None:
             wrench = preset.zero_wrench.format(ctrl=values.prefix)
             self._wrench = node.create_publisher(WrenchStamped, wrench, LATCHED_QOS)
-        self.following = False  # a hand's target
-        self.last_sent: pin.SE3 | None = None  # what the controller was asked for last, world frame; None: nothing
+        self.following = False  # Whether a target is followed now.
+        self.last_sent: pin.SE3 | None = None  # The last target sent, in the world frame; None if there is none.
         self._ends = node.create_publisher(Empty, ended_topic(topic), SENT_COMMAND_QOS) if preset is BUILTIN else None
-        self._sent_at = -math.inf  # the last target of a stream that has not ended yet [s]
-        self._fault: Reason | None = None  # why the controller that is driven is not the one of before
-        self._endpoints: set[bytes] = set()  # of the controller
+        self._sent_at = -math.inf  # Time of the last target of a stream that has not ended yet [s].
+        self._fault: Reason | None = None  # Why the controller is not the same as before.
+        self._endpoints: set[bytes] = set()  # Endpoints of the controller.
         self._listeners = 0
-        self._unknown = False  # a subscriber's node is not known yet
-        self._asked_at = self._appeared_at = -math.inf  # the graph, and a subscriber [s]
-        self.starts = 0  # how often the controller has appeared
+        self._unknown = False  # Whether a subscriber's node is not known yet.
+        self._asked_at = self._appeared_at = -math.inf  # Times of the last query of the graph and of a subscriber [s].
+        self.starts = 0  # How often the controller has appeared.
 
     @property
     def sent(self) -> int:
@@ -88,12 +89,12 @@ class TargetOutput:
         return self._unknown_node if self._unknown and not self.following else None
 
     def take_fault(self, now: float) -> Reason | None:
-        """Check the subscribers; returns once why the controller that is driven is not there any more."""
+        """Check the subscribers. If the controller is no longer there, return the reason once."""
         listeners = self._present()
         if listeners > self._listeners or listeners == 0:
             self._appeared_at = now
             if not self.following:
-                self.forget(now)  # a new subscriber must not get an old target
+                self.forget(now)  # A new subscriber must not get an old target.
         self._listeners = listeners
         recently = now - self._appeared_at < _NAME_TIMEOUT
         if self._unknown or recently or not 0.0 <= now - self._asked_at <= _GRAPH_PERIOD:
@@ -104,7 +105,7 @@ class TargetOutput:
             return self._unknown_node
         fault, self._fault = self._fault, None
         if fault is None and self.following and (silence := self._publisher.silence()) is not None:
-            self.forget(now)  # the controller is gone, and its successor must not get an old target
+            self.forget(now)  # The successor of the controller must not get an old target.
             return Reason.of(ReasonKind.CONTROLLER_SILENT, silence, controller=self._controller)
         return fault
 
@@ -118,13 +119,17 @@ class TargetOutput:
         start: pin.SE3 | None = None,
         state: ArmState = ArmState.ENGAGED,
     ) -> pin.SE3 | None:
-        """Publish for ``now`` [s]; returns what was published, in the world frame.
+        """Publish the target of one tick, and return the published pose in the world frame, or None.
 
-        ``target``: where the tool should be, None while paused; ``tool``: where it is; ``base``: the frame in which
-        the controller reads its targets. All are in the world frame; the latter two are None while not known.
-        ``decided``: see :func:`publish_in_time`; ``start``: where a stream begins, by default at its first target.
-        ``state``: of the arm. The stream goes on while its operator may only begin to pause it, and then ends in order.
-        A stream that stops in any other way has ceased, for which the built-in controller holds linked arms too.
+        Args:
+            target: The target of the tool, in the world frame; None while the arm is paused.
+            tool: The measured tool, in the world frame; None if not known.
+            base: The frame of the controller's targets, in the world frame; None if not known.
+            now: The time [s].
+            decided: See :func:`publish_in_time`.
+            start: The begin of a stream; by default its first target.
+            state: The state of the arm. In PAUSING the stream continues, because the press may become another gesture.
+                In PAUSED it ends in order. If it stops in another way, the built-in controller also holds linked arms.
         """
         if self._unknown or self._present() > self._listeners:
             return None
@@ -146,7 +151,7 @@ class TargetOutput:
         return pose
 
     def _end_stream(self, state: ArmState, now: float) -> None:
-        """Say that the stream ends where its operator paused the arm; what has ceased says nothing."""
+        """Publish that the stream ends if the operator paused the arm. A stream that stops otherwise is not ended."""
         if self._ends is None or state is not ArmState.PAUSED:
             self._sent_at = -math.inf
         elif _LAST_ON_ITS_WAY < now - self._sent_at < math.inf:
@@ -154,12 +159,12 @@ class TargetOutput:
             self._ends.publish(Empty())
 
     def forget(self, now: float) -> None:
-        """Drop the held target; the next target begins a new stream."""
+        """Drop the held target. The next target begins a new stream."""
         self.following, self.last_sent, self._sent_at = False, None, -math.inf
         self.guard.reset(None, now)
 
     def _present(self) -> int:
-        """Number of subscribers, also those that the graph lists before the publisher can send to them."""
+        """Return the number of subscribers, with those that the graph lists before the publisher can send to them."""
         return max(self._publisher.listeners, self._node.handle.get_count_subscribers(self.topic))
 
     def _holds(self, tool: pin.SE3 | None, state: ArmState, now: float) -> bool:
@@ -198,6 +203,6 @@ class TargetOutput:
 
 
 def near(pose: pin.SE3, other: pin.SE3, distance: float, angle: float) -> bool:
-    """Whether two poses are within ``distance`` [m] and ``angle`` [rad] of each other."""
+    """Return whether two poses are within ``distance`` [m] and ``angle`` [rad] of each other."""
     length, rotation = apart(pose, other)
     return length <= distance and rotation <= angle

@@ -1,10 +1,11 @@
-"""Messages of the loops as they are on the wire, CDR, without an object for each of their parts.
+"""Read and write the serialized messages (CDR) of the loops, without a Python object for each of their parts.
 
-rclpy makes a Python object of every part of a message, and checks it. Measured for the joint states of two arms: 37 us
-to make and publish one, 39 us to take one, and twice that between the ticks of a loop, whose data the caches have lost
-by then. Names and layout are the same in each message of a sender, and only its numbers change. A :class:`Template`
-writes these into a serialized message, and the readers here take them out of one whose layout they have seen. rosbags
-reads transforms in 0.25 ms, these in 0.02 ms; and it refuses the bytes that rclpy may leave at a message's end.
+rclpy makes a Python object of every part of a message, and checks it. For the joint states of two arms, this takes
+37 us to make and publish a message, and 39 us to receive one. Between the ticks of a loop it takes twice as long,
+because the caches have lost the data by then. In the messages of a sender only the numbers change, not the names and
+the layout. A :class:`Template` writes the numbers into a serialized message. The readers here read them from a message
+with a known layout. rosbags reads transforms in 0.25 ms, and these readers in 0.02 ms. rosbags also refuses bytes that
+rclpy may leave at the end of a message.
 """
 
 from __future__ import annotations
@@ -22,17 +23,20 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.types import Array
 
-_LITTLE_ENDIAN = b"\x01"  # second byte of a serialized message
+_LITTLE_ENDIAN = b"\x01"  # The second byte of a serialized message.
 _STAMP = struct.Struct("<iI")
-_SECOND, _NANOSECOND = 0x1BADF00D, 987_654_321  # which no other part of a template is
-_KEPT = 16  # layouts that are remembered of each kind
+_SECOND, _NANOSECOND = 0x1BADF00D, 987_654_321  # No other part of a template has these values.
+_KEPT = 16  # Number of layouts that are remembered for each kind of message.
 
 
 class Template:
-    """A serialized message in which only the time stamps and the floating-point numbers are written anew."""
+    """A serialized message in which only the time stamps and the floating-point numbers are replaced."""
 
     def __init__(self, make: Callable[[Iterator[float], Any], Any], stamp: Any) -> None:
-        """``make`` gets numbers, each once, and a stamp; it puts the numbers where others will be written, in order."""
+        """Serialize the message of ``make``, which gets unique numbers and a stamp, and puts them into the message.
+
+        Later numbers are written to the same places in the same order.
+        """
         marks: list[float] = []
 
         def numbers() -> Iterator[float]:
@@ -42,12 +46,12 @@ class Template:
 
         stamp.sec, stamp.nanosec = _SECOND, _NANOSECOND
         self._data = bytearray(serialize_message(make(numbers(), stamp)))
-        # Numbers are searched for as little-endian bytes: every platform of ROS 2 Jazzy is little endian.
+        # The search is for little-endian bytes, because every platform of ROS 2 Jazzy is little endian.
         self._stamps = _found(self._data, _STAMP.pack(_SECOND, _NANOSECOND))
         places = [_found(self._data, struct.pack("<d", mark)) for mark in marks]
         if any(len(found) != 1 for found in places):
             raise ValueError("a number of this message is not found where it was written")
-        self._runs: list[tuple[int, int, struct.Struct]] = []  # numbers that follow each other: first, end, how
+        self._runs: list[tuple[int, int, struct.Struct]] = []  # Runs of adjacent numbers: first, end, format.
         self._places: list[int] = [found[0] for found in places]
         first = 0
         for index in range(1, len(places) + 1):
@@ -56,7 +60,7 @@ class Template:
                 first = index
 
     def fill(self, numbers: Sequence[float], t: float) -> bytes:
-        """The message with these numbers, and the time ``t`` [s] in all its stamps."""
+        """Return the message with these numbers, and with the time ``t`` [s] in all its stamps."""
         data = self._data
         whole, part = divmod(max(t, 0.0), 1.0)
         stamp = int(whole), min(round(part * 1e9), 999_999_999)
@@ -76,7 +80,7 @@ def _found(data: bytes | bytearray, part: bytes) -> list[int]:
 
 
 class JointNumbers(NamedTuple):
-    """The joints of a JointState, or of the one point of a JointTrajectory; arrays (n,), or (0,) for none."""
+    """The joints of a JointState, or of the only point of a JointTrajectory. Arrays are (n,), or (0,) if not given."""
 
     name: tuple[str, ...]
     position: Array
@@ -86,17 +90,17 @@ class JointNumbers(NamedTuple):
 
 class _JointLayout(NamedTuple):
     names: tuple[str, ...]
-    same: tuple[tuple[int, bytes], ...]  # bytes that are the same in all messages of this layout, and where
-    arrays: tuple[tuple[int, int], ...]  # where positions, velocities and efforts are, and how many
-    end: int  # of the arrays; what the middleware appends to a message counts for nothing
+    same: tuple[tuple[int, bytes], ...]  # Offsets and bytes that all messages of this layout share.
+    arrays: tuple[tuple[int, int], ...]  # Offset and length of positions, velocities and efforts.
+    end: int  # The end of the arrays. Bytes that the middleware appends to a message are ignored.
 
 
 class _Walk:
-    """Goes through a serialized message. Raises SerdeError where it ends too early, or a text is none."""
+    """Goes through a serialized message; raises SerdeError if it ends too early or has an invalid text."""
 
     def __init__(self, data: bytes) -> None:
-        self.data, self.place = data, 4  # after the encapsulation, from where alignment counts
-        # Texts and lengths, and where they are. The gaps between aligned parts have any bytes.
+        self.data, self.place = data, 4  # Alignment counts from the end of the encapsulation.
+        # Offsets and bytes of texts and lengths. The gaps between aligned parts may have any bytes.
         self.same = [(1, _LITTLE_ENDIAN)]
         if data[1:2] != _LITTLE_ENDIAN:
             raise SerdeError("not little endian, as every platform of this ROS is")
@@ -105,14 +109,14 @@ class _Walk:
         self.place = 4 + -(-(self.place - 4) // size) * size
 
     def skip(self, length: int) -> int:
-        """Go on by so many bytes; where they begin."""
+        """Skip ``length`` bytes, and return the offset of the first one."""
         began, self.place = self.place, self.place + length
         if self.place > len(self.data):
             raise SerdeError(f"{len(self.data)} bytes are no whole message")
         return began
 
     def count(self) -> int:
-        """A length."""
+        """Read a length."""
         self.align(4)
         began = self.skip(4)
         self.same.append((began, self.data[began : self.place]))
@@ -127,16 +131,16 @@ class _Walk:
             raise SerdeError(str(error)) from error
 
     def numbers(self) -> tuple[int, int]:
-        """Where a sequence of float64 begins, and how many there are."""
+        """Skip a sequence of float64, and return its offset and length."""
         if many := self.count():
             self.align(8)
         return self.skip(8 * many), many
 
 
 def _joints(data: bytes, arrays: int, before: Callable[[_Walk], bool] = lambda walk: True) -> _JointLayout | None:
-    """The layout of a header, names, and arrays; None unless it is so ``before`` the arrays."""
+    """Return the layout of a header, names and arrays; None if ``before`` returns False in front of the arrays."""
     walk = _Walk(data)
-    walk.skip(8)  # the stamp
+    walk.skip(8)  # The stamp.
     walk.text()
     names = tuple(walk.text() for _ in range(walk.count()))
     if not before(walk):
@@ -146,10 +150,9 @@ def _joints(data: bytes, arrays: int, before: Callable[[_Walk], bool] = lambda w
 
 
 def _remembered(make: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
-    """The layouts of messages by ``make``, each made once."""
-    layouts: dict[
-        int, tuple[Callable[[bytes], Any], Any, Any]
-    ] = {}  # by a message's length: its parts that are the same
+    """Return a function that finds the layout of a message. Each layout is made once by ``make``."""
+    # By the length of a message, the function that takes its constant parts, these parts, and the layout.
+    layouts: dict[int, tuple[Callable[[bytes], Any], Any, Any]] = {}
 
     def find(data: bytes) -> Any:
         parts_of, parts, layout = layouts.get(len(data), (None, None, None))
@@ -169,9 +172,9 @@ def _numbers(data: bytes, layout: _JointLayout) -> Iterator[Array]:
 
 
 def joint_state_reader() -> Callable[[Any], Any]:
-    """A function that reads serialized JointState messages, and returns other objects as they are.
+    """Return a function that reads serialized JointState messages, and returns other objects unchanged.
 
-    It raises SerdeError for bytes that are no such message.
+    The function raises SerdeError for bytes that are no such message.
     """
     find = _remembered(lambda data: _joints(data, 3))
 
@@ -192,7 +195,7 @@ class Span(NamedTuple):
 
 
 class Point(NamedTuple):
-    """A point of a trajectory; arrays are (n,), or (0,) for none."""
+    """A point of a trajectory. Arrays are (n,), or (0,) if not given."""
 
     positions: Array
     velocities: Array
@@ -207,12 +210,12 @@ class Trajectory(NamedTuple):
 
 
 def trajectory_reader() -> Callable[[bytes], Any]:
-    """A function that reads serialized JointTrajectory messages. It raises SerdeError for what is none."""
+    """Return a function that reads serialized JointTrajectory messages, and raises SerdeError for other bytes."""
     find = _remembered(lambda data: _joints(data, 4, lambda walk: walk.count() == 1))
 
     def read(data: bytes) -> Any:
         layout = find(data)
-        if layout is None:  # not one point
+        if layout is None:  # The message does not have exactly one point.
             return deserialize_message(data, JointTrajectory)
         q, v, *_ = _numbers(data, layout)
         end = 4 + -(-(layout.end - 4) // 4) * 4
@@ -235,7 +238,7 @@ _POSE = struct.Struct("<7d")
 
 
 def read_pose(message: Any) -> PoseNumbers:
-    """A PoseStamped, serialized or not. Raises SerdeError for bytes that are none."""
+    """Read a PoseStamped, serialized or not; raises SerdeError for bytes that are none."""
     if isinstance(message, bytes):
         walk = _Walk(message)
         sec, nanosec = _STAMP.unpack_from(message, walk.skip(8))
@@ -260,13 +263,13 @@ class TransformNumbers(NamedTuple):
 
 
 class _TransformLayout(NamedTuple):
-    same: tuple[tuple[int, bytes], ...]  # see _JointLayout
-    frames: tuple[tuple[str, str], ...]  # child and parent of each
-    places: tuple[int, ...]  # of their numbers
+    same: tuple[tuple[int, bytes], ...]  # See _JointLayout.
+    frames: tuple[tuple[str, str], ...]  # Child and parent of each transform.
+    places: tuple[int, ...]  # Offsets of their numbers.
 
 
 def transforms_reader() -> Callable[[bytes], list[TransformNumbers]]:
-    """A function that reads serialized TFMessages. It raises SerdeError for what is none."""
+    """Return a function that reads serialized TFMessages, and raises SerdeError for other bytes."""
     find = _remembered(_layout_of_transforms)
 
     def read(data: bytes) -> list[TransformNumbers]:
@@ -281,7 +284,7 @@ def _layout_of_transforms(data: bytes) -> _TransformLayout:
     walk, frames, places = _Walk(data), list[tuple[str, str]](), list[int]()
     for _ in range(walk.count()):
         walk.align(4)
-        walk.skip(8)  # the stamp
+        walk.skip(8)  # The stamp.
         parent, child = walk.text(), walk.text()
         walk.align(8)
         frames.append((child, parent))

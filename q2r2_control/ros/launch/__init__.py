@@ -1,1 +1,1 @@
-"""Steps before a node runs; nothing here needs rclpy, and no node needs more of it than ``middleware``."""
+"""Steps before a node runs. Nothing here needs rclpy, and nodes need only ``middleware`` from this package."""

@@ -1,4 +1,4 @@
-"""Build the interface packages under ``interfaces/`` into the running environment, where no other install has them."""
+"""Build the interface packages under ``interfaces/`` into the running environment, if no other install has them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from q2r2_control.errors import Q2R2Error
 from q2r2_control.extras import install_line
 
 INTERFACES = Path(__file__).parents[1] / "interfaces"
-# Packages that the generators and ament import while CMake runs; the result is for rclpy.
+# Packages that the generators and ament import while CMake runs, and rclpy, for which the result is made.
 _PYTHON_TOOLS = ("rclpy", "rosidl_adapter", "rosidl_generator_py", "catkin_pkg", "em", "lark", "numpy")
 
 
 class BuildError(Q2R2Error):
-    """Interfaces cannot be built; the message says what is missing, or which file holds the build's log."""
+    """Interfaces cannot be built. The message says what is missing, or which file holds the build's log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Interfaces:
 
     @property
     def proof(self) -> str:
-        """Python code that fails unless all types can be imported; messages are serialised."""
+        """Python code that fails unless all types can be imported and serialised."""
         lines = ["from rclpy.serialization import serialize_message"]
         for file in sorted([*self.source.glob("msg/*.msg"), *self.source.glob("action/*.action")]):
             probe = f"{file.stem}.Goal()" if file.suffix == ".action" else f"{file.stem}()"
@@ -44,8 +44,8 @@ class Interfaces:
         return "\n".join([*lines, f"import {self.name}"])
 
     def found_in(self) -> Path | None:
-        """The folder that a fresh Python imports all types from, or None."""
-        # As where this environment's own setup file is sourced after that of a ROS.
+        """Return the folder from which a new Python process imports all types, or None."""
+        # The path is the same as if this environment's setup file is sourced after that of a ROS.
         libraries = os.pathsep.join(filter(None, [str(Path(sys.prefix, "lib")), os.environ.get("LD_LIBRARY_PATH")]))
         command = [sys.executable, "-c", f"{self.proof}\nprint({self.name}.__path__[0])"]
         environment = os.environ | {"LD_LIBRARY_PATH": libraries}
@@ -58,12 +58,12 @@ def interface_packages() -> list[Interfaces]:
 
 
 def build_interfaces(report: Callable[[str], None], force: bool = False) -> None:
-    """Build what cannot be imported and ``report`` one line a package. Raises :class:`BuildError`.
+    """Build packages that cannot be imported, and ``report`` one line for each; raises :class:`BuildError`.
 
-    ``force`` builds again what this environment holds; what another install has, such as one that is sourced, stays.
+    ``force`` builds the packages of this environment again. Those of another install, such as a sourced one, stay.
     """
     prefix = Path(sys.prefix)
-    held = []  # by this environment
+    held = []  # Packages of this environment.
     for package in interface_packages():
         folder = package.found_in()
         own = folder is None or folder.resolve().is_relative_to(prefix.resolve())
@@ -82,14 +82,14 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
             raise BuildError(f"{package.name} was built into {prefix} but cannot be imported, see {log}")
         report(f"{package.name}: built in {time.monotonic() - began:.0f} s (log: {log})")
     sourced = _sourced()
-    if held and sourced and prefix not in sourced:  # whose libraries the sourced ROS does not find
+    if held and sourced and prefix not in sourced:  # The sourced ROS does not find their libraries.
         report(f"before use: source {prefix}/share/{held[0]}/local_setup.bash")
 
 
 def build_missing(report: Callable[[str], None]) -> None:
-    """Build the message packages where this environment lacks some. Raises :class:`BuildError`.
+    """Build the message packages if this environment lacks some; raises :class:`BuildError`.
 
-    It looks for their names only, since importing them all takes seconds: for the start of nodes.
+    Only their names are looked up, because importing all of them would delay the start of nodes by seconds.
     """
     if any(importlib.util.find_spec(package.name) is None for package in interface_packages()):
         report("building message packages, once for this environment")
@@ -98,9 +98,9 @@ def build_missing(report: Callable[[str], None]) -> None:
 
 
 def missing_tools(prefix: Path) -> list[str]:
-    """The things that a build into ``prefix`` needs and does not have, each with where to get it."""
+    """Return the things that a build into ``prefix`` lacks, each with where to get it."""
     missing = []
-    # Debian's own Python looks elsewhere.
+    # Debian's own Python imports from another folder.
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
     if Path(sysconfig.get_path("purelib")) != packages or not os.access(packages, os.W_OK):
         missing.append(f"a virtual environment that can be written to, since {prefix} is none")
@@ -121,7 +121,7 @@ def missing_tools(prefix: Path) -> list[str]:
 
 
 def build(package: Interfaces, prefix: Path, log: Path) -> None:
-    """Compile and install ``package`` into ``prefix``; all output goes to ``log``. Raises :class:`BuildError`."""
+    """Compile and install ``package`` into ``prefix``, with all output in ``log``; raises :class:`BuildError`."""
     cmake = _found("cmake") or "cmake"
     path = os.pathsep.join(map(str, _prefix_path(prefix)))
     environment = os.environ | {"AMENT_PREFIX_PATH": path, "CMAKE_PREFIX_PATH": path}
@@ -153,5 +153,5 @@ def _sourced() -> list[Path]:
 
 
 def _prefix_path(prefix: Path) -> list[Path]:
-    """Where CMake finds packages: in ``prefix``, the running environment and every ROS that is sourced."""
+    """Return the folders in which CMake finds packages: ``prefix``, the running environment and every sourced ROS."""
     return list(dict.fromkeys([prefix, Path(sys.prefix), *_sourced()]))

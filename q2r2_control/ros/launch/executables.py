@@ -1,7 +1,7 @@
-"""The executables of the nodes. One that is still importing ends on Ctrl-C at once and without a traceback.
+"""The executables of the nodes. During its imports, an executable ends on Ctrl-C at once and without a traceback.
 
-Imports take seconds, and turn Ctrl-C into errors of many kinds. There is nothing to clean up yet, so the system's own
-answer to the signal is the right one, until :func:`run_node` takes it over.
+Imports take seconds, and turn Ctrl-C into errors of many kinds. There is nothing to clean up yet, so the default action
+of the signal is right until :func:`run_node` handles it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 
-# Module of ``nodes``, and in it the class of a node, or the function that runs more than one.
+# By executable, a module of ``nodes``, and in it the class of a node or a function that runs several nodes.
 NODES = {
     "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),
     "SimulationInput": ("simulation_input", "SimulationInput"),
@@ -31,7 +31,7 @@ def _executable(name: str) -> Callable[[], int]:
     def run() -> int:
         sys.argv[0] = name
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        # q2r2 ros up blocks it, so that the interpreter's own start is not interrupted either.
+        # q2r2 ros up blocks the signal, so that it does not interrupt the start of the interpreter either.
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         module, made = NODES[name]
         imported = import_module(f"q2r2_control.ros.nodes.{module}")
@@ -42,7 +42,7 @@ def _executable(name: str) -> Callable[[], int]:
         from q2r2_control.ros.base_node import end_in_time, run_node
 
         code = run_node(node_or_run) if isinstance(node_or_run, type) else int(node_or_run())
-        end_in_time()  # what the middleware still does as the process goes
+        end_in_time()  # The middleware may still work while the process ends.
         return code
 
     return run

@@ -1,8 +1,8 @@
-"""Sets up Fast DDS, the middleware of ROS 2 Jazzy, unless the user has done so; each process for itself.
+"""Set up Fast DDS, the middleware of ROS 2 Jazzy, for this process, unless the user has done so.
 
 Shared memory is switched off. A process that is killed while it holds a lock there delays all writers to the same
-memory, and all their subscribers, for about a second. And a node that died leaves the graph after 3 s instead of 20, so
-that its successor counts as a second publisher for no longer.
+memory, and all their subscribers, for about a second. A node that died leaves the graph after 3 s instead of 20 s, so
+that its successor counts as a second publisher for 3 s at most.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ _RANGE, _PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
 
 
 def set_up_middleware(environment: MutableMapping[str, str]) -> None:
-    """Add what a process needs before ``rclpy.init``; the user's Fast DDS settings and another middleware stay."""
+    """Add the variables for Fast DDS before ``rclpy.init``. The user's own settings and another middleware stay."""
     if not environment.get("RMW_IMPLEMENTATION", _FAST_DDS).startswith(_FAST_DDS):
         return
-    # ROS_LOCALHOST_ONLY overrides the range, and brings shared memory whatever a profile says.
+    # ROS_LOCALHOST_ONLY overrides the range, and switches shared memory on against any profile.
     if _PROFILES_FILE in environment or _TRANSPORTS in environment or environment.get("ROS_LOCALHOST_ONLY") == "1":
         return
     if environment.get(_RANGE) != "LOCALHOST":
         environment.update({_TRANSPORTS: "UDPv4", _PROFILES_FILE: str(_PROFILES / "subnet.xml")})
     elif not environment.get(_PEERS):
-        # For LOCALHOST ROS 2 adds shared memory whatever the profile says. For SYSTEM_DEFAULT it adds nothing, static
-        # peers neither: with static peers the range, and so the shared memory, stay as they are.
+        # For LOCALHOST, ROS 2 adds shared memory against any profile. For SYSTEM_DEFAULT, it adds neither shared memory
+        # nor static peers. Therefore, with static peers, the range and its shared memory do not change.
         environment.update({_RANGE: "SYSTEM_DEFAULT", _PROFILES_FILE: str(_PROFILES / "localhost.xml")})

@@ -25,11 +25,11 @@ from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_s
 from q2r2_control.ros.launch.build import build_missing
 from q2r2_control.types import SIDES
 
-NO_INPUT = "none"  # another node sends the hands
+NO_INPUT = "none"  # Another node sends the hands.
 ROBOTS = ("auto", "mujoco", "none")
 # Time for a process to end, after SIGINT and then after SIGTERM; SIGKILL follows [s].
 _END_TIMEOUTS = {signal.SIGINT: 5.0, signal.SIGTERM: 3.0}
-# Looked up here, because few calls are safe between fork and exec.
+# The function is looked up here, because few calls are safe between fork and exec.
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 _NAMESPACE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _PR_SET_PDEATHSIG = 1
@@ -38,14 +38,14 @@ _EXECUTABLES = "q2r2_control.ros.launch.executables"
 
 @dataclass(frozen=True, slots=True)
 class NodeProcess:
-    """One process to start: its executable's name, and the parameters of its nodes."""
+    """One process to start, with the name of its executable and the parameters of its nodes."""
 
     name: str
     parameters: Mapping[str, str | float] = field(default_factory=dict)
-    ros_arguments: tuple[str, ...] = ()  # more for ROS, such as "-r", "__ns:=/cell"
+    ros_arguments: tuple[str, ...] = ()  # Further arguments for ROS, such as "-r", "__ns:=/cell".
 
     def command(self) -> list[str]:
-        """The command that starts it with this Python; a text that looks like a number, as "3", stays one."""
+        """Return the command that starts it with this Python. A text that looks like a number, as "3", stays a text."""
         parameters = [
             part
             for key, value in self.parameters.items()
@@ -62,11 +62,15 @@ def nodes_of(
     separate: bool = False,
     page: tuple[str, int] | None = None,
 ) -> list[NodeProcess]:
-    """The processes for a cell's YAML, in the order of their start. Raises :class:`ConfigError`.
+    """Return the processes for a cell, in the order of their start; raises :class:`ConfigError`.
 
-    ``source`` of the hands: an installed input, "none", or None for the cell's. ``robot``: mujoco, none, or auto:
-    mujoco for ``controller: builtin`` only. ``recording``: parameters of the recorder, which starts first and ends
-    last. ``separate``: each arm is a process with a teleoperation of its own. ``page``: its address.
+    Args:
+        path: The YAML of the cell.
+        source: The source of the hands: an installed input, "none", or None for the cell's input.
+        robot: "mujoco", "none", or "auto", which is mujoco for ``controller: builtin`` and else none.
+        recording: Parameters of the recorder, which starts first and ends last; None for no recorder.
+        separate: Whether each arm is a process with its own teleoperation.
+        page: Host and port of the page in a browser; None for no page.
     """
     if robot not in ROBOTS:
         raise ConfigError(f"robot = {robot!r:.60}: allowed are {', '.join(ROBOTS)}")
@@ -86,7 +90,7 @@ def nodes_of(
     nodes += [NodeProcess(name, config) for name in (["arm_controllers"] if together else arms)]
     if source != NO_INPUT:
         executable = getattr(load_class(INPUTS, source), "executable", "hand_input")
-        # Nobody listens to the other hand of a cell with one arm.
+        # In a cell with one arm, no node uses the other hand.
         hands = [cell.teleop.stance.hand_of(str(arm)) for arm in cell.arms]
         side: dict[str, str | float] = {"side": hands[0]} if len(hands) == 1 else {}
         nodes.append(NodeProcess(executable, config | {"input": source} | side))
@@ -100,9 +104,9 @@ def nodes_of(
 def in_ros(
     nodes: Iterable[NodeProcess], arguments: Sequence[str], namespace: str | None, sim_time: bool
 ) -> list[NodeProcess]:
-    """``nodes`` with more ``arguments`` for ROS, in a ``namespace``, and with the time on /clock.
+    """Return ``nodes`` with more ``arguments`` for ROS, in a ``namespace``, and with ``sim_time`` by the topic /clock.
 
-    Raises :class:`ConfigError` for what is no namespace.
+    Raises :class:`ConfigError` for an invalid namespace.
     """
     given: list[str] = []
     if namespace is not None:
@@ -115,7 +119,7 @@ def in_ros(
 
 
 def _relayed(external: ExternalConfig) -> dict[str, str | float]:
-    """Parameters of the built-in controller for mode filtered: it publishes safe targets, or joint commands."""
+    """Return the parameters of the built-in controller in mode filtered, for safe targets or joint commands."""
     preset = external.terms
     parameters: dict[str, str | float] = {"output": preset.output}
     if not preset.takes_poses:
@@ -129,18 +133,21 @@ def _relayed(external: ExternalConfig) -> dict[str, str | float]:
 
 
 class UpError(Q2R2Error):
-    """ROS cannot be used here; the message says what is missing."""
+    """ROS cannot be used here. The message says what is missing."""
 
 
 def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> int:
     """Start ``nodes`` and pass each line that they print to ``say``, after the node's name; returns the exit code.
 
-    Ctrl-C or SIGTERM ends all of them: 0, or 3 if a node says by this code that its recording failed. A node that ends
-    by itself is reported at once and ends the others: 1. None is restarted. Each is a session of its own, so that
-    Ctrl-C in a terminal reaches it only from here, in order. If this process is killed, Linux interrupts them all:
-    arms must not move in a teleoperation that cannot be ended. ``say`` is called by several threads,
-    one at a time. Message packages that are missing are built first. Raises :class:`UpError`, and :class:`BuildError`
-    where these cannot be built.
+    Ctrl-C or SIGTERM ends all of them. The exit code is then 0, or 3 if a node reports by this code that its recording
+    failed. A node that ends by itself is reported at once and ends the others, with exit code 1. No node is restarted.
+    Each node is a session of its own, so that Ctrl-C in a terminal reaches it only from here, in order. If this process
+    is killed, Linux interrupts all nodes, because arms must not move in a teleoperation that cannot be ended. ``say``
+    is called by several threads, one at a time. Missing message packages are built first.
+
+    Raises:
+        UpError: If ROS cannot be used.
+        BuildError: If message packages cannot be built.
     """
     check_rclpy()
     build_missing(say)
@@ -156,7 +163,7 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
         try:
             for node in nodes:
                 running[node.name] = _start(node)
-            for name, process in running.items():  # threads come last, since a process is forked from one thread best
+            for name, process in running.items():  # Threads start last: forking is safer from a single thread.
                 readers.append(threading.Thread(target=_read, args=(name, process, say_alone), daemon=True))
                 readers[-1].start()
             dead = _watch(running, stop, say_alone)
@@ -173,7 +180,7 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
 
 
 def check_rclpy() -> None:
-    """Raise :class:`UpError` where there is no ROS."""
+    """Raise :class:`UpError` if there is no ROS."""
     if importlib.util.find_spec("rclpy") is None:
         cure = f"{install_line('ros')}, or source a ROS 2 Jazzy"
         raise UpError(f"rclpy cannot be imported: {cure}")
@@ -195,9 +202,9 @@ def _start(node: NodeProcess) -> subprocess.Popen[str]:
 
 
 def _end_with(parent: int) -> None:
-    """In the new process: ask Linux for SIGINT when ``parent`` ends, which it may have done already.
+    """Let Linux send SIGINT to this new process when ``parent`` ends, which may have happened already.
 
-    The executable unblocks the signal: an interpreter that is starting would print a traceback.
+    The signal is blocked until the executable unblocks it, because a starting interpreter would print a traceback.
     """
     assert _prctl is not None
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -212,7 +219,7 @@ def _read(name: str, process: subprocess.Popen[str], say: Callable[[str], None])
 
 
 def _watch(running: Mapping[str, subprocess.Popen[str]], stop: StopRequest, say: Callable[[str], None]) -> str | None:
-    """Wait for the request to stop, or for a process to end by itself; its name."""
+    """Wait for the request to stop, or for a process to end by itself; return its name, or None."""
     while not stop.asked:
         for name, process in running.items():
             if (code := process.poll()) is not None:
@@ -223,7 +230,7 @@ def _watch(running: Mapping[str, subprocess.Popen[str]], stop: StopRequest, say:
 
 
 def _end(running: Mapping[str, subprocess.Popen[str]], say: Callable[[str], None]) -> None:
-    """End them one by one, the last started first: the robot runs until the controller has braked it."""
+    """End all processes one by one in reverse order, so that the robot runs until the controller has braked it."""
     for name, process in reversed(list(running.items())):
         for number, timeout in _END_TIMEOUTS.items():
             if process.poll() is None:

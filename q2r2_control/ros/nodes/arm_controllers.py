@@ -24,7 +24,7 @@ class RightArmController(BaseArmController):
 
 
 def run_arms(left: Callable[..., BaseArmController], right: Callable[..., BaseArmController]) -> int:
-    """Main function of an executable of both arms, nodes of two classes that share one teleoperation."""
+    """Run an executable with the nodes of both arms, which share one teleoperation."""
     made: list[BaseArmController] = []
 
     def make_left() -> BaseArmController:
@@ -35,5 +35,5 @@ def run_arms(left: Callable[..., BaseArmController], right: Callable[..., BaseAr
 
 
 def run_both_arms() -> int:
-    """Both arms in one process and one teleoperation."""
+    """Run both arms in one process and one teleoperation."""
     return run_arms(LeftArmController, RightArmController)

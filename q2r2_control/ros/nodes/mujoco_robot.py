@@ -39,27 +39,28 @@ from q2r2_control.ros.bridge.messages import age, delay, joint_state_template, s
 from q2r2_control.ros.bridge.wire import Template, trajectory_reader
 from q2r2_control.supervision.targets import DelayWatch
 
-_LOG_PERIOD = 1.0  # of lines about refusals [s]
+_LOG_PERIOD = 1.0  # Least time between lines about refusals [s].
 _TRAJECTORY = "joint_trajectory"
-_REACHED = 0.02  # of the stroke
-_STALLED_AFTER = 0.3  # without moving by the following [s]
-_MOVES = 0.004  # of the stroke
-_OUTSIDE = 0.02  # a goal this much beyond the stroke still counts as its end
-_CLOSED = 0.05  # in goals, as Quest2ROS2 has it; 0 is fully open [m]
+_REACHED = 0.02  # Distance from the goal that counts as reached, as a share of the stroke.
+_STALLED_AFTER = 0.3  # A gripper that does not move by _MOVES within this time has stalled [s].
+_MOVES = 0.004  # Share of the stroke.
+_OUTSIDE = 0.02  # A goal beyond the stroke by this share still counts as its end.
+_CLOSED = 0.05  # Closed position in goals, as in Quest2ROS2; 0 is fully open [m].
 
 
 @dataclass(slots=True)
 class _Motion:
     handle: ServerGoalHandle
-    goal: float  # opening, 0 closed .. 1 open
-    seen: float  # opening when it last moved
-    moved_at: float  # [s]
+    goal: float  # Opening: 0 closed .. 1 open.
+    seen: float  # Opening at the last motion.
+    moved_at: float  # Time of the last motion [s].
 
 
 class GripperServer:
-    """Serves ``topic``. A newer goal aborts the older one; fingers that stop on something have succeeded: stalled.
+    """Serves ``topic``. A newer goal aborts the older one. Fingers that stop on an object have stalled and succeeded.
 
-    A goal's ``max_effort`` is not used. :meth:`update` works on goals: a callback that waits would block the node.
+    The ``max_effort`` of a goal is not used. :meth:`update` processes goals, because a waiting callback would block the
+    node.
     """
 
     def __init__(self, node: Node, topic: str, command: Callable[[float], None], refuse: Callable[[str], None]) -> None:
@@ -70,14 +71,14 @@ class GripperServer:
             node,
             GripperCommand,
             topic,
-            execute_callback=lambda _: GripperCommand.Result(),  # each goal gets its own when it ends
+            execute_callback=lambda _: GripperCommand.Result(),  # Each goal gets its own result at its end.
             goal_callback=self._check,
             handle_accepted_callback=self._accept,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
     def update(self, now: float, opening: float, effort: float) -> None:
-        """Go on with the goal at ``now`` [s]: the gripper is open by ``opening`` 0..1 and presses by ``effort`` [N]."""
+        """Continue with the goal at ``now`` [s], with the gripper's measured ``opening`` 0..1 and ``effort`` [N]."""
         position = _CLOSED * (1.0 - opening)
         if self._newest is not None:
             if self._motion is not None:
@@ -104,7 +105,7 @@ class GripperServer:
 
     def _check(self, goal: GripperCommand.Goal) -> GoalResponse:
         position = goal.command.position
-        if -_OUTSIDE <= position / _CLOSED <= 1.0 + _OUTSIDE:  # which is not so of NaN
+        if -_OUTSIDE <= position / _CLOSED <= 1.0 + _OUTSIDE:  # NaN is refused too.
             return GoalResponse.ACCEPT
         self._refuse(f"gripper position {position:g} m; allowed: 0 .. {_CLOSED:g}")
         return GoalResponse.REJECT
@@ -116,7 +117,7 @@ class GripperServer:
 
     def _end(self, handle: ServerGoalHandle, outcome: str, result: GripperCommand.Result) -> None:
         def conclude(handle: ServerGoalHandle) -> GripperCommand.Result:
-            # A goal that is being cancelled can end as canceled only.
+            # A goal with a requested cancellation can only end as canceled.
             getattr(handle, "canceled" if handle.is_cancel_requested else outcome)()
             return result
 
@@ -133,7 +134,7 @@ class MujocoRobot(BaseNode):
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
         rate = self.parameter("rate", 250.0, "joint states per second [Hz]", within=(20, 1000))
         tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", within=(1, 1000))
-        # Hands feel it fifty times a second; an admittance needs it in every tick.
+        # Vibrations need external torques fifty times a second, and an admittance needs them at every tick.
         felt = rate if config.admittance.enabled else 50.0
         self._external_period, self._external_due = 1.0 / felt, 0.0  # [s]
         hold_after = self.parameter("hold_after", 0.1, "without commands [s]", within=(0.01, 1))
@@ -141,10 +142,10 @@ class MujocoRobot(BaseNode):
         self._robot = Robot.from_config(config)
         self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
         self._period = 1.0 / rate
-        self._received = 0.0  # when the command that is being taken was [s]
+        self._received = 0.0  # Receipt time of the command in progress [s].
         self._refused: dict[str, str] = {}
         self._refusals = 0
-        self._delays: dict[tuple[str, ...], DelayWatch] = {}  # by topic and first joint
+        self._delays: dict[tuple[str, ...], DelayWatch] = {}  # By topic and first joint.
         self._make_publishers()
         self._make_subscriptions()
         self._grippers = {
@@ -157,7 +158,7 @@ class MujocoRobot(BaseNode):
             for arm in self._cell.plant.gripper_openings()
         }
         self.create_service(Trigger, "~/reset", self._reset)
-        # The simulation makes its own time, whatever /clock says.
+        # The simulation has its own time, and ignores /clock.
         self.create_tick(self._period, self._tick, clock=STEADY)
         self.create_tick(1.0 / tf_rate, self._publish_transforms, clock=STEADY)
         self.get_logger().info(f"{config.name}: {', '.join(self._robot.joint_names)}")
@@ -175,7 +176,7 @@ class MujocoRobot(BaseNode):
         self._tf_static.publish(fixed.at(self._cell.plant.data, self.now))
 
     def _make_subscriptions(self) -> None:
-        # Each arm may have a sender of its own, and the one's message is not to take the place of the other's.
+        # Each arm may have its own sender, and the message of one must not replace that of the other.
         commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
         names, move, push = self._robot.joint_names, self._cell.command_velocities, self._cell.command_torques
         kinds: tuple[tuple[type, str, Callable[[Any], str | None]], ...] = (
@@ -187,7 +188,7 @@ class MujocoRobot(BaseNode):
         )
         for kind, topic, command in kinds:
             take = partial(self._take, topic, command)
-            if kind is JointTrajectory:  # which comes in every tick
+            if kind is JointTrajectory:  # These messages come at every tick.
                 take = partial(self._take_serialized, trajectory_reader(), take)
             self.create_subscription(kind, topic, take, commands, raw=kind is JointTrajectory)
 
@@ -196,19 +197,19 @@ class MujocoRobot(BaseNode):
     ) -> None:
         try:
             message = read(data)
-        except SerdeError:  # which is its sender's fault
+        except SerdeError:  # The sender is at fault.
             self.drop(_TRAJECTORY, f"{len(data)} bytes")
             return
         take(message, info)
 
     def _take(self, topic: str, command: Callable[[Any], str | None], message: Any, info: Mapping[str, Any]) -> None:
-        # Two controllers of an arm each may send on one topic, from hosts with clocks of their own.
+        # Two controllers, each of one arm, may send on one topic from hosts with different clocks.
         names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
         if late := delays.take(delay(info), time.monotonic()):
             self._note(topic, f"{late:.2f} s late; its sender or this node stood still")
             return
-        # A message that came while this process stood still is as new as one that came since the last tick.
+        # A message that came while this process stood still counts as one that came since the last tick.
         self._received = time.monotonic() - min(age(info), self._period)
         self._note(topic, command(message))
 
@@ -240,10 +241,10 @@ class MujocoRobot(BaseNode):
         stamp = self.now
         q = np.concatenate([state.q, cell.finger_positions()])
         v = np.concatenate([state.v, cell.finger_velocities()])
-        tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])  # fingers' efforts are not measured
+        tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])  # Efforts of fingers are not measured.
         self._joint_states.publish(self._measured.fill([*q.tolist(), *v.tolist(), *tau.tolist()], stamp))
         if state.tau_external is not None and now >= self._external_due:
-            # On a grid, half a tick early so that no tick of the grid is too early by its jitter.
+            # The due times are on a grid, half a tick early, so that a tick that comes early by jitter counts.
             self._external_due = max(self._external_due + self._external_period, now - 0.5 * self._period)
             if self._external.get_subscription_count():
                 self._external.publish(self._felt.fill(state.tau_external.tolist(), stamp))
@@ -276,14 +277,14 @@ class MujocoRobot(BaseNode):
 
 
 def link_transforms(model: Any, without: Collection[str]) -> tuple[LinkTransforms, LinkTransforms]:
-    """Of a ``mujoco.MjModel`` the links on a joint, and all others; bodies named in ``without`` are no links."""
+    """Return the transforms of a model's links with a joint, and of all others, except bodies named in ``without``."""
     links = [index for index in range(1, model.nbody) if model.body(index).name not in without]
     moving = [index for index in links if model.body_jntnum[index]]
     return LinkTransforms(model, moving), LinkTransforms(model, [index for index in links if index not in moving])
 
 
 class LinkTransforms:
-    """Where bodies are in their parents, as a serialized TFMessage."""
+    """The poses of bodies in their parents, as a serialized TFMessage."""
 
     def __init__(self, model: Any, bodies: list[int]) -> None:
         self._bodies, self._parents = np.array(bodies, dtype=int), model.body_parentid[bodies]
@@ -301,15 +302,15 @@ class LinkTransforms:
         self._template = Template(make, Time())
 
     def at(self, data: Any, t: float) -> bytes:
-        """The message for a ``mujoco.MjData`` at ``t`` [s]."""
+        """Return the message for a ``mujoco.MjData`` at ``t`` [s]."""
         turned = data.xquat[self._parents]
         away = data.xpos[self._bodies] - data.xpos[self._parents]
         numbers = np.empty((len(self._bodies), 7))
-        # A vector turned back by a unit quaternion (w, u) is a - 2 w (u x a) + 2 u x (u x a).
+        # A vector a that is turned back by a unit quaternion (w, u) is a - 2 w (u x a) + 2 u x (u x a).
         w, u = turned[:, :1], turned[:, 1:]
         across = np.cross(u, away)
         numbers[:, :3] = away - 2.0 * w * across + 2.0 * np.cross(u, across)
-        its_w, its_u = data.xquat[self._bodies, :1], data.xquat[self._bodies, 1:]  # MuJoCo has w first
+        its_w, its_u = data.xquat[self._bodies, :1], data.xquat[self._bodies, 1:]  # MuJoCo has w first.
         numbers[:, 3:6] = w * its_u - its_w * u - np.cross(u, its_u)
         numbers[:, 6:] = w * its_w + (u * its_u).sum(axis=1, keepdims=True)
         return self._template.fill(numbers.ravel().tolist(), t)

@@ -17,11 +17,11 @@ from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_hap
 from q2r2_control.ros.monitoring import HandListeners
 from q2r2_control.types import SIDES, HandSample
 
-_PERIOD = 0.002  # between two polls of another input [s]
-_SHORTEST, _LONGEST = 0.001, 0.02  # between two looks at what has come due [s]
-# Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
+_PERIOD = 0.002  # Time between two polls of another input [s].
+_SHORTEST, _LONGEST = 0.001, 0.02  # Shortest and longest time between two checks for due samples [s].
+# Times of the script at which it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
-# After the hands have first moved: an arm that stops while other nodes still start is engaged again until then [s].
+# Time after the first motion of the hands in which an arm that stops is engaged again, while other nodes start [s].
 _SETTLES = 6.0
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
@@ -31,12 +31,12 @@ _MODES = {
 
 
 class SimulationInput(BaseNode):
-    """Plays a scripted trajectory. It presses and releases the lower buttons, early on, to engage the arms.
+    """Plays a scripted trajectory, which presses and releases the lower buttons early to engage the arms.
 
-    The script starts when every hand that it plays has a subscriber. The hands rest until the arms' nodes say that they
-    can be engaged. Then the buttons are pressed. They are pressed again where an arm is not engaged by the time the
-    hands would move, or stops in the first six seconds. From then on, and after an arm's ``~/pause``, ``~/reset`` or
-    way home, it takes a person: the script's own presses may pause an arm, and engage none.
+    The script starts when every hand that it plays has a subscriber. The hands rest until the arms' nodes report that
+    they can be engaged. Then the buttons are pressed. They are pressed again if an arm is not engaged when the hands
+    would move, or if it stops in the first six seconds. After that time, and after an arm's ``~/pause``, ``~/reset`` or
+    way home, only a person can engage an arm. The script's own presses may still pause an arm.
     """
 
     ticks = True
@@ -56,11 +56,11 @@ class SimulationInput(BaseNode):
         self._hand_publishers = HandPublishers(self, self._hands, _MODES[mode])
         self._make_script = partial(ScriptedInput, trajectory, self._hands, rate_hz=rate, jitter=jitter)
         self._listeners = HandListeners(self, self._hands if MessageType.INPUTS in _MODES[mode] else ())
-        self._starts = True  # until nothing is pressed again to engage the arms
-        self._pressed = False  # once, to engage them
-        self._moves = False  # whether the hands do
-        self._until = math.inf  # when it ends that arms are engaged again [s]
-        self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
+        self._starts = True  # Whether presses may still engage the arms.
+        self._pressed = False  # Whether the buttons were pressed once to engage them.
+        self._moves = False  # Whether the hands move.
+        self._until = math.inf  # Time until which arms are engaged again [s].
+        self._not_to_press: set[str] | None = None  # Hands that do not press; None before that is decided.
         self._rewind(self.now)
         self._timer = self.create_tick(_LONGEST, self._tick)
 
@@ -74,16 +74,16 @@ class SimulationInput(BaseNode):
         return OK, self._title, values
 
     def _missing(self) -> list[str]:
-        """Hands that nobody listens to."""
+        """Return the hands without a subscriber."""
         return [hand for hand in self._hands if not self._hand_publishers.subscribers(hand)]
 
     def _tick(self) -> None:
-        """Play, and come again when the next sample is due."""
+        """Play the script, and schedule the next tick for the next sample."""
         if self._waits_for_subscribers:
             if self._missing():
                 return
             self._waits_for_subscribers = False
-            self._rewind(self.now)  # the listeners are looked at from now on
+            self._rewind(self.now)  # From now on, the arms are watched.
             self.get_logger().info(f"plays {self._title}")
         now = self.now
         if self._starts:
@@ -95,10 +95,10 @@ class SimulationInput(BaseNode):
         self._timer.reset()
 
     def _engage(self, now: float) -> None:
-        """Begin the script anew, where its hands rest, until the arms are ready, and then until they follow."""
+        """Restart the script, in which the hands rest first, until the arms are ready, and then until they follow."""
         self._listeners.look()
         t = now - self._began
-        # An arm's last event may be a request of before the first press, which does not count.
+        # The last event of an arm may be a request before the first press. Such a request does not count.
         self._pressed = self._pressed or (self._not_to_press is not None and t >= _BEFORE_MOTION)
         if now > self._until or (self._pressed and self._listeners.asked_to_hold()):
             self._starts = False
@@ -110,12 +110,12 @@ class SimulationInput(BaseNode):
         following = [hand for hand in self._hands if self._listeners.engaged(hand) is not False]
         if self._not_to_press is None:
             if self._listeners.unready() is None:
-                # A press would pause those that are engaged already.
+                # A press would pause arms that are engaged already.
                 self._not_to_press = {hand for hand in following if self._listeners.engaged(hand)}
             else:
                 self._rewind(now)
         elif len(following) == len(self._hands) or (self._moves and following):
-            # Once the hands move they do not go back while an arm follows, which would be a jump.
+            # While an arm follows, moving hands do not go back to the start, because that would be a jump.
             self._moves, self._until = True, min(self._until, now + _SETTLES)
         else:
             self._rewind(now)

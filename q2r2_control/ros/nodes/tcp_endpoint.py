@@ -148,7 +148,7 @@ class CheckTcpConnection(BaseNode):
         self._recorders.setdefault(topic, TopicRecorder()).record(message, time.monotonic())
 
     def _topics(self) -> tuple[dict[str, TopicStatistics | None], list[str]]:
-        """Of each topic what came, and the topics that are silent."""
+        """Return the statistics of each topic, and the names of silent topics."""
         now, heard = time.monotonic(), self._recorders
         topics = {name: heard[name].snapshot(now) if name in heard else None for name in HAND_TOPICS}
         ages = {name: now - self._start if topic is None else topic.age for name, topic in topics.items()}

@@ -80,16 +80,16 @@ class WebPage(BaseNode):
             allowed = "allowed: controller: builtin, or mode: filtered"
             raise ConfigError(f"--web: {config.name} has no ticks to show; {allowed}")
         self._asked: SimpleQueue[Any] = SimpleQueue()
-        self._page = Page(host, port, self._asked.put)  # its process starts while this one builds
+        self._page = Page(host, port, self._asked.put)  # Its process starts during the work below.
         self._cell, self._robot = config.model_copy(update={"loop_rate_hz": rate}), Robot.from_config(config)
         self._begun = time.monotonic_ns()
         self._ticks = RosTicks(self._begun, self._robot)
         self._waiting: list[tuple[str, Message]] = []
-        self._row: Any = None  # newest tick; None: nothing to be shown was heard yet
+        self._row: Any = None  # The newest tick; None before the first one.
         self._start: RunStart | None = None
         self._events: list[Event] = []
         self._marks = EpisodeMarks()
-        self._number, self._shown, self._slowest = -1, -1, 0.0  # newest tick, and the last one of a frame
+        self._number, self._shown, self._slowest = -1, -1, 0.0  # Newest tick, last shown one, longest time [s].
         self._states, self._notice = NodeStates(self, namespace=self.get_namespace()), ""
         self._controller, self._recorder = self.name_in_set("cartesian_controller"), self.name_in_set(RECORDER)
         self._trigger_clients: dict[str, Any] = {}
@@ -101,10 +101,10 @@ class WebPage(BaseNode):
             if topic.name in shown:
                 name, qos = self.name_in_set(heard_on(topic.name)), RECORDED_QOS if topic.type == TEXT else _STREAM_QOS
                 self._listen(name, topic.type, partial(self._take, topic), qos)
-        self._obstacles: dict[str, tuple[MovingObstacle, float]] = {}  # newest ones, and when they came [s]
+        self._obstacles: dict[str, tuple[MovingObstacle, float]] = {}  # The newest ones and their times [s].
         if config.control.moving_obstacles:
             self.create_subscription(Marker, OBSTACLES.replace("~", self._controller), self._on_obstacle, 10)
-        self._pictures: dict[str, bytes] = {}  # newest messages, by camera
+        self._pictures: dict[str, bytes] = {}  # The newest messages by camera.
         for camera in [name for name, its in config.cameras.items() if its.topic and is_compressed(its.topic)]:
             self._listen(
                 str(config.cameras[camera].topic), PICTURE, partial(self._pictures.__setitem__, camera), _PICTURE_QOS

@@ -1,1 +1,1 @@
-"""Watching a set of nodes from outside, for ``q2r2 ros watch`` and ``doctor``; only ``set_listener`` needs rclpy."""
+"""Watch a set of nodes from outside, for ``q2r2 ros watch`` and ``doctor``."""

@@ -1,6 +1,6 @@
-"""Faults of a set of nodes or of the environment, and their cures; found without importing rclpy here.
+"""Find faults of a set of nodes or of the environment, with their cures, without importing rclpy here.
 
-A middleware that is not installed ends the process that asks for it, so another process tries.
+A middleware that is not installed ends the process that requests it, so another process tries it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from q2r2_control.teleop.arm_states import ArmState
 _ONE = "end all but one (a killed one counts for some seconds)"
 _START_CONTROLLER = "start the arm's controller, or set preset or ctrl_prefix to the one that runs"
 _START_HANDS = "start tcp_endpoint and connect the headset, or SimulationInput"
-# Its controllers keep their last command, and its hardware cannot be activated again.
+# The driver's controllers keep their last command, and its hardware cannot be activated again.
 FRI_CURE = "start the application on the pendant, and the driver's launch file anew: it ends with each session"
 _BAD_STATES = (
     *(ReasonKind.NO_STATES_YET, ReasonKind.STATES_SILENT, ReasonKind.STATE_NOT_FINITE, ReasonKind.STATE_JUMPED),
@@ -45,16 +45,16 @@ _CURES = {
     **dict.fromkeys((ReasonKind.FRI_SESSION, ReasonKind.FRI_SILENT, ReasonKind.FRI_COMMAND_MODE), FRI_CURE),
     **dict.fromkeys(_BAD_STATES, "look at the robot's driver, and at joint_states_topic of cartesian_controller"),
 }
-# Whose sentences say what helps, as those of a stopped arm do.
+# Kinds of faults whose sentences already name the cure, as the sentences of a stopped arm do.
 _CURE_IN_SENTENCE = {ReasonKind.CONTROLLER_REFUSES, ReasonKind.CONTROLLER_DEACTIVATED}
 _SEE = "docs/ros.md, What moves an arm, and what stops it"
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that is wrong, and what helps, in a line each."""
+    """A fault and its cure, in one line each."""
 
-    stops_arms: bool  # keeps them from moving, or stops them
+    stops_arms: bool  # Whether it keeps arms from moving, or stops them.
     what: str
     cure: str
 
@@ -64,7 +64,10 @@ def error(what: str, cure: str) -> Finding:
 
 
 def examine_set(view: SetView, expected: Collection[str]) -> list[Finding]:
-    """Findings of a set, none where none runs; ``expected``: names that nodes end with, as ``left_arm_controller``."""
+    """Return the findings of a set of nodes, or none if no node runs.
+
+    ``expected`` are the ends of the names of expected nodes, such as ``left_arm_controller``.
+    """
     if not view.nodes:
         return []
     return [*_nodes(view, expected), *_senders(view), *_receivers(view), *_arms(view)]
@@ -100,7 +103,7 @@ def _senders(view: SetView) -> Iterator[Finding]:
             continue
         arms = [controllers[name].arms for name in topic.publishers if name in controllers]
         if len(arms) == len(topic.publishers) and len(set().union(*arms)) == sum(map(len, arms)):
-            continue  # controllers of an arm each
+            continue  # Each of these controllers has its own arm.
         yield error(f"{len(topic.publishers)} publishers of {topic.name}: {', '.join(topic.publishers)}", _ONE)
     for robot in (node.name for node in view.nodes if node.is_robot):
         topics = [topic for topic in view.topics if robot in topic.subscribers and topic.publishers]
@@ -135,7 +138,7 @@ def _arms(view: SetView) -> Iterator[Finding]:
 
 
 def _cure(node: NodeView, line: str) -> str:
-    """By the kind of what a node reports; a controller that refuses, and a stop, say themselves what helps."""
+    """Return the cure for the fault that a node reports. The lines of a refusal and of a stop name it themselves."""
     kind = node.values.get("kind")
     if kind in _CURE_IN_SENTENCE or node.values.get("state") == ArmState.STOPPED:
         return line
@@ -148,7 +151,7 @@ PACKAGES = (
     *("sensor_msgs", "std_msgs", "std_srvs", "trajectory_msgs", "visualization_msgs"),
 )
 _GREATEST_DOMAIN = 232
-# Also tries each package of messages, whose code is given. Its last line is one JSON object.
+# This code also tries each message package by the code in its argument. Its last line is one JSON object.
 _TRY = """
 import json, sys
 import rclpy
@@ -167,7 +170,7 @@ _INSTALL = f"{install_line('ros')}, or source a ROS 2 Jazzy"
 
 
 def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str], list[Finding]]:
-    """Facts by name, and what is wrong; ``environment``: of the process, as the user has set it."""
+    """Return facts by name, and findings; ``environment`` is that of the process, as the user has set it."""
     findings = []
     domain = environment.get("ROS_DOMAIN_ID") or "0"
     if not (domain.isdecimal() and int(domain) <= _GREATEST_DOMAIN):
@@ -197,7 +200,7 @@ def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str],
             findings.append(answer)
         else:
             facts["middleware"], lacking = answer["middleware"], answer["lacking"]
-    # Implementations on Zenoh answer yes to whether all was acknowledged, whoever hangs: it has no acknowledgements.
+    # Zenoh has no acknowledgements. Middlewares on it report that all was acknowledged, even if a receiver hangs.
     if "zenoh" in facts["middleware"]:
         what = f"{facts['middleware']} has no acknowledgements: a receiver that hangs is not noticed by that"
         findings.append(Finding(False, what, "export RMW_IMPLEMENTATION=rmw_fastrtps_cpp or rmw_cyclonedds_cpp"))
@@ -208,7 +211,7 @@ def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str],
 
 
 def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> dict[str, Any] | Finding:
-    """The findings of a node that tries ROS and the code of ``packages``, or why there is no node."""
+    """Start a node in another process, which tries ``packages``; return its answer, or why there is no node."""
     own = dict(environment)
     set_up_middleware(own)
     try:

@@ -1,4 +1,4 @@
-"""The drivers of a cell with a preset ``lbr_*``, as ``q2r2 ros doctor`` sees them: what they lack, and their limits."""
+"""Check the drivers of a cell with a preset ``lbr_*`` for ``q2r2 ros doctor``: their topics, sessions and limits."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from q2r2_control.ros.watching.set_view import DriverView, SetView
 from q2r2_control.wording import sentence
 
 _STATE = "lbr_fri_idl/msg/LBRState"
-_NEAR = 1e-6  # [rad], and of a share
+_NEAR = 1e-6  # Tolerance of an angle [rad] and of a share.
 _SHUT = "its driver shuts the connection beyond"
 
 
 class DriverListener:
-    """Listens to the drivers' states and descriptions, and to no command. Has to be spun."""
+    """Listens to the states and descriptions of drivers, but not to commands. The node has to be spun."""
 
     def __init__(self, node: Node, cell: Config) -> None:
         self._node, external = node, cell.external
@@ -43,7 +43,7 @@ class DriverListener:
             node.create_subscription(String, topic, partial(self._on_description, view), LATCHED_QOS)
 
     def look(self) -> None:
-        """At the graph."""
+        """Read the types of states and commands from the graph."""
         for view in self.views:
             for name in STATE_TOPICS:
                 topic = f"{view.namespace}/{name}"
@@ -59,7 +59,7 @@ class DriverListener:
 
 
 def examine_drivers(view: SetView, cell: Config) -> list[Finding]:
-    """Findings of the drivers that were listened to."""
+    """Return the findings of the drivers in ``view``."""
     if not view.drivers:
         return []
     robot, judged = Robot.from_config(cell), any(node.is_controller for node in view.nodes)
@@ -67,7 +67,7 @@ def examine_drivers(view: SetView, cell: Config) -> list[Finding]:
 
 
 def _examine(view: DriverView, cell: Config, robot: Robot, with_session: bool) -> Iterator[Finding]:
-    """``with_session``: whether its session is judged, which a controller does where one runs."""
+    """Yield the findings of one driver. Its session is judged only ``with_session``: a running controller judges it."""
     assert cell.external is not None
     arm, message, topics = view.arm, cell.external.terms.message, " and ".join(view.states)
     controller = cell.external.arm(arm).ctrl_prefix.rpartition("/")[2]
@@ -97,7 +97,7 @@ def _examine(view: DriverView, cell: Config, robot: Robot, with_session: bool) -
 
 
 def _compare_limits(view: DriverView, cell: Config, robot: Robot) -> Iterator[Finding]:
-    """Of positions and velocities that are commanded, and those that the driver allows."""
+    """Compare the limits of commanded positions and velocities with those of the driver."""
     where = f"{view.namespace}/robot_description"
     try:
         urdf = parse_urdf(view.description, where)
@@ -118,7 +118,7 @@ def _compare_limits(view: DriverView, cell: Config, robot: Robot) -> Iterator[Fi
     low, high, fastest = (
         np.array([float(limits[theirs[name]].get(key, "0")) for name in ours]) for key in ("lower", "upper", "velocity")
     )
-    if view.state is not None:  # its safe_stop stays away from its limits by a step
+    if view.state is not None:  # The driver's safe_stop keeps one step from its limits.
         low, high = low + fastest * view.state.sample_time, high - fastest * view.state.sample_time
     lower, upper = robot.position_lower[joints], robot.position_upper[joints]
     margin = np.maximum(low - lower, upper - high)
@@ -138,5 +138,5 @@ def _compare_limits(view: DriverView, cell: Config, robot: Robot) -> Iterator[Fi
 
 
 def _degrees(*values: float) -> str:
-    """Of angles [rad]."""
+    """Return angles [rad] as text in degrees."""
     return " to ".join(f"{np.degrees(value):.1f}" for value in values) + " deg"

@@ -1,7 +1,7 @@
-"""Listens to what nodes of a set say on ``~/state``, and so takes no part in it.
+"""Listen only to the reports of a set's nodes on ``~/state``, so that the set runs as without the listener.
 
-An arm that has no controller would take a listener of its targets for one and could be engaged. A controller lets arms
-go whose commands get a new receiver. How much goes over a topic is counted by who sends it, and said there.
+An arm without a controller would take a listener of its targets for a controller, and could be engaged. A controller
+stops commanding arms whose commands get a new receiver. Therefore each sender counts its own messages and reports that.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from q2r2_control.ros.monitoring import NodeStates, node_of
 from q2r2_control.ros.watching.lbr_drivers import DriverListener
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
 
-_LOOK_PERIOD = 0.5  # between two looks at the graph [s]
-_OWN = ("/rosout", "/parameter_events")  # every node has them
-_COUNTS = 8  # of what a sender says, over which its rate is taken
+_LOOK_PERIOD = 0.5  # Time between two queries of the graph [s].
+_OWN = ("/rosout", "/parameter_events")  # Topics of every node.
+_COUNTS = 8  # Number of a sender's counts from which its rate is computed.
 
 
 class WatchError(Q2R2Error):
-    """The middleware does not start; the message says why."""
+    """The middleware does not start. The message says why."""
 
 
 class SetListener:
-    """Looks at the graph of one domain, and hears nodes that report on ``~/state``. Has to be spun."""
+    """Queries the graph of one domain, and listens to reports on ``~/state``. The node has to be spun."""
 
     def __init__(self, node: Node, cell: Config, drivers: bool = False) -> None:
         self._node, self._cell = node, cell
         self._drivers = DriverListener(node, cell) if drivers else None
         self._states = NodeStates(node, self._note)
-        self._sent: dict[tuple[str, str], deque[tuple[float, int]]] = {}  # node and topic: when it was told, how many
-        self._topics: dict[str, tuple[str, ...]] = {}  # with their types
+        self._sent: dict[tuple[str, str], deque[tuple[float, int]]] = {}  # By node and topic: times [s] and counts.
+        self._topics: dict[str, tuple[str, ...]] = {}  # The types by topic.
         self._publishers: dict[str, tuple[str, ...]] = {}
         self._subscribers: dict[str, tuple[str, ...]] = {}
         self._names: tuple[str, ...] = ()
@@ -76,7 +76,7 @@ class SetListener:
                 self._sent.setdefault((name, topic), deque(maxlen=_COUNTS)).append((time.monotonic(), count))
 
     def _rate(self, topic: str) -> float | None:
-        """Of all that say how much they send there [Hz]."""
+        """Return the rate of all nodes that count their messages on a topic [Hz], or None."""
         rates = []
         for name in self._publishers[topic]:
             counts = self._sent.get((name, topic))
@@ -86,14 +86,14 @@ class SetListener:
         return sum(rates) if rates else None
 
     def _is_shown(self, topic: str, members: set[str]) -> bool:
-        """Whether some node of the set awaits it, or sends it and somebody counts or takes it."""
+        """Return whether a node of the set expects the topic, or sends it and it is counted or received."""
         if topic in _OWN or "/_action/" in topic or topic.removesuffix("/state") in members:
             return False
         if members.intersection(self._publishers[topic]):
             counted = any(topic == told for _, told in self._sent)
             return bool(counted or self._subscribers[topic])
         receivers = [self._states.newest[name][0] for name in members.intersection(self._subscribers[topic])]
-        # Arms and controllers need what they receive; a robot receives one of many kinds of commands.
+        # Arms and controllers need all topics that they receive. A robot receives only one of many kinds of commands.
         return any(self._publishers[topic] or "arm" in state or "phase" in state for state in receivers)
 
 
@@ -112,9 +112,9 @@ def watch_set(
     stop: Callable[[], bool],
     drivers: bool = False,
 ) -> SetView:
-    """Listen for ``duration`` [s] or until ``stop``; ``show`` gets views. The last one. Raises :class:`WatchError`.
+    """Listen for ``duration`` [s] or until ``stop``, and return the last view; raises :class:`WatchError`.
 
-    ``drivers``: KUKA drivers are listened to as well.
+    ``show`` gets all views before. With ``drivers``, KUKA drivers are listened to as well.
     """
     set_up_middleware(os.environ)
     try:

@@ -1,4 +1,4 @@
-"""A set of nodes at one moment: nodes by what they say, topics by the graph, arms in words."""
+"""A set of nodes at one moment: nodes by their reports, topics by the graph, and arms in words."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from q2r2_control.events import Reason
 from q2r2_control.teleop.arm_states import AT_REST, ArmState
 from q2r2_control.wording import sentence
 
-SILENT = 2.0  # nodes say what they do twice a second [s]
-_SLIPPED = 0.005  # a target that has slipped farther is held up [m]
-# Findings that wait where the arms move already, and where nothing is wrong.
+SILENT = 2.0  # A node without a report for this time is silent. Nodes report twice a second [s].
+_SLIPPED = 0.005  # A target that has slipped farther than this is held back [m].
+# Texts for states in which the arm moves already, or in which nothing is wrong.
 _MOVES = {
     ArmState.CARRIED: "goes with the other arm",
     ArmState.HOMING: "goes home",
@@ -26,17 +26,17 @@ _MOVES = {
 
 @dataclass(frozen=True, slots=True)
 class NodeView:
-    """A node of the set, as it says on ``~/state``."""
+    """A node of the set by its last report on ``~/state``."""
 
-    name: str  # full
-    level: str  # ok, warn, error
+    name: str  # The full name.
+    level: str  # One of ok, warn and error.
     message: str
-    age: float  # of what it said last [s]
+    age: float  # Age of the report [s].
     values: Mapping[str, Any]
 
     @property
     def arm(self) -> str | None:
-        """Which arm it teleoperates, if it does."""
+        """The arm that the node teleoperates, or None."""
         arm = self.values.get("arm")
         return arm if isinstance(arm, str) else None
 
@@ -50,12 +50,12 @@ class NodeView:
 
     @property
     def arms(self) -> set[str]:
-        """Which arms it controls, if it does."""
+        """The arms that the node controls, if any."""
         return {key.removesuffix("_state") for key in self.values if key.endswith("_state")}
 
     @property
     def sent(self) -> tuple[str, ...]:
-        """The topics on which it counts what it sends."""
+        """The topics on which the node counts its messages."""
         sent = self.values.get("sent")
         return tuple(sent) if isinstance(sent, dict) else ()
 
@@ -65,7 +65,7 @@ class NodeView:
         return "" if problem is None else sentence(problem)
 
     def reason(self, key: str) -> Reason | None:
-        """The reason that the node tells as this value; None where it tells none."""
+        """Return the reason that the node reports under ``key``, or None."""
         try:
             return Reason.from_json(self.values[key])
         except (KeyError, TypeError, ValueError):
@@ -74,36 +74,36 @@ class NodeView:
 
 @dataclass(frozen=True, slots=True)
 class TopicView:
-    """A topic that nodes of the set send or take."""
+    """A topic that nodes of the set send or receive."""
 
     name: str
     types: tuple[str, ...]
-    publishers: tuple[str, ...]  # full names of nodes
-    subscribers: tuple[str, ...]
-    rate: float | None  # [Hz]; None: not known
+    publishers: tuple[str, ...]  # Full names of nodes.
+    subscribers: tuple[str, ...]  # Full names of nodes.
+    rate: float | None  # [Hz]; None if not known.
 
 
 @dataclass(frozen=True, slots=True)
 class ArmView:
-    """One arm and why it does or does not move."""
+    """One arm, and why it moves or does not move."""
 
     name: str
-    node: str  # full name; "": none runs
-    state: str  # of its teleoperation
-    controller: str  # what the built-in controller does with it; "" where that says nothing
+    node: str  # Full name of its node; "" if none runs.
+    state: str  # State of its teleoperation.
+    controller: str  # Its state in the built-in controller; "" if not reported.
     why: str
 
 
 @dataclass(slots=True)
 class DriverView:
-    """A KUKA driver, as its topics are."""
+    """A KUKA driver by its topics."""
 
     arm: str
-    command: str  # topic of the arm's commands
-    states: dict[str, set[str]] = field(default_factory=dict)  # types that are published, by topic
-    takers: set[str] = field(default_factory=set)  # types that nodes take on the topics of commands
-    state: Any = None  # the newest LBRState
-    description: str = ""  # the newest URDF
+    command: str  # Topic of the arm's commands.
+    states: dict[str, set[str]] = field(default_factory=dict)  # Published types by topic of states.
+    takers: set[str] = field(default_factory=set)  # Types that nodes receive on the topics of commands.
+    state: Any = None  # The newest LBRState.
+    description: str = ""  # The newest URDF.
 
     @property
     def namespace(self) -> str:
@@ -114,19 +114,19 @@ class DriverView:
 class SetView:
     nodes: tuple[NodeView, ...]
     topics: tuple[TopicView, ...]
-    names: tuple[str, ...]  # of all nodes in the domain, one that runs twice twice
+    names: tuple[str, ...]  # Of all nodes in the domain. A node that runs twice is there twice.
     arms: tuple[ArmView, ...]
-    drivers: tuple[DriverView, ...] = ()  # where they were listened to
+    drivers: tuple[DriverView, ...] = ()  # Empty if drivers were not listened to.
 
     @property
     def others(self) -> tuple[str, ...]:
-        """Nodes that say nothing on ``~/state``."""
+        """The nodes without a report on ``~/state``."""
         members = {node.name for node in self.nodes}
         return tuple(name for name in self.names if name not in members)
 
 
 def arm_views(nodes: tuple[NodeView, ...], cell: Config) -> tuple[ArmView, ...]:
-    """A row for every node of an arm, and for every arm of ``cell`` that has none."""
+    """Return a row for every node of an arm, and for every arm of ``cell`` without a node."""
     controller = next((node for node in nodes if node.is_controller), None)
     views = []
     for arm in cell.arms:
@@ -156,7 +156,7 @@ def _why(node: NodeView, controller: NodeView | None, cell: Config) -> str:
         bindings = cell.teleop.bindings
         control = bindings.words_of(Action.PAUSE_TOGGLE) or bindings.words_of(Action.DEAD_MAN)
         press = "a press" if control is None else QUEST_WORDS.noun(control)
-        last = str(values.get("last_event", "")).removeprefix(f"{state}: ")  # the state stands beside this
+        last = str(values.get("last_event", "")).removeprefix(f"{state}: ")  # The state is shown beside this text.
         return f"waits for its operator: {press} of the {values.get('hand')} hand engages (last: {last})"
     return node.message.removeprefix(f"{state}: ")
 

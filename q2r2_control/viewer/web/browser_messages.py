@@ -1,7 +1,8 @@
-"""The messages of a browser that reach viser: those that this page sends, field by field, and no others.
+"""Filter the messages of browsers, so that viser gets only those that this page sends, with no other fields.
 
-viser itself sets any attribute of a control that a client names, its callbacks too, and opens a public tunnel for
-whoever asks. Therefore each message is read here first, and only what was understood is written anew for viser.
+viser itself sets any attribute of a control that a client names, even its callbacks, and opens a public tunnel for
+any client that requests one. Therefore each message is decoded here first, and only its known fields are encoded again
+for viser.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from websockets.asyncio.server import ServerConnection
 
 from q2r2_control.inputs.listener import RateLimit
 
-LONGEST_MESSAGE = 4096  # the longest of the page, its camera, has 400 [bytes]
-MOST_MESSAGES = 1000  # of a browser in a second; one that drags both tools sends 160
-_PRESS_PERIOD = 0.1  # between two presses of a button that count [s]
-_CHANGES = 10  # of a slider or a checkbox in that time; a browser sends 2
+LONGEST_MESSAGE = 4096  # Allowed length [bytes]. The page's longest message, about its camera, has 400 bytes.
+MOST_MESSAGES = 1000  # Allowed messages of a browser per second. A browser that drags both tools sends 160.
+_PRESS_PERIOD = 0.1  # Least time between two presses of a button that count [s].
+_CHANGES = 10  # Allowed changes of a slider or a checkbox in that time. A browser sends 2.
 _FLOOD = 1008  # WebSocket's code for a breach of policy
 
 _Three = tuple[float, float, float]
@@ -27,11 +28,11 @@ _Four = tuple[float, float, float, float]
 
 
 class _Sent(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=True):
-    """A message of viser's client; the classes have its names."""
+    """A message of viser's client. The subclasses have the names that viser gives to its messages."""
 
 
 class ViewerCameraMessage(_Sent):
-    """The browser looks from elsewhere."""
+    """The camera of the browser was moved."""
 
     wxyz: _Four
     position: _Three
@@ -75,7 +76,7 @@ class TransformControlsDragEndMessage(_Sent):
 
 
 class LocalStorageGetItemResponseMessage(_Sent):
-    """The answer of a page that is asked whether it is alive."""
+    """The answer of a page to the question whether it is alive."""
 
     value: str | None
     error: str | None
@@ -93,7 +94,7 @@ _DECODER = msgspec.msgpack.Decoder(
 
 
 class BrowserMessages:
-    """Decides which messages of browsers viser gets. Used in the thread of the server's event loop only."""
+    """Decides which messages of browsers viser gets. Only the thread of the server's event loop may use it."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock = clock
@@ -102,18 +103,18 @@ class BrowserMessages:
         self._limits: dict[str, RateLimit] = {}
 
     def watch(self, gui: viser.GuiApi) -> None:
-        """Let browsers use the widgets of ``gui``; before, they can use none."""
+        """Let browsers use the widgets of ``gui``. Before this call they can use none."""
         self._gui = gui
 
     def take_over(self, button: viser.GuiButtonHandle, action: Callable[[], None]) -> None:
-        """Do ``action`` at each press of ``button``, which viser never hears of.
+        """Do ``action`` at each press of ``button``. These presses are not passed on to viser.
 
-        The press counts in any state of viser's widgets, and however busy the threads are that call their callbacks.
+        Therefore a press counts in any state of viser's widgets, even if the threads for their callbacks are busy.
         """
         self._actions[button._impl.uuid] = action
 
     def admitted(self, content: str | bytes) -> bytes | None:
-        """The message for viser, written anew, or None if viser shall not get it."""
+        """Return the message for viser, encoded again, or None if viser must not get it."""
         if isinstance(content, str):
             return None
         try:
@@ -122,7 +123,7 @@ class BrowserMessages:
             return None
         if isinstance(message, GuiUpdateMessage) and not self._is_allowed(message.uuid, message.updates.value):
             return None
-        # The same message anew: of two fields that a browser sends with one name, viser might read the other one.
+        # The message is encoded again: if a browser sends two fields with one name, viser might read the other one.
         encoded: bytes = msgspec.msgpack.encode(message)
         return encoded
 
@@ -141,19 +142,19 @@ class BrowserMessages:
                 fits, count = not isinstance(value, bool) and handle.min <= value <= handle.max, _CHANGES
             case _:
                 return False
-        # Only widgets of the page have a limit, so no browser makes this grow.
+        # Only widgets of the page have a limit, so no browser can make this dictionary grow.
         return fits and self._limits.setdefault(uuid, RateLimit(count, _PRESS_PERIOD)).take(self.clock())
 
 
 class FilteredConnection(ServerConnection):
-    """A browser's connection, from which viser gets only what ``messages`` admits. A flood ends it."""
+    """A browser's connection. viser gets only the messages that ``messages`` admits, and too many of them close it."""
 
     def __init__(self, *all: Any, messages: BrowserMessages, **settings: Any) -> None:
         super().__init__(*all, **settings)
         self._messages, self._rate = messages, RateLimit(MOST_MESSAGES)
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """The next message that is admitted."""
+        """Return the next message that is admitted."""
         while True:
             content = await super().recv(decode)
             if not self._rate.take(self._messages.clock()):

@@ -1,4 +1,4 @@
-"""The door of the page that viser serves."""
+"""The check of all requests to the page that viser serves."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from q2r2_control.viewer.web.browser_messages import LONGEST_MESSAGE, BrowserMes
 from q2r2_control.viewer.web.page_file import PageFile
 
 _MOST_CLIENTS = 12
-# viser's page is one file: its scripts and styles are in it, it compiles WebAssembly, and it starts workers from blobs.
-# Its sorter of Gaussian splats evaluates text, which is not allowed, since this page shows none.
+# viser's page is one file with its scripts and styles. It compiles WebAssembly, and starts workers from blobs.
+# Its sorter of Gaussian splats evaluates text as code. The policy forbids this, because this page shows no splats.
 _POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
     "connect-src 'self' blob: data:; img-src 'self' blob: data:; font-src 'self' data:; worker-src 'self' blob: data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
 )
-_CLOSE_TIMEOUT = 1.0  # for a browser to say that it has closed its end [s]
+_CLOSE_TIMEOUT = 1.0  # Time for a browser to confirm that a connection is closed [s].
 
 
 class Door(PageDoor):
-    """The token is the path of the page's URL, since that is where viser's page connects to."""
+    """A page door whose token is the path of the page's URL, because viser's page connects to that path."""
 
     def __init__(self, host: str, port: int, certificate: str | None = None, addresses: Sequence[str] = ()) -> None:
-        """As of :class:`PageDoor`."""
+        """Open the socket, with the arguments of :class:`PageDoor`."""
         super().__init__(host, port, "--web", secrets.token_urlsafe(16), certificate, addresses)
-        self.messages = BrowserMessages()  # which of them viser gets
+        self.messages = BrowserMessages()  # Decides which messages viser gets.
         self._clients = 0
 
     def refusal(self, request: Request, *, with_token: bool = True) -> str | None:
@@ -54,11 +54,12 @@ class Door(PageDoor):
 
     @contextmanager
     def guards(self, name: str) -> Iterator[None]:
-        """Servers of ``websockets`` that are started meanwhile, as viser's, listen behind this door.
+        """Check all requests to servers of ``websockets`` that are started in this context, such as viser's.
 
-        Their page has the ``name`` of a cell, which is the browser tab's.
+        The title of their page, which the browser's tab shows, is the ``name`` of a cell.
 
-        Raises :class:`ConfigError` where none was: then nothing would check requests.
+        Raises:
+            ConfigError: If no server was started, because then nothing would check requests.
         """
         serve, used, page = websockets.asyncio.server.serve, False, PageFile(name)
 
@@ -70,12 +71,12 @@ class Door(PageDoor):
             def checked(connection: ServerConnection, request: Request) -> Response | None:
                 if (reason := self.refusal(request)) is not None:
                     return text_response(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
-                request.path = "/"  # the page is all that viser serves
+                request.path = "/"  # viser serves nothing but the page.
                 response: Response | None = answer(connection, request)
                 if response is not None:
                     page.change(response)
                     protect(response, _POLICY)
-                    response.headers["X-Frame-Options"] = "DENY"  # a page around this one could steal a click
+                    response.headers["X-Frame-Options"] = "DENY"  # A page that frames this one could steal a click.
                 return response
 
             async def counted(connection: ServerConnection) -> None:
@@ -90,7 +91,7 @@ class Door(PageDoor):
             settings["create_connection"] = partial(FilteredConnection, messages=self.messages)
             return serve(counted, process_request=checked, **settings)
 
-        setattr(websockets.asyncio.server, "serve", guarded)  # noqa: B010, which a type checker would refuse
+        setattr(websockets.asyncio.server, "serve", guarded)  # noqa: B010 (a type checker refuses the assignment)
         try:
             yield
         finally:

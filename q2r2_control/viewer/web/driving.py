@@ -1,4 +1,4 @@
-"""Gizmos at the tools, with which one page at a time moves them, as a hand does."""
+"""Gizmos at the tools. One page at a time moves the tools with them, in place of a hand."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ import viser
 from q2r2_control.viewer.web.exchange import Frame, PageHand, PageLost, PageSetup
 from q2r2_control.viewer.web.figure import place
 
-_SIZE = 0.22  # of a gizmo [m]
-_PERIOD = 0.02  # between samples [s]
-_ANSWER = 60.0  # a page that does not answer for longer drives no more; the gate stops the arms long before [s]
-_Gizmos = dict[str, viser.TransformControlsHandle]  # by arm
+_SIZE = 0.22  # Size of a gizmo [m].
+_PERIOD = 0.02  # Time between samples [s].
+_ANSWER = 60.0  # A page without an answer for this time loses control. The gate stops the arms long before [s].
+_Gizmos = dict[str, viser.TransformControlsHandle]  # By arm.
 
 
 class Driving:
-    """The page that drags first drives until it lets go. Others watch meanwhile, and have no gizmos.
+    """The page that drags first drives until it lets go. Until then the other pages only watch, and show no gizmos.
 
-    A browser says nothing of a mouse that rests. Therefore the page that drives is asked again and again for an answer,
-    which its own script gives; each answer is a sample of the hands. Without them the gate stops the arms.
+    A browser sends nothing while the mouse rests. Therefore the page that drives is asked again and again for an
+    answer, which its own script gives. Each answer is a sample of the hands. Without answers the gate stops the arms.
     """
 
     def __init__(self, server: viser.ViserServer, setup: PageSetup, answer: Callable[[Any], None]) -> None:
         self._server, self._arms, self._answer = server, tuple(setup.joints), answer
         self._lock = RLock()
-        self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # of each page
+        self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # By page.
         self._driver: int | None = None
-        self._dragged: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {}  # arm -> position, x y z w
-        self._tools: dict[str, tuple[float, ...]] = {}  # arm -> x y z qx qy qz qw
+        self._dragged: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {}  # By arm: position, x y z w.
+        self._tools: dict[str, tuple[float, ...]] = {}  # By arm: x y z qx qy qz qw.
         server.on_client_connect(self._connect)
         server.on_client_disconnect(self._disconnect)
 
     @property
     def words(self) -> str:
-        """Who drives."""
+        """The page that drives, in words."""
         driver = self._driver
         return "drag a tool's arrows or rings to move it" if driver is None else f"page {driver} drives"
 
     def add_buttons(self, gui: viser.GuiApi) -> None:
-        """A button for each gripper."""
+        """Add a button for each gripper."""
         for arm in self._arms:
 
             @gui.add_button(f"Close or open the {arm} gripper").on_click
@@ -54,7 +54,7 @@ class Driving:
                             self._send(arm, pressed)
 
     def show(self, frame: Frame) -> None:
-        """Put the gizmos that nobody drags where the tools are."""
+        """Put the gizmos that nobody drags at the tools."""
         with self._lock:
             self._tools = {arm: tuple(pin.SE3ToXYZQUATtuple(tool)) for arm, tool in frame.tick.tools.items()}
             for page, (_, gizmos) in self._gizmos.items():
@@ -70,7 +70,7 @@ class Driving:
             gizmos[arm] = client.scene.add_transform_controls(f"/gizmos/{arm}", scale=_SIZE, depth_test=False)
 
             async def drag(event: viser.TransformControlsEvent, arm: str = arm) -> None:
-                # No await, so that the pose is the one of this event.
+                # There is no await, so that the pose belongs to this event.
                 self._drag(page, arm, event)
 
             gizmos[arm].on_update(drag)
@@ -88,12 +88,12 @@ class Driving:
             if event.phase == "start" and self._driver in (None, page):
                 begins, self._driver = self._driver is None, page
                 self._dragged[arm] = _pose_of(event.target)
-                for held in (False, True):  # a control has to be seen released before it counts
+                for held in (False, True):  # A control has to be released before a press counts.
                     self._send(arm, drag=held)
                 if begins:
                     Thread(target=self._ask, args=(page,), daemon=True).start()
             elif self._driver == page and event.phase == "end" and page not in self._server.get_clients():
-                self._lose()  # viser ends the drag of a page that is gone
+                self._lose()  # viser ends the drag of a page that has gone.
             elif self._driver == page and arm in self._dragged:
                 self._dragged[arm] = _pose_of(event.target)
                 self._send(arm, drag=event.phase != "end")

@@ -18,102 +18,102 @@ from q2r2_control.viewer.shown_robot import ShownRobot
 
 @dataclass(frozen=True)
 class PageSetup(ShownRobot):
-    """The first message to the server: the cell, and where to listen."""
+    """The first message to the server, with the cell and the address at which to listen."""
 
     host: str
-    port: int  # 0: any free one
-    addresses: tuple[str, ...]  # by which others reach it
-    certificate: str | None  # a PEM file with its key; None: http
+    port: int  # With 0, any free port.
+    addresses: tuple[str, ...]  # Addresses by which other computers reach the server.
+    certificate: str | None  # A PEM file with its key; None for plain HTTP.
     title: str
-    tools: Mapping[str, int]  # of each arm, the frame of its tool in ``model``
+    tools: Mapping[str, int]  # By arm, the frame of its tool in ``model``.
     home: Array  # (nv,) [rad]
-    lower: Array  # (nv,) position limits [rad]
-    upper: Array
+    lower: Array  # (nv,) lower position limits [rad]
+    upper: Array  # (nv,) upper position limits [rad]
     model: pin.Model
-    collision_model: pin.GeometryModel  # whose pairs are monitored
-    parts: Mapping[str, int]  # loose objects by name -> where their pose begins in ``Frame.moved``
-    requests: tuple[PageRequest, ...]  # whose buttons are shown
-    changes: tuple[PageSetting, ...]  # whose sliders are shown
-    device: DeviceWords  # of what drives the arms
-    driven: bool  # whether the page is the run's input
-    replayed: bool  # whether the run is a recorded one
+    collision_model: pin.GeometryModel  # The model whose pairs are monitored.
+    parts: Mapping[str, int]  # By name of a loose object, the index in ``Frame.moved`` at which its pose begins.
+    requests: tuple[PageRequest, ...]  # Requests that have a button.
+    changes: tuple[PageSetting, ...]  # Settings that have a slider.
+    device: DeviceWords  # Words for the device that drives the arms.
+    driven: bool  # Whether the page is the run's input.
+    replayed: bool  # Whether the page shows a recorded run.
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The newest tick, and what has come together since the last frame."""
+    """The newest tick, and everything collected since the last frame."""
 
     tick: Tick
     events: tuple[Event, ...]
-    binding: tuple[ActiveLimit, ...]  # limits that held a step back
-    ticks: int
-    slowest: float  # tick among them [s]
-    moved: Array | None  # MuJoCo's positions of all that moves
-    end: float = 0.0  # of what can be shown of a replay, by its time [s]
-    ages: Mapping[str, float] = field(default_factory=dict)  # of the newest pose of each arm's hand [s]
-    why: Mapping[str, str] = field(default_factory=dict)  # of each arm, where another program knows it
-    driver: str = ""  # who drives, in words; empty where that is not known
-    notice: str = ""  # what became of a request
-    pictures: Mapping[str, bytes] = field(default_factory=dict)  # newest ones by camera, JPEG or PNG
+    binding: tuple[ActiveLimit, ...]  # Limits that held a step back.
+    ticks: int  # Count of ticks since the last frame.
+    slowest: float  # Computing time of the slowest of these ticks [s].
+    moved: Array | None  # MuJoCo's positions (qpos) of everything that moves.
+    end: float = 0.0  # Time of a replay up to which frames can be shown [s].
+    ages: Mapping[str, float] = field(default_factory=dict)  # By arm, the age of the newest pose of its hand [s].
+    why: Mapping[str, str] = field(default_factory=dict)  # By arm, why it is in its state, if another program knows it.
+    driver: str = ""  # The person or page that drives, in words; empty if not known.
+    notice: str = ""  # The result of a request.
+    pictures: Mapping[str, bytes] = field(default_factory=dict)  # The newest pictures by camera, JPEG or PNG.
 
 
 class Ready(NamedTuple):
-    """The server's first answer: it listens."""
+    """The server's first answer, which says that it listens."""
 
-    urls: tuple[str, ...]  # one for each of its addresses
+    urls: tuple[str, ...]  # One for each address of the server.
 
 
 class PageWatched(NamedTuple):
-    """Browsers came or went."""
+    """A browser connected or disconnected."""
 
-    pages: int  # that are open now
+    pages: int  # Count of pages that are open now.
 
 
 class PageHand(NamedTuple):
-    """A hand that a page moves; the numbers are a browser's, and nothing has checked them."""
+    """A hand that a page moves. The numbers come from a browser, and are not checked yet."""
 
     hand: str
-    position: tuple[float, ...]  # world [m]
-    quaternion: tuple[float, ...]  # x y z w
+    position: tuple[float, ...]  # In the world frame [m].
+    quaternion: tuple[float, ...]  # In the order x y z w.
     drag: bool
     gripper: bool
 
 
 class PageLost(NamedTuple):
-    """The page that drove is gone."""
+    """The page that drove has gone."""
 
 
 class PageSetting(StrEnum):
     """The settings that a page's sliders change."""
 
-    SPEED = "speed"  # part of the cell's speeds of a tool
-    STIFFNESS = "stiffness"  # part of the cell's, of torque mode
-    DAMPING = "damping"  # ratio, of torque mode
-    SCALE = "scale"  # teleop.position_scale
+    SPEED = "speed"  # Share of the tool speeds that the cell allows.
+    STIFFNESS = "stiffness"  # Share of the cell's stiffness in torque mode.
+    DAMPING = "damping"  # Damping ratio in torque mode.
+    SCALE = "scale"  # The setting teleop.position_scale.
 
 
 class PageChange(NamedTuple):
-    """A slider was moved; the number is a browser's."""
+    """A slider was moved. The number comes from a browser."""
 
     setting: PageSetting
     value: float
 
 
 class PageSeek(NamedTuple):
-    """The time line was moved; the number is a browser's."""
+    """The time line was moved. The number comes from a browser."""
 
     time: float  # [s]
 
 
 class PagePlay(NamedTuple):
-    """A replay is to play, or to stand still where it plays."""
+    """A replay shall play, or pause if it plays already."""
 
 
 class PageRequest(StrEnum):
     """The requests of the page's buttons."""
 
     STOP = "stop"
-    RESET = "reset"  # takes back a stop that ends no run
+    RESET = "reset"  # Takes back a stop that does not end the run.
     ENGAGE = "engage"
     PAUSE = "pause"
     HOME = "home"

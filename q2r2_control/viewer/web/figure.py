@@ -1,4 +1,4 @@
-"""A cell's robot in a scene: meshes under a frame for each joint."""
+"""A cell's robot in a scene, with meshes under a frame for each joint."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _GHOST_OPACITY, _OBSTACLE_OPACITY = 0.35, 0.6
 
 
 class RobotFigure:
-    """The robot in a scene; a ``ghost`` is translucent."""
+    """The robot in a scene. A ``ghost`` is translucent."""
 
     def __init__(self, scene: viser.SceneApi, name: str, tree: JointTree, ghost: bool = False) -> None:
         self._tree, self._data = tree, tree.model.createData()
@@ -31,7 +31,7 @@ class RobotFigure:
         self._frames = [scene.add_frame(path, show_axes=False) for path in paths[1:]]
         for index, (joint, colour, mesh) in enumerate(tree.meshes()):
             if ghost and joint == 0:
-                continue  # it does not move
+                continue  # Shapes without a joint do not move, so the ghost leaves them out.
             scene.add_mesh_simple(
                 f"{paths[joint]}/shape_{index}",
                 np.asarray(mesh.vertices),
@@ -50,7 +50,7 @@ class RobotFigure:
 
 
 class CapsuleFigure:
-    """The shapes that the controller keeps apart, of a collision model, where ``visible`` lets them be seen."""
+    """The shapes of a collision model, which the controller keeps apart. They are hidden until ``root`` is visible."""
 
     def __init__(self, scene: viser.SceneApi, name: str, model: pin.GeometryModel) -> None:
         self.root = scene.add_frame(name, show_axes=False, visible=False)
@@ -68,14 +68,14 @@ class CapsuleFigure:
 
 
 class ObstacleFigure:
-    """The moving obstacles that are there, where they were reported last."""
+    """The moving obstacles at their last reported poses."""
 
     def __init__(self, scene: viser.SceneApi, name: str) -> None:
         self._scene, self._name = scene, name
-        self._drawn: dict[str, tuple[object, viser.SceneNodeHandle]] = {}  # looks and node of each
+        self._drawn: dict[str, tuple[object, viser.SceneNodeHandle]] = {}  # Look and node of each obstacle.
 
     def show(self, reports: Mapping[str, ObstacleReport]) -> None:
-        """Draw these and no others."""
+        """Draw the obstacles of ``reports``, and remove all others."""
         for gone in self._drawn.keys() - reports.keys():
             self._drawn.pop(gone)[1].remove()
         for name, report in reports.items():

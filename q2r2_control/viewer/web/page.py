@@ -1,4 +1,4 @@
-"""The process that serves a page, from outside."""
+"""The handle of the process that serves a page."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.web.exchange import Frame, PageRequest, PageSetting, PageSetup, PageWatched, Ready
 
-_READY = 120.0  # for the process to be ready, before the run, on a busy computer [s]
-_PATIENCE, _LONGEST = 2.0, 10.0  # for it to end while it does nothing, and while it is busy [s]
+_READY = 120.0  # Longest time until the process is ready, before the run, on a busy computer [s].
+_PATIENCE, _LONGEST = 2.0, 10.0  # Longest time until the process ends if it is idle, and if it is busy [s].
 
 
 def check_viser() -> None:
-    """Raises :class:`ConfigError` where it is not installed."""
+    """Raise :class:`ConfigError` if viser is not installed."""
     if find_spec("viser") is None:
         raise ConfigError(f"--web needs viser: {install_line('web')}")
 
 
 class Page:
-    """A page and its process, as a context. Nothing in a browser can keep this process waiting."""
+    """A page and the process that serves it, as a context. No browser can keep the caller's process waiting."""
 
     def __init__(self, host: str, port: int, on_answer: Callable[[Any], None], certificate: Path | None = None) -> None:
-        """Start the process, which takes a second. Raises :class:`ConfigError` where viser is not installed.
+        """Start the process, which takes a second; raises :class:`ConfigError` if viser is not installed.
 
-        ``on_answer`` gets what browsers ask for, in a thread of its own. Beyond this computer the page comes by HTTPS,
-        with your own ``certificate`` or, without one, that of the headset's page.
+        ``on_answer`` gets the requests of browsers, in a thread of its own. Other computers get the page by HTTPS, with
+        your own ``certificate`` or else with the certificate of the headset's page.
         """
         check_viser()
         self._host, self._port, self._on_request = host, port, on_answer
         self._ready = Flag()
-        self.urls: tuple[str, ...] = ()  # one for each address of this computer; empty: not begun
-        self.lines: tuple[str, ...] = ()  # for people: where it is
+        self.urls: tuple[str, ...] = ()  # One for each address of this computer; empty before :meth:`open`.
+        self.lines: tuple[str, ...] = ()  # Lines for the user, with the URLs.
         self._certificate = certificate
-        self.watched = False  # by any browser
-        self._pictures: dict[str, bytes] = {}  # by camera, that wait for a frame
+        self.watched = False  # Whether any browser shows the page.
+        self._pictures: dict[str, bytes] = {}  # By camera, pictures that wait for the next frame.
         try:
-            # Room for one frame: a newer one is better than a queue.
+            # Only one frame may wait, because a newer frame is better than a queue of old ones.
             self._process = HelperProcess("serves the page", "q2r2_control.viewer.web.server", self._on_answer, room=1)
         except OSError as error:
             raise ConfigError(f"--web: {reason_of(error)}") from error
@@ -69,7 +69,7 @@ class Page:
         driven: bool = False,
         replayed: bool = False,
     ) -> str:
-        """Serve the page of a cell, see :class:`PageSetup`; returns its URL. Raises :class:`ConfigError`."""
+        """Serve the page of a cell, and return its URL; raises :class:`ConfigError`. See :class:`PageSetup`."""
         addresses = reachable_addresses(self._host)
         certificate, notes = self._certified(addresses)
         setup = PageSetup(
@@ -102,7 +102,7 @@ class Page:
         return self.urls[0]
 
     def _certified(self, addresses: Sequence[str]) -> tuple[str | None, tuple[str, ...]]:
-        """The PEM file that HTTPS needs, None on this computer alone, and lines about it; see :meth:`open`."""
+        """Return the PEM file for HTTPS, or None if only this computer reaches the page, and lines about the file."""
         if is_loopback(self._host):
             return None, ()
         if self._certificate is not None:
@@ -119,11 +119,11 @@ class Page:
 
     @property
     def fault(self) -> str | None:
-        """Why the process has ended before it was to."""
+        """The reason why the process has ended too early."""
         return self._process.fault
 
     def send(self, frame: Frame) -> bool:
-        """Show a frame, unless the page is not done with the last one."""
+        """Show a frame, and return True, or return False if the page is still busy with the last one."""
         pictures, self._pictures = self._pictures, {}
         sent = self._process.send(replace(frame, pictures=pictures) if pictures else frame, 1)
         if not sent:
@@ -131,7 +131,7 @@ class Page:
         return sent
 
     def show_picture(self, camera: str, picture: bytes) -> None:
-        """Show a JPEG or PNG with the next frame; from any thread."""
+        """Show a JPEG or PNG with the next frame. Any thread may call this."""
         self._pictures = self._pictures | {camera: picture}
 
     def _on_answer(self, answer: Any) -> None:

@@ -8,7 +8,7 @@ from html import escape
 from websockets.http11 import Response
 
 _TITLE = b"<title>Viser</title>"
-# On a phone, viser's panel is a sheet over the scene. Here it has the lower half of the screen, and the scene the rest.
+# On a phone, viser's panel covers the scene. This style gives it the lower half of the screen, and the scene the rest.
 _SHEET = '.mantine-Paper-root[style*="position: fixed"][style*="bottom: 0"]'
 _PHONE = (
     f"<style>@media (max-width: 576px) {{{_SHEET} {{width: 100% !important; max-height: 50vh !important}} "
@@ -23,10 +23,10 @@ class PageFile:
 
     def __init__(self, name: str) -> None:
         self._head = f"<title>{escape(name)}</title>{_PHONE}".encode()
-        self._made: dict[bytes, bytes] = {}  # of the one file that viser serves, plain and compressed
+        self._made: dict[bytes, bytes] = {}  # The changed page by viser's page, plain and compressed.
 
     def change(self, response: Response) -> None:
-        """Put the cell's page into ``response``, if it brings viser's."""
+        """Put the cell's page into ``response``, if it carries viser's page."""
         if response.status_code != 200:
             return
         is_compressed = response.headers.get("Content-Encoding") == "gzip"

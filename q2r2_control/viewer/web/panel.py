@@ -1,4 +1,4 @@
-"""The panel beside the scene: states and reasons of the arms, figures of the loop, joints against their limits."""
+"""The panel beside the scene: states of the arms and their reasons, figures of the loop, and joints in their ranges."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from q2r2_control.viewer.web.panel_html import (
 )
 from q2r2_control.wording import sentence
 
-_PERIOD = 0.2  # of the table [s]
-_NEAR_LIMIT = 0.05  # of a joint's range
-_EPISODES = 12  # lines of them
+_PERIOD = 0.2  # Period at which the table is drawn [s].
+_NEAR_LIMIT = 0.05  # Share of a joint's range that counts as near a limit.
+_EPISODES = 12  # Lines about episodes that are shown.
 _OF_EPISODES = (
     *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
     *(ReasonKind.EPISODE_DISCARDED, ReasonKind.MARK, ReasonKind.VERDICT),
@@ -59,7 +59,7 @@ _BUTTONS = {
 
 
 class Panel:
-    """Shows frames, and answers with what the buttons and sliders ask for."""
+    """Shows frames, and answers with the requests of the buttons and sliders."""
 
     def __init__(
         self,
@@ -69,18 +69,18 @@ class Panel:
         answer: Callable[[Any], None],
         take_over: Callable[[viser.GuiButtonHandle, Callable[[], None]], None],
     ) -> None:
-        """``take_over`` does an action at each press of a button, whatever pages do to viser's widgets."""
+        """Build the panel. ``take_over`` makes an action follow each press of a button, in any state of the widgets."""
         self._setup, self._driving, self._words = setup, driving, setup.words(setup.device)
         self._answer, self._take_over = answer, take_over
         self._binding: dict[ActiveLimit, None] = {}
-        self._told: list[tuple[str, str]] = []  # of episodes, and when
+        self._told: list[tuple[str, str]] = []  # Time and text of each line about episodes.
         self._ticks, self._slowest = 0, 0.0
         self._rates, self._times = deque[float](maxlen=HISTORY), deque[float](maxlen=HISTORY)  # [Hz], [us]
-        self._moved: dict[PageSetting, float] = {}  # sliders
+        self._moved: dict[PageSetting, float] = {}  # New values of moved sliders.
         self._shown = time.monotonic()
         self._newest: Frame | None = None
-        self._buttons: list[viser.GuiInputHandle[Any]] = []  # and sliders, of a run that goes on
-        self._drawn_last: tuple[float, Mapping[str, pin.SE3]] = 0.0, {}  # time [s] and tools
+        self._buttons: list[viser.GuiInputHandle[Any]] = []  # Buttons and sliders that end with the run.
+        self._drawn_last: tuple[float, Mapping[str, pin.SE3]] = 0.0, {}  # Time [s] and tools of the drawn table.
         gui = server.gui
         gui.set_panel_label(setup.title)
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(60, 120, 216))
@@ -94,8 +94,8 @@ class Panel:
         self._table = gui.add_html("")
         self._episodes = gui.add_html("", visible=False)
         self._cameras = gui.add_html("", visible=False)
-        self._pictures: Mapping[str, bytes] = {}  # newest ones by camera
-        self._pictured: Mapping[str, bytes] = self._pictures  # those that are shown
+        self._pictures: Mapping[str, bytes] = {}  # The newest pictures by camera.
+        self._pictured: Mapping[str, bytes] = self._pictures  # The pictures that are shown.
         if driving is not None:
             with gui.add_folder("Grippers", expand_by_default=False):
                 driving.add_buttons(gui)
@@ -140,7 +140,7 @@ class Panel:
         self._time_line = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
 
         def seek(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-            if event.client_id is not None:  # no page has moved it otherwise
+            if event.client_id is not None:  # Without a client, the panel itself moved the slider.
                 self._answer(PageSeek(float(event.target.value)))
 
         self._time_line.on_update(seek)
@@ -156,7 +156,7 @@ class Panel:
         numbers: tuple[float, float, float, float],
         unit: float,
     ) -> None:
-        """``numbers``: least, greatest, step and first value, in ``unit`` of the setting."""
+        """Add a slider. ``numbers`` are minimum, maximum, step and first value, in the ``unit`` of the setting."""
         slider = gui.add_slider(label, *numbers)
 
         def move(_: object) -> None:
@@ -166,13 +166,13 @@ class Panel:
         self._buttons.append(slider)
 
     def follow(self, frame: Frame) -> None:
-        """Keep what a frame says that may be shown later."""
-        if self._setup.replayed:  # each frame has all that is told, and the time line goes back too
+        """Keep the content of a frame that may be shown later."""
+        if self._setup.replayed:  # Each frame holds all events to tell, and the time line can go back.
             self._words.told = {}
         self._words.follow(frame.events)
         for event in frame.events:
             line = f"{event.t:.1f} s", sentence(event.reason)
-            if event.kind in _OF_EPISODES and line not in self._told[-2:]:  # both arms tell it
+            if event.kind in _OF_EPISODES and line not in self._told[-2:]:  # Both arms have the same event.
                 self._told.append(line)
         self._binding |= dict.fromkeys(frame.binding)
         if frame.pictures:
@@ -181,7 +181,7 @@ class Panel:
         self._slowest = max(self._slowest, frame.slowest)
 
     def end(self) -> None:
-        """Say that nothing comes any more, and take the buttons away, which would do nothing."""
+        """Show that the run is over, and hide the buttons, because they would do nothing."""
         for button in self._buttons:
             button.visible = False
         what = "replay" if self._setup.replayed else "run"
@@ -193,7 +193,7 @@ class Panel:
             self._table.content = self._drawn(self._newest, [], over=True)
 
     def show(self, frame: Frame) -> None:
-        """Draw the table, and pass on where sliders are, some times a second."""
+        """Draw the table and answer with the moved sliders, a few times a second."""
         self._newest = frame
         passed = time.monotonic() - self._shown
         if passed >= _PERIOD:
@@ -204,7 +204,7 @@ class Panel:
             self._times.append(1e6 * slowest)
             binding, self._binding = list(self._binding), {}
             self._table.content = self._drawn(frame, binding)
-            if self._told and not self._setup.replayed:  # of a replay, each frame has the last events
+            if self._told and not self._setup.replayed:  # In a replay, each frame has only the last events.
                 self._episodes.content, self._episodes.visible = table(self._told[-_EPISODES:]), True
             if (pictures := self._pictures) is not self._pictured:
                 self._pictured, self._cameras.visible = pictures, True
@@ -217,7 +217,7 @@ class Panel:
                 self._answer(PageChange(setting, value))
 
     def _drawn(self, frame: Frame, binding: list[ActiveLimit], over: bool = False) -> str:
-        """The table of a frame; of a run that is ``over``, without what only a run that goes on can do."""
+        """Return the table of a frame. After a run that is ``over``, rows that need a running loop are left out."""
         tick, arms = frame.tick, list(frame.tick.tools)
         rows = [
             ("", [f"<b>{escape(arm)}</b>" for arm in arms]),
@@ -245,7 +245,7 @@ class Panel:
         return f"<div style='{STYLE}'><table style='width:100%'>{cells}</table>{self._below(frame, over)}</div>"
 
     def _below(self, frame: Frame, over: bool) -> str:
-        """Lines and plots on both arms together."""
+        """Return lines and plots about the whole robot."""
         tick, report = frame.tick, frame.tick.reference.report
         certified = coloured("certified", GREEN) if report.certified else coloured("not certified", RED)
         lines = [f"{tick.t:.1f} s", f"tightest pair: {escape(' | '.join(report.tightest_pair))}"]
@@ -264,7 +264,7 @@ class Panel:
         return "<br>".join(lines) + "".join(plots)
 
     def _tool_speed(self, tick: Tick, arm: str) -> str:
-        """The mean speed of an arm's measured tool since the table was drawn before, beside the cell's limit."""
+        """Return the mean speed of an arm's measured tool since the last table, beside the cell's limit."""
         (t, tools), limit = self._drawn_last, self._setup.config.control.tool_speed_limit
         if arm not in tools or tick.t <= t:
             return ""

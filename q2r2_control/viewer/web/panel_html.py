@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 
 STYLE = "font-size:12px;line-height:1.35;padding:0 0.6em 0.4em"
-HISTORY = 150  # values of a plot
+HISTORY = 150  # Count of values in a plot.
 
 
 def coloured(text: str, colour: tuple[int, int, int]) -> str:
@@ -39,7 +39,7 @@ def share(opening: float | None) -> str:
 
 
 def plot(label: str, values: Sequence[float], top: float) -> str:
-    """A line of the last values, from 0 up to ``top``."""
+    """Return a plot of the last values as a line, from 0 up to ``top``."""
     points = " ".join(f"{100.0 * i / HISTORY:.0f},{20.0 * (1.0 - min(y / top, 1.0)):.1f}" for i, y in enumerate(values))
     return (
         f"<div style='color:#777'>{label}</div><svg viewBox='0 0 100 21' preserveAspectRatio='none'"

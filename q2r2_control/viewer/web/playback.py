@@ -1,4 +1,4 @@
-"""A replay on a page, with a time line: frames of it are kept, and shown at the recorded speed."""
+"""A replay on a page with a time line. Frames are kept, and shown at the recorded speed."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from q2r2_control.viewer.arm_words import Told, told_after
 from q2r2_control.viewer.web.exchange import Frame, PagePlay, PageRequest, PageSeek
 from q2r2_control.viewer.web.view import PageView
 
-_KEPT = 0.05  # between the frames that are kept, by the run's time [s]
-_PERIOD = 1.0 / 30.0  # between looks at what is to be shown [s]
-_STILL = 0.25  # the same while it stands still [s]
+_KEPT = 0.05  # Time between kept frames, in the run's time [s].
+_PERIOD = 1.0 / 30.0  # Time between shown frames while the replay plays [s].
+_STILL = 0.25  # Time between shown frames while the replay is paused [s].
 
 
 class Playback:
-    """A listener of a replay. The page plays what has been replayed, from where its time line is put."""
+    """A listener of a replay. The page plays the kept frames, from the position of its time line."""
 
     def __init__(self, view: PageView) -> None:
         self._view = view
         self._frames: list[Frame] = []
-        self._times: list[float] = []  # of the frames
-        self._told: dict[str, Told] = {}  # of each arm
+        self._times: list[float] = []  # Times of the frames [s].
+        self._told: dict[str, Told] = {}  # By arm.
         self._ticks, self._slowest = 0, 0.0
         self._position, self._playing, self._complete = 0.0, True, False
         self._ended = Flag()
 
     def begin(self, pipeline: Pipeline, title: str) -> str:
-        """Serve the page of a replay that is about to begin; returns its URL. Raises :class:`ConfigError`."""
+        """Serve the page of a replay before it begins, and return its URL; raises :class:`ConfigError`."""
         url = self._view.serve(pipeline, title, replayed=True, on_request=self._on_request)
         pipeline.listeners.append(self)
         Thread(target=self._play, daemon=True).start()
         return url
 
     def __call__(self, tick: Tick) -> None:
-        """Keep one tick where a frame is due."""
+        """Keep the tick if a frame is due."""
         self._ticks += 1
         self._slowest = max(self._slowest, tick.compute_time)
         self._told = told_after(self._told, tick.events)
@@ -53,7 +53,7 @@ class Playback:
             self._ticks, self._slowest = 0, 0.0
 
     def wait(self) -> None:
-        """Until the page's button or Ctrl-C ends it."""
+        """Wait until the page's button or Ctrl-C ends the replay, or the page's process has ended."""
         stop, self._complete = StopRequest(), True
         with stop_on_signals(stop.ask):
             while not (self._ended.wait(_PERIOD) or stop.asked or not self._view.alive):
@@ -61,7 +61,7 @@ class Playback:
         self._ended.set()
 
     def _on_request(self, request: Any) -> None:
-        """In a thread of the page's answers."""
+        """Obey a request of the page. The thread of the page's answers calls this."""
         if request is PageRequest.STOP:
             self._ended.set()
         elif isinstance(request, PagePlay):

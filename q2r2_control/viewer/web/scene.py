@@ -1,4 +1,4 @@
-"""The scene of the page: robot, ghost, targets, trails, the tightest pair, and what stands in the cell."""
+"""The scene of the page: robot, ghost, targets, trails, the tightest pair, obstacles and loose parts."""
 
 from __future__ import annotations
 
@@ -16,21 +16,24 @@ from q2r2_control.viewer.web.exchange import Frame, PageSetup
 from q2r2_control.viewer.web.figure import CapsuleFigure, ObstacleFigure, RobotFigure, place
 
 _TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (150, 80, 190))
-_TRAIL = 90  # points
-_TRAIL_PERIOD = 0.05  # between them, by the run's time [s]
-_BREAK = 1.0  # a trail begins anew after a longer time [s]
-_AWAY = 0.01  # the ghost shows where a joint is farther from its reference than this [rad]
-_SHORT = 0.01  # lines that are not drawn [m]
-_PER_NEWTON = 0.005  # length of a force [m/N]
-_SINGULAR = 0.05  # directions that the joints feel by less do not count
-_NEAR = 0.1  # a pair with more to spare is calm [m]
-_CAMERA = np.array([2.0, 1.0, 1.1])  # from the middle of the arms [m]
-FIELD_OF_VIEW = math.radians(40.0)  # of the camera, upwards
+_TRAIL = 90  # Points of a trail.
+_TRAIL_PERIOD = 0.05  # Time between the points, in the run's time [s].
+_BREAK = 1.0  # After a longer gap than this, a trail begins anew [s].
+_AWAY = 0.01  # The ghost is shown if a joint is farther from its reference than this [rad].
+_SHORT = 0.01  # Lines up to this length are not drawn [m].
+_PER_NEWTON = 0.005  # Drawn length per force [m/N].
+_SINGULAR = 0.05  # Least ratio of a singular value to the largest one. Directions below it do not count.
+_NEAR = 0.1  # A pair with this margin or more is green [m].
+_CAMERA = np.array([2.0, 1.0, 1.1])  # Position of the camera from the middle of the arms [m].
+FIELD_OF_VIEW = math.radians(40.0)  # Vertical angle of the camera's view [rad].
 _BACKGROUND: Colour = (238, 241, 244)
 
 
 def first_view(model: pin.Model, home: Array) -> tuple[Array, Array]:
-    """Where the camera begins, and what it looks at (3,) [m]: in front of the arms, above them, where it sees both."""
+    """Return the first position (3,) of the camera, from which it sees both arms, and the point (3,) in its centre [m].
+
+    The position is in front of the arms and above them.
+    """
     data = model.createData()
     pin.forwardKinematics(model, data, home)
     places = np.array([placement.translation for placement in list(data.oMi)[1:]])
@@ -39,7 +42,7 @@ def first_view(model: pin.Model, home: Array) -> tuple[Array, Array]:
 
 
 class CellScene:
-    """Draws frames. Only :meth:`show` is called after the beginning, by one thread."""
+    """Draws frames. After the start, only :meth:`show` may be called, and only by one thread."""
 
     def __init__(self, server: viser.ViserServer, setup: PageSetup) -> None:
         scene, config = server.scene, setup.config
@@ -48,7 +51,7 @@ class CellScene:
         self._tightest = TightestPair(setup.model, setup.collision_model)
         self._tree = JointTree(setup)
         scene.set_up_direction("+z")
-        scene.configure_default_lights(cast_shadow=False)  # a browser without a graphics card is ten times as fast
+        scene.configure_default_lights(cast_shadow=False)  # Without a GPU, browsers are ten times as fast then.
         scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, dtype=np.uint8))
         scene.add_grid(
             "/floor",
@@ -78,7 +81,7 @@ class CellScene:
             first = self._data.oMi[self._model.getJointId(setup.joint_names[joints[0]])].translation
             scene.add_label(f"/names/{arm}", arm, position=first, anchor="top-center")
         nothing = np.zeros((_TRAIL - 1, 2, 3), dtype=np.float32)
-        # The way of each tool, and thinner that of its target, which is the hand's.
+        # The trail of each tool, and as a thinner line the trail of its target, which shows the hand.
         self._trails = {
             (arm, kind): scene.add_line_segments(f"/trails/{arm}_{kind}", nothing, _faded(colour), line_width=width)
             for arm, colour in zip(arms, _TRAIL_COLOURS, strict=False)
@@ -108,7 +111,7 @@ class CellScene:
         camera.fov = FIELD_OF_VIEW
 
     def _add_choices(self, server: viser.ViserServer) -> viser.GuiInputHandle[bool]:
-        """Things that are drawn on request; returns whether the ghost always is."""
+        """Add checkboxes for things that are drawn on request; return the one that always shows the ghost."""
         with server.gui.add_folder("View", order=1e9, expand_by_default=False):
             shadows = server.gui.add_checkbox("shadows", False, hint="slow without a graphics card")
             capsules = server.gui.add_checkbox("shapes that are kept apart", False)
@@ -151,13 +154,13 @@ class CellScene:
                 box.visible = True
 
     def _show_line(self, line: viser.LineSegmentsHandle, tool: pin.SE3, way: Array | None) -> None:
-        """A line from a ``tool`` along ``way`` (3,) [m], if that is long enough to be seen."""
+        """Draw a line from a ``tool`` along the vector ``way`` (3,) [m], if it is long enough to be seen."""
         line.visible = way is not None and float(np.linalg.norm(way)) > _SHORT
         if line.visible:
             line.points = np.array([[tool.translation, tool.translation + way]])
 
     def _force(self, arm: str, state: RobotState) -> Array | None:
-        """The force on a tool, drawn as a way (3,) [m]; None: the plant does not tell."""
+        """Return the force on a tool as a vector (3,) to draw [m]; None if the plant does not measure it."""
         if state.tau_external is None:
             return None
         frame, joints = self._setup.tools[arm], self._setup.joints[arm]
@@ -171,7 +174,7 @@ class CellScene:
         if 0.0 <= tick.t - self._trail_time < _TRAIL_PERIOD:
             return
         if not 0.0 <= tick.t - self._trail_time < _BREAK:
-            self._trail_points.clear()  # a replay's time line was moved
+            self._trail_points.clear()  # The time line of a replay was moved.
         self._trail_time = tick.t
         for (arm, kind), trail in self._trails.items():
             target = tick.targets[arm].pose
@@ -203,7 +206,7 @@ class CellScene:
 
 
 def _faded(colour: Colour) -> Array:
-    """Colours (segments, 2, 3) of a trail, from the background's at its old end."""
+    """Return the colours (segments, 2, 3) of a trail, which begin with the background's colour at its old end."""
     part = np.linspace(0.0, 1.0, _TRAIL)[:, None]
     colours = (part * colour + (1.0 - part) * _BACKGROUND).astype(np.uint8)
     made: Array = np.stack([colours[:-1], colours[1:]], axis=1)

@@ -18,13 +18,13 @@ from q2r2_control.viewer.web.exchange import Frame, PageLost, PageRequest, PageS
 from q2r2_control.viewer.web.panel import Panel
 from q2r2_control.viewer.web.scene import CellScene
 
-_NICENESS = 10  # the loop goes first
-_LAST_WORDS = 0.5  # for browsers to hear that the run is over, before their connections end [s]
-_RATE, _BURST = 500.0, 50.0  # answers a second, and at once; two hands that a page moves need 220 a second
+_NICENESS = 10  # The loop has priority.
+_LAST_WORDS = 0.5  # Time for browsers to learn that the run is over, before their connections are closed [s].
+_RATE, _BURST = 500.0, 50.0  # Allowed answers per second, and at once. Two hands that a page moves need 220 per second.
 
 
 class _Newest:
-    """Hands frames from one thread to another, the newest only."""
+    """Passes only the newest frame from one thread to another."""
 
     def __init__(self) -> None:
         self._condition = Condition()
@@ -32,7 +32,7 @@ class _Newest:
         self._ended = False
 
     def put(self, frame: Frame | None) -> None:
-        """None: there are no more."""
+        """Pass a frame on; None if no more frames follow."""
         with self._condition:
             self._frame, self._ended = frame, frame is None
             self._condition.notify()
@@ -48,9 +48,9 @@ class _Newest:
 
 
 class LimitedAnswers:
-    """Passes answers of browsers on, but no flood of them, which would take the interpreter from the loop.
+    """Passes answers of browsers on at a limited rate, because too many would take the interpreter from the loop.
 
-    A stop always passes, and so does the loss of a page that drove.
+    A stop is always passed on, and so is the loss of a page that drove.
     """
 
     def __init__(self, answer: Callable[[Any], None], clock: Callable[[], float] = time.monotonic) -> None:
@@ -68,7 +68,7 @@ class LimitedAnswers:
 
 
 def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
-    """Answer :class:`Ready`, then what browsers ask for. Raises :class:`ConfigError` for an address that is taken."""
+    """Answer :class:`Ready`, then the requests of browsers; raises :class:`ConfigError` if the address is in use."""
     setup: PageSetup | None = next(requests, None)
     if setup is None:
         return

@@ -1,4 +1,4 @@
-"""The run's side of its page: hands ticks to the process that serves it, and does what its buttons ask for."""
+"""The run's side of its page. It sends ticks to the process that serves the page, and obeys the page's buttons."""
 
 from __future__ import annotations
 
@@ -30,36 +30,36 @@ from q2r2_control.viewer.web.exchange import (
 )
 from q2r2_control.viewer.web.page import Page
 
-_PERIOD = 1.0 / 30.0  # between frames [s]
+_PERIOD = 1.0 / 30.0  # Time between frames [s].
 
 _logger = logging.getLogger(__name__)
 
 
 class PageView(Page):
-    """A listener of one run, as a context around it. Nothing in a browser can keep the loop waiting.
+    """A listener of one run, and a context around it. No browser can keep the loop waiting.
 
-    A tick stores references, 30 times a second a thread gets them; where it is not done with the last ones, newer ones
-    come later instead. A page that fails is one line, and the run goes on.
+    Each tick stores references, and a thread gets them 30 times a second. If that thread is still busy with the last
+    ones, it gets newer ones later. If the page fails, one line is logged and the run goes on.
     """
 
     def __init__(self, host: str, port: int, certificate: Path | None = None) -> None:
-        """Start the process, which takes a second. Raises :class:`ConfigError` where viser is not installed."""
-        self._due = 0.0  # of the next frame, by the clock on the wall [s]
+        """Start the process, which takes a second; raises :class:`ConfigError` if viser is not installed."""
+        self._due = 0.0  # Time of the next frame, by the monotonic clock [s].
         self._events: list[Event] = []
         self._binding: dict[ActiveLimit, None] = {}
         self._ticks, self._slowest = 0, 0.0
-        self._heard: dict[str, float] = {}  # hand -> when its newest pose came, by the loop's clock [s]
-        self._plant: MujocoPlant | None = None  # whose loose objects are shown
-        self._input: WebInput | None = None  # that the page drives
+        self._heard: dict[str, float] = {}  # By hand, the time of its newest pose, by the loop's clock [s].
+        self._plant: MujocoPlant | None = None  # The simulator whose loose objects are shown.
+        self._input: WebInput | None = None  # The input that the page drives.
         self._requests: dict[PageRequest, Callable[[], None]] = {}
         self._changes: dict[PageSetting, Callable[[float], None]] = {}
-        self._hand_of: Callable[[str], str]  # that drives an arm
-        self._source: object = None  # of the hands
-        self._nobody = ""  # why no person drives
+        self._hand_of: Callable[[str], str]  # Returns the hand that drives an arm.
+        self._source: object = None  # The input of the hands.
+        self._nobody = ""  # The reason why no person drives.
         super().__init__(host, port, self._do, certificate)
 
     def begin(self, pipeline: Pipeline, title: str, recorded: bool) -> str:
-        """Serve the page of a run that is about to begin; returns its URL. Raises :class:`ConfigError`."""
+        """Serve the page of a run before it begins, and return its URL; raises :class:`ConfigError`."""
         url = self.serve(pipeline, title, recorded=recorded)
         pipeline.listeners.append(self)
         return url
@@ -73,12 +73,12 @@ class PageView(Page):
         replayed: bool = False,
         on_request: Callable[[Any], None] | None = None,
     ) -> str:
-        """Serve a page; returns its URL. ``on_request`` gets what its buttons ask for, instead of the run."""
+        """Serve a page, and return its URL. If given, ``on_request`` gets the requests of its buttons, not the run."""
         if on_request is not None:
             self._on_request = on_request
         config, plant = pipeline.config, pipeline.plant
         source: object = pipeline.input
-        while (operator := getattr(source, "operator", None)) is not None:  # of a policy: its hands
+        while (operator := getattr(source, "operator", None)) is not None:  # A policy has an operator's input.
             source = operator
         self._input = source if isinstance(source, WebInput) else None
         self._source, self._nobody = source, pipeline.input.controls.words.nobody
@@ -112,7 +112,7 @@ class PageView(Page):
         )
 
     def __call__(self, tick: Tick) -> None:
-        """Store one tick, and send it where a frame is due."""
+        """Store one tick, and send it if a frame is due."""
         self._ticks += 1
         self._slowest = max(self._slowest, tick.compute_time)
         for sample in tick.samples:
@@ -147,17 +147,17 @@ class PageView(Page):
 
     @property
     def _driver(self) -> str:
-        """Who drives, in words; empty for an input that does not know."""
+        """The device that drives, in words; empty if the input does not know it."""
         if self._nobody or not hasattr(self._source, "driver"):
             return self._nobody
         return "nobody drives" if self._source.driver is None else f"the headset at {self._source.driver} drives"
 
     def _do(self, answer: Any) -> None:
-        """In a thread of its own."""
+        """Obey an answer of the page. The thread of the answers calls this."""
         if isinstance(answer, PageRequest):
             self._requests[answer]()
         elif isinstance(answer, PageChange):
-            with suppress(ConfigError):  # a number that no slider has
+            with suppress(ConfigError):  # The number may be one that no slider has.
                 self._changes[answer.setting](answer.value)
         elif self._input is not None and isinstance(answer, PageHand):
             controls = {"drag": float(answer.drag), "gripper": float(answer.gripper)}
@@ -167,7 +167,7 @@ class PageView(Page):
 
 
 def _changes_of(pipeline: Pipeline) -> dict[PageSetting, Callable[[float], None]]:
-    """The effect of each slider: speeds stay below the cell's, and a number that is not allowed changes nothing."""
+    """Return the effect of each slider. Speeds stay within the cell's, and a forbidden number changes nothing."""
     control, teleop, impedance = pipeline.config.control, pipeline.config.teleop, pipeline.config.impedance
 
     def limit_speed(part: float) -> None:
