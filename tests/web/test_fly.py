@@ -17,6 +17,7 @@ STICK_FORWARD = """navigator.getGamepads = () => [{
     mapping: "standard", axes: [0, -1, 0, 0], buttons: Array.from({ length: 17 }, () => ({ pressed: false })) }]"""
 
 
+# Repeats do not count before the key is pressed.
 REPEATING = """code => {
     const repeat = () => dispatchEvent(new KeyboardEvent("keydown", { code, repeat: true }));
     window.repeating = setInterval(repeat, 40);
@@ -40,8 +41,8 @@ def test_keys_and_a_gamepad_engage_an_arm_move_it_and_leave_it_when_the_page_is_
     wait_until_said(page, lambda: arms(page, "state") == ["engaged", "idle"])
     page.keyboard.up("Space")
     before = targets_of_left(page)
-    page.keyboard.down("KeyW")
     page.evaluate(REPEATING, "KeyW")
+    page.keyboard.down("KeyW")
     wait_until_said(page, lambda: targets_of_left(page)[0] > before[0] + 0.02)
     page.evaluate("clearInterval(repeating)")
     page.keyboard.up("KeyW")
@@ -56,7 +57,7 @@ def test_keys_and_a_gamepad_engage_an_arm_move_it_and_leave_it_when_the_page_is_
 
 
 # The page's own flying hand, in time that the test lets pass: 20 ms a look.
-LOOKS = """async ([events, looks]) => {
+LOOKS = """async ([events, looks, unsent = 0]) => {
     const { Flying } = await import("/fly.js");
     let now = performance.now();
     performance.now = () => now;
@@ -67,6 +68,7 @@ LOOKS = """async ([events, looks]) => {
     for (let look = 0; look < looks; look++) {
         now += 20;
         held.push(flying.read().left.buttons[1]);
+        if (look >= unsent) flying.told();
     }
     flying.end();
     delete performance.now;
@@ -101,3 +103,21 @@ def test_a_button_is_held_while_another_key_repeats_and_only_a_press_begins_it_a
     held = page.evaluate(LOOKS, [[("keydown", space), ("keydown", {"code": "KeyW"})], 60])["held"]
     assert held[:30] == [True] * 30
     assert held[-10:] == [False] * 10
+
+
+def test_a_tap_between_two_messages_is_in_the_next_one_that_is_sent_unless_it_was_taken_back(
+    open_page: Open, listen: Listen
+) -> None:
+    page = open_page(str(listen().url), "")
+    down, up = ("keydown", {"code": "Space"}), ("keyup", {"code": "Space"})
+
+    def held(*events: tuple[str, Mapping[str, object]], unsent: int = 0) -> int:
+        """How many messages say that the button is down."""
+        return sum(page.evaluate(LOOKS, [events, 200, unsent])["held"])
+
+    assert held(down, up) == 1
+    assert held(down, up, unsent=3) == 4  # the first three messages are left out
+    assert held(down, up, unsent=200) == 149  # for 3 s
+    assert held(down, up, down, up) == 0
+    assert held(down, up, ("blur", {})) == 0
+    assert held(down, up, ("keydown", {"code": "KeyW", "ctrlKey": True})) == 0

@@ -6,6 +6,8 @@ const LONGEST = 0.05; // of a frame that a hand moves for [s]
 // A key counts for so long after it was pressed, and after each of its repeats: browsers do not always say that it is up.
 // Chromium on X begins to repeat after 660 ms, and goes on every 40 ms. A page that draws slowly hears it later.
 const [PRESSED, REPEATED] = [750, 600]; // [ms]
+// A button that was pressed between two messages is in the next one, also if it is up again. A later press is forgotten.
+const TAPPED = 3000; // [ms]
 const DEAD = 0.12; // of a stick
 /** @type {Record<string, Seven>} */
 const START = { left: [0.3, 0.2, 1.1, 0, 0, 0, 1], right: [0.3, -0.2, 1.1, 0, 0, 0, 1] }; // x forward, y left, z up [m]
@@ -48,6 +50,8 @@ export class Flying {
     this.slow = false;
     /** @type {Map<string, number>} */
     this.until = new Map(); // keys that are held -> when they count no more [ms]
+    /** @type {Map<string, number>} */
+    this.taps = new Map(); // buttons that were pressed since the last message -> when they count no more [ms]
     /** @type {Record<string, Seven>} */
     this.poses = structuredClone(START);
     this.then = performance.now();
@@ -55,7 +59,7 @@ export class Flying {
     const { signal } = this.listening;
     addEventListener("keydown", (event) => this.press(event), { signal });
     addEventListener("keyup", (event) => this.release(event), { signal });
-    addEventListener("blur", () => this.until.clear(), { signal });
+    addEventListener("blur", () => this.forget(), { signal });
     /** @param {KeyboardEvent} event */
     const noticeShift = (event) => {
       this.slow = event.shiftKey;
@@ -67,13 +71,14 @@ export class Flying {
   /** @param {KeyboardEvent} event */
   press(event) {
     // Such a press is the browser's: its dialogs keep the page from hearing that keys are up, and so does Cmd on a Mac.
-    if (isModified(event)) return this.until.clear();
+    if (isModified(event)) return this.forget();
     if (!(event.code in KEYS || event.code in HANDS || BUTTONS.includes(event.code))) return;
     this.device = "keys";
     event.preventDefault(); // Space would press the button that began this
     if (event.repeat && !this.holds(event.code)) return; // what has ended begins with a new press only
     const until = performance.now() + (event.repeat ? REPEATED : PRESSED);
     this.until.set(event.code, until);
+    if (BUTTONS.includes(event.code) && !event.repeat) this.tap(event.code);
     // Only the last key repeats. The others move no more then, but a dead man among them holds while any key repeats.
     for (const code of BUTTONS) if (this.holds(code)) this.until.set(code, until);
     this.hand = HANDS[event.code] ?? this.hand;
@@ -81,8 +86,26 @@ export class Flying {
 
   /** @param {KeyboardEvent} event */
   release(event) {
-    if (isModified(event)) this.until.clear();
+    if (isModified(event)) this.forget();
     this.until.delete(event.code);
+  }
+
+  forget() {
+    this.until.clear();
+    this.taps.clear();
+  }
+
+  /**
+   * Two presses between two messages are none: the second one takes the first one back.
+   * @param {string} button
+   */
+  tap(button) {
+    if (!this.taps.delete(button)) this.taps.set(button, performance.now() + TAPPED);
+  }
+
+  // The hands that were read last have been sent.
+  told() {
+    this.taps.clear();
   }
 
   /** @param {string} code */
@@ -102,6 +125,8 @@ export class Flying {
     if (pad?.buttons.some((button) => button.pressed)) this.device = "gamepad";
     /** @param {number} button */
     const pressed = (button) => Boolean(pad?.buttons[button].pressed);
+    /** @param {string} code */
+    const isDown = (code) => this.holds(code) || (this.taps.get(code) ?? 0) > now;
     for (const [hand, bumper] of Object.entries(PAD.bumpers)) if (pressed(bumper)) this.hand = hand;
     const rates = [0, 0, 0, 0, 0, 0];
     for (const key in KEYS) if (this.holds(key)) rates[KEYS[key][0]] += KEYS[key][1];
@@ -113,7 +138,7 @@ export class Flying {
     const place = pose.slice(0, 3).map((value, axis) => value + step[axis]);
     this.poses[this.hand] = /** @type {Seven} */ ([...place, ...turned(pose.slice(3), step.slice(3))]);
     /** @type {[boolean, boolean, boolean]} */
-    const buttons = [this.holds(UPPER) || pressed(PAD.b), this.holds(LOWER) || pressed(PAD.a), false];
+    const buttons = [isDown(UPPER) || pressed(PAD.b), isDown(LOWER) || pressed(PAD.a), false];
     /** @type {[boolean, boolean, boolean]} */
     const none = [false, false, false];
     return Object.fromEntries(

@@ -117,7 +117,7 @@ function fly() {
   const onFrame = () => {
     if (flying !== begun) return;
     requestAnimationFrame(onFrame);
-    link.send(begun.read(), true);
+    if (link.send(begun.read(), true)) begun.told();
     drawing.drawOnPage(state);
   };
   requestAnimationFrame(onFrame);
