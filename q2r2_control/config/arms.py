@@ -45,7 +45,7 @@ def _by_joint(value: object) -> object:
 
 # A path is looked up from the folder of the YAML first, then from the working directory, then among the shipped files.
 LocalPath = Annotated[str, AfterValidator(_beside_the_file)]
-XacroArgs = Annotated[dict[str, str | bool | int | float], Field(description="of a .xacro model, by name")]
+XacroArgs = Annotated[dict[str, str | bool | int | float], Field(description="arguments of a .xacro model, by name")]
 
 
 class PoseConfig(StrictModel):
@@ -61,9 +61,11 @@ class FlangeConfig(StrictModel):
     model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path")
     xacro_args: XacroArgs = Field({})
     frame: str | None = Field(None, description="link of the model that carries the tool; default: the last link")
-    thickness: float | None = Field(None, gt=0, le=0.5, description="of a cylinder instead of a model, along z [m]")
-    radius: float | None = Field(None, gt=0, le=0.5, description="of that cylinder [m]")
-    mass: float = Field(0.0, ge=0, le=20, description="of that cylinder [kg]")
+    thickness: float | None = Field(
+        None, gt=0, le=0.5, description="length along z of a cylinder that is used instead of a model [m]"
+    )
+    radius: float | None = Field(None, gt=0, le=0.5, description="radius of that cylinder [m]")
+    mass: float = Field(0.0, ge=0, le=20, description="mass of that cylinder [kg]")
 
     @model_validator(mode="after")
     def _is_one_thing(self) -> FlangeConfig:
@@ -97,10 +99,12 @@ class HeldObjectConfig(StrictModel):
     """The object that a gripper holds: a box or a ball, fixed to the tool."""
 
     box: tuple[ObjectSize, ObjectSize, ObjectSize] | None = Field(None, description="x y z [m]")
-    sphere: float | None = Field(None, gt=0, le=0.5, description="radius; with neither, 0.03 [m]")
+    sphere: float | None = Field(
+        None, gt=0, le=0.5, description="radius [m]; 0.03 if neither a box nor a sphere is given"
+    )
     at: Metres3 = Field((0.0, 0.0, 0.0), description="centre in the tool frame [m]")
-    rpy: Radians3 = Field((0.0, 0.0, 0.0), description="of the box in the tool frame [rad]")
-    mass: float = Field(0.0, ge=0, le=50, description="that torque mode bears [kg]")
+    rpy: Radians3 = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw of the box in the tool frame [rad]")
+    mass: float = Field(0.0, ge=0, le=50, description="mass that torque mode compensates [kg]")
 
     @model_validator(mode="after")
     def _is_one_shape(self) -> HeldObjectConfig:
@@ -118,11 +122,17 @@ class GripperConfig(StrictModel):
     """How an opening of 0..1 becomes finger joint positions."""
 
     joints: tuple[str, ...] = Field((), description="finger joints of the tool, all driven alike")
-    open_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, open [m or rad]")
-    closed_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, closed [m or rad]")
-    speed: float = Field(0.1, gt=0, le=5, description="of each finger joint [m/s or rad/s]")
-    force: float = Field(60.0, gt=0, le=500, description="of each finger joint [N or Nm]")
-    object: HeldObjectConfig | None = Field(None, description="what counts as part of the tool while it is held")
+    open_position: float = Field(
+        0.0, ge=-3.15, le=3.15, description="position of each finger joint of the open gripper [m or rad]"
+    )
+    closed_position: float = Field(
+        0.0, ge=-3.15, le=3.15, description="position of each finger joint of the closed gripper [m or rad]"
+    )
+    speed: float = Field(0.1, gt=0, le=5, description="speed of each finger joint [m/s or rad/s]")
+    force: float = Field(60.0, gt=0, le=500, description="force of each finger joint [N or Nm]")
+    object: HeldObjectConfig | None = Field(
+        None, description="the object that counts as a part of the tool while the gripper holds it"
+    )
 
     @model_validator(mode="after")
     def _opens(self) -> GripperConfig:
@@ -134,11 +144,12 @@ class GripperConfig(StrictModel):
 class RobotConfig(StrictModel):
     """One model that several arms are parts of. Its links and joints keep their names."""
 
-    model: LocalPath = Field(description="as an arm's model")
+    model: LocalPath = Field(description="the model, named as an arm's model is")
     xacro_args: XacroArgs = Field({})
     mount: PoseConfig = PoseConfig()
     home: dict[str, float] = Field(
-        default_factory=dict, description="where joints of no arm are locked, by name; the others as near 0 as allowed"
+        default_factory=dict,
+        description="positions at which joints of no arm are locked, by name; the default is as near to 0 as allowed",
     )
 
 
@@ -150,14 +161,17 @@ class ArmConfig(StrictModel):
     )
     xacro_args: XacroArgs = Field({})
     mount: PoseConfig = PoseConfig()
-    tip: str | None = Field(None, description="last link of the arm; none: found, where there is no doubt")
-    joints: tuple[str, ...] = Field((), description="of the arm, base to tip; none: all from base to tip")
+    tip: str | None = Field(None, description="last link of the arm; null: it is found if only one link is possible")
+    joints: tuple[str, ...] = Field(
+        (), description="joints of the arm from base to tip; null: all joints from base to tip"
+    )
     flange: FlangeConfig = FlangeConfig()
     tool: ToolConfig = ToolConfig()
     gripper: GripperConfig = GripperConfig()
     home: tuple[float, ...] = Field(description="joint positions [rad]")
     acceleration_limit: Annotated[dict[str, Acceleration], BeforeValidator(_by_joint)] = Field(
-        default_factory=dict, description="of joints, by name, in place of the model's [rad/s^2]"
+        default_factory=dict,
+        description="acceleration limits of joints by name, in place of those of the model [rad/s^2]",
     )
 
     @model_validator(mode="after")

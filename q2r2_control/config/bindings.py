@@ -107,9 +107,11 @@ class Binding(NamedTuple):
 class BindingSettings(StrictModel):
     """The controls of each hand. An action is bound to one gesture at most, and something has to engage the arm."""
 
-    lower: Action = Field(Action.PAUSE_TOGGLE, description="A or X, tapped: what is done once, but stop; or none")
+    lower: Action = Field(
+        Action.PAUSE_TOGGLE, description="A or X, tapped: an action that is done once, except stop; or none"
+    )
     lower_hold: Action = Field(
-        Action.NONE, description="held for hold_time: what is done once, but pause_toggle; or none"
+        Action.NONE, description="held for hold_time: an action that is done once, except pause_toggle; or none"
     )
     upper: Action = Field(Action.GRIPPER_TOGGLE, description="B or Y, as lower")
     upper_hold: Action = Field(Action.NONE, description="as lower_hold")
@@ -118,10 +120,12 @@ class BindingSettings(StrictModel):
         description="index finger; while held: dead_man, precision, rotation_lock, translation_lock, gripper_analog; "
         "tapped: what is done once; or none",
     )
-    trigger_hold: Action = Field(Action.NONE, description="as lower_hold, where trigger is not for what lasts")
+    trigger_hold: Action = Field(
+        Action.NONE, description="as lower_hold, if trigger has no action that lasts while it is held"
+    )
     grip: Action = Field(Action.NONE, description="middle finger, as trigger")
     grip_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    stick_up: Action = Field(Action.NONE, description="thumb stick forward, as trigger, but no gripper_analog")
+    stick_up: Action = Field(Action.NONE, description="thumb stick forward, as trigger, but not gripper_analog")
     stick_up_hold: Action = Field(Action.NONE, description="as trigger_hold")
     stick_down: Action = Field(Action.NONE, description="as stick_up")
     stick_down_hold: Action = Field(Action.NONE, description="as trigger_hold")
@@ -130,7 +134,8 @@ class BindingSettings(StrictModel):
     stick_right: Action = Field(Action.NONE, description="as stick_up")
     stick_right_hold: Action = Field(Action.NONE, description="as trigger_hold")
     device: dict[str, Action] = Field(
-        default_factory=dict, description="of each button or axis NAME that only the input device has, and NAME_hold"
+        default_factory=dict,
+        description="actions of NAME and NAME_hold, for each button or axis NAME that only the input device has",
     )
 
     @model_validator(mode="after")

@@ -86,15 +86,20 @@ class ObstacleConfig(StrictModel):
 class HeadsetConfig(StrictModel):
     """The TCP server that the Quest2ROS app connects to."""
 
-    host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0 admits the network, :: that of IPv6 too")
+    host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0 admits the network, :: also that of IPv6")
     port: int = Field(10000, ge=0, le=65535, description="0 takes any free port")
     allow: tuple[str, ...] | None = Field(
-        None, min_length=1, description="addresses and networks that may connect; none: all that reach the port"
+        None, min_length=1, description="addresses and networks that may connect; null: all that reach the port"
     )
     frozen_time: float | None = Field(
-        0.5, ge=0.1, le=10, description="poses that stay the same to the last bit for this long are lost [s]; none: not"
+        0.5,
+        ge=0.1,
+        le=10,
+        description="a hand whose poses are equal to the last bit for this time is lost [s]; null: no such rule",
     )
-    watch_frame: bool = Field(True, description="both hands that move as one are a frame that moved: a fault")
+    watch_frame: bool = Field(
+        True, description="a motion of both hands as one rigid body is a fault, since the tracking frame has moved"
+    )
 
     @field_validator("allow")
     @classmethod
@@ -134,16 +139,19 @@ class MujocoConfig(StrictModel):
     """The simulated cell."""
 
     timestep: float = Field(0.001, gt=0, le=0.001, description="physics step [s]")
-    position_stiffness: float = Field(4000.0, gt=0, le=1e6, description="of the position servos [Nm/rad]")
-    position_damping_ratio: float = Field(1.0, gt=0, le=5, description="of the position servos")
+    position_stiffness: float = Field(4000.0, gt=0, le=1e6, description="stiffness of the position servos [Nm/rad]")
+    position_damping_ratio: float = Field(1.0, gt=0, le=5, description="damping ratio of the position servos")
     rotor_share: float = Field(
         1.0,
         ge=0.01,  # Light wrist joints without any rotor inertia could not be integrated.
         le=1,
-        description="of the rotors' inertia that the joints feel; a torque loop on the joint hides most",
+        description="share of the rotors' inertia that the joints feel; a torque loop at the joint hides most of it",
     )
     obstacle_friction: float = Field(
-        0.6, ge=0, le=1.5, description="of what touches obstacles; metal on wood 0.3, rubber on wood up to 0.9"
+        0.6,
+        ge=0,
+        le=1.5,
+        description="friction of bodies that touch obstacles; metal on wood has 0.3, rubber on wood up to 0.9",
     )
     objects: dict[str, ObjectConfig] = Field(default_factory=dict, description="loose boxes by name")
 
@@ -152,15 +160,19 @@ class Config(StrictModel):
     """One cell: everything a user tunes."""
 
     name: str = Field(min_length=1)
-    robot: RobotConfig | None = Field(None, description="a model that all arms are parts of; none: one of its own each")
+    robot: RobotConfig | None = Field(
+        None, description="a model that contains all arms; null if each arm has a model of its own"
+    )
     arms: dict[Side, ArmConfig] = Field(min_length=1)
     packages: dict[str, LocalPath] = Field(
-        default_factory=dict, description="folders of ROS packages, by name: for package:// and $(find ...)"
+        default_factory=dict, description="folder of each ROS package by its name, for package:// and $(find ...)"
     )
     obstacles: dict[str, ObstacleConfig] = Field(default_factory=dict)
-    floor: Coordinate | None = Field(0.0, description="height of the floor, which arms keep off [m]; none: no floor")
+    floor: Coordinate | None = Field(
+        0.0, description="height of the floor, from which the arms keep their distance [m]; null: no floor"
+    )
     srdf: LocalPath | None = Field(
-        None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it"
+        None, description="SRDF file of the pairs that are not monitored, as q2r2 check --pairs writes it"
     )
     capsules: dict[str, Annotated[int, Field(ge=1, le=4)]] = Field(
         default_factory=dict,
@@ -168,25 +180,31 @@ class Config(StrictModel):
         "has no collision shape; others: one",
     )
     unchecked_links: tuple[str, ...] = Field(
-        (), description="links without a collision shape that nothing keeps off anything"
+        (), description="links without a collision shape that are not monitored at all"
     )
     supervision: SupervisionSettings = SupervisionSettings()
     loop_rate_hz: _LoopRate = Field(
         AUTO, description="control loop [Hz]; auto: the highest of 1000, 500 and 250 that this computer can keep"
     )
-    input: str = Field("scripted", min_length=1, description="name of what brings hand samples, where none is given")
-    plant: str = Field("mujoco", min_length=1, description="name of what moves, where none is given")
+    input: str = Field("scripted", min_length=1, description="input device, if no --input is given")
+    plant: str = Field("mujoco", min_length=1, description="plant, if no --plant is given")
     controller: ControllerKind = Field(ControllerKind.BUILTIN, description="builtin, or external: for q2r2 ros up")
-    external: ExternalConfig | None = Field(None, description="controllers of others; with controller: external")
+    external: ExternalConfig | None = Field(
+        None, description="controllers of other packages; only with controller: external"
+    )
     control: ControllerSettings = ControllerSettings()
     impedance: ImpedanceSettings = ImpedanceSettings()
     admittance: AdmittanceSettings = AdmittanceSettings()
     teleop: TeleopSettings = TeleopSettings()
     headset: HeadsetConfig = HeadsetConfig()
     mujoco: MujocoConfig = MujocoConfig()
-    fri: dict[Side, CabinetConfig] = Field(default_factory=dict, description="KUKA's cabinet of each arm, of plant fri")
+    fri: dict[Side, CabinetConfig] = Field(
+        default_factory=dict, description="the KUKA cabinet of each arm, for plant fri"
+    )
     cameras: dict[CameraName, CameraConfig] = Field(
-        default_factory=dict, max_length=16, description="of the simulated cell, or on ROS topics, by name"
+        default_factory=dict,
+        max_length=16,
+        description="cameras of the simulated cell, or cameras on ROS topics, by name",
     )
     recording: RecordingSettings = RecordingSettings()
     judge: JudgeSettings = JudgeSettings()

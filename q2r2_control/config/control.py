@@ -23,7 +23,7 @@ ObstacleName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_leng
 
 
 class DistanceSettings(StrictModel):
-    """How far pairs of bodies stay apart, by what they are; left out: ``min_distance``.
+    """Distances that pairs keep, by the kind of their bodies. A kind that is left out has ``min_distance``.
 
     A finger is moved by a gripper's joints, and carried by a tool (the hand). An obstacle stands in the cell, and the
     floor counts as an obstacle. An object is the body that ``gripper.object`` describes, while it is held. ``arm_self``
@@ -48,10 +48,10 @@ class DistanceSettings(StrictModel):
 
 
 class NamedPairDistance(StrictModel):
-    """How far pairs of bodies stay apart, by their names."""
+    """The distance that pairs keep, by the names of their bodies."""
 
     pair: tuple[LinkPattern, LinkPattern] = Field(
-        description="links, * stands for any letters and ? for one; in either order"
+        description="two links in any order; * stands for any characters and ? for one"
     )
     distance: Distance = Field(description="[m]")
 
@@ -74,9 +74,12 @@ class ControllerSettings(StrictModel):
     """Settings of :class:`CartesianController`; every range is checked when the object is made."""
 
     solver: str = Field(
-        "daqp", description="of the QP; daqp, osqp, or any other that qpsolvers finds installed; --solver NAME instead"
+        "daqp",
+        description="solver of the QP: daqp, osqp, or another that qpsolvers finds; --solver NAME replaces it",
     )
-    solver_options: dict[str, Any] = Field({}, description="keyword arguments of that solver, and of no other")
+    solver_options: dict[str, Any] = Field(
+        {}, description="keyword arguments of that solver; they are not used with another one"
+    )
     solve_time_limit: float | None = Field(
         None,
         gt=0,
@@ -85,9 +88,16 @@ class ControllerSettings(StrictModel):
     )
     max_substep: float = Field(0.002, gt=0, le=0.02, description="a longer dt is split into equal parts below this [s]")
 
-    acceleration_limit: float = Field(10.0, gt=0, le=100, description="cap of every joint's own limit [rad/s^2]")
+    acceleration_limit: float = Field(
+        10.0,
+        gt=0,
+        le=100,
+        description="largest acceleration of every joint, if the joint's own limit is not smaller [rad/s^2]",
+    )
     velocity_scale: float = Field(1.0, gt=0, le=1, description="fraction of the robot's velocity limits")
-    position_margin: float = Field(0.01, ge=0, le=0.5, description="distance kept from position limits [rad]")
+    position_margin: float = Field(
+        0.01, ge=0, le=0.5, description="distance that joints keep from their position limits [rad]"
+    )
     limits: Literal["driver", "model"] = Field(
         "driver",
         description="driver: with plant fri or a preset lbr_*, position_margin is 0.105 rad at least, and "
@@ -97,49 +107,73 @@ class ControllerSettings(StrictModel):
         None,
         ge=0.02,
         le=3,
-        description="no tool of the reference is ever faster, whatever a solver answers [m/s]; null: no such promise",
+        description="no tool of the reference is ever faster, whatever the solver returns [m/s]; null: no such limit",
     )
-    recovery_velocity: float = Field(0.2, gt=0, le=1, description="inward speed when outside a limit [rad/s]")
+    recovery_velocity: float = Field(
+        0.2, gt=0, le=1, description="speed back inside of a joint that is outside its limits [rad/s]"
+    )
 
     min_distance: Annotated[Distance, _LIVE] = Field(
-        0.02, description="monitored pairs stay this far apart unless said below [m]"
+        0.02, description="distance that monitored pairs keep, unless distances or pairs say otherwise [m]"
     )
-    distances: DistanceSettings = Field(DistanceSettings(), description="the same, by what the bodies are")
-    pairs: tuple[NamedPairDistance, ...] = Field((), description="the same, by name; of several, the last one counts")
+    distances: DistanceSettings = Field(DistanceSettings(), description="the same by the kind of the bodies")
+    pairs: tuple[NamedPairDistance, ...] = Field(
+        (), description="the same by the names of the bodies; the last entry that fits counts"
+    )
     contact_allowed: tuple[ContactPair, ...] = Field(
-        (), description="pairs that may touch in torque mode; of several, the last one counts"
+        (), description="pairs that may touch in torque mode; the last entry that fits counts"
     )
     moving_obstacles: tuple[ObstacleName, ...] = Field(
-        (), max_length=16, description="names of obstacles that may come, move and go while a controller runs"
+        (), max_length=16, description="names of obstacles that may appear, move and disappear while a controller runs"
     )
     distance_buffer: float = Field(
         0.002,
         ge=1e-4,
         le=0.05,
-        description="the QP aims to stop this much earlier, but half a pair's distance at most [m]",
+        description="the QP plans to stop a pair this much earlier, at most half of its distance [m]",
     )
-    separation_gain: LiveFloat = Field(10.0, gt=0, le=50, description="closing speed per metre left after a stop [1/s]")
-    separation_recovery_speed: float = Field(0.05, gt=0, le=0.5, description="when too close, moving apart [m/s]")
+    separation_gain: LiveFloat = Field(
+        10.0, gt=0, le=50, description="closing speed per metre that would remain after a stop [1/s]"
+    )
+    separation_recovery_speed: float = Field(
+        0.05, gt=0, le=0.5, description="speed at which a pair that is too close moves apart [m/s]"
+    )
 
     priority: str = Field(EQUAL, description="equal, or the arm that the other one gives way to")
-    yield_weight: LiveFloat = Field(0.01, gt=0, le=1, description="of the costs of the arm that gives way")
+    yield_weight: LiveFloat = Field(0.01, gt=0, le=1, description="factor of the costs of the arm that gives way")
 
     position_gain: LiveFloat = Field(8.0, gt=0, le=50, description="[1/s]")
     rotation_gain: LiveFloat = Field(8.0, gt=0, le=50, description="[1/s]")
-    position_weights: Weights = Field((1.0, 1.0, 1.0), description="of a tool's error along the world's x, y, z")
-    rotation_weights: Weights = Field((1.0, 1.0, 1.0), description="of its error about its own x, y, z; 0: left free")
+    position_weights: Weights = Field(
+        (1.0, 1.0, 1.0), description="weights of the position error along the world's x, y, z"
+    )
+    rotation_weights: Weights = Field(
+        (1.0, 1.0, 1.0),
+        description="weights of the rotation error about the tool's own x, y, z; 0 leaves that rotation free",
+    )
     max_linear_speed: LiveFloat = Field(1.0, gt=0, le=3, description="tool speed [m/s]")
     max_angular_speed: LiveFloat = Field(2.5, gt=0, le=10, description="tool speed [rad/s]")
-    linear_deceleration: LiveFloat = Field(2.0, gt=0, le=50, description="planned when approaching a target [m/s^2]")
-    angular_deceleration: LiveFloat = Field(
-        5.0, gt=0, le=100, description="planned when approaching a target [rad/s^2]"
+    linear_deceleration: LiveFloat = Field(
+        2.0, gt=0, le=50, description="deceleration with which a tool approaches its target [m/s^2]"
     )
-    feed_forward_time: float = Field(0.02, gt=0, le=1, description="smoothing of the target's velocity [s]")
+    angular_deceleration: LiveFloat = Field(
+        5.0, gt=0, le=100, description="deceleration with which a tool turns to its target [rad/s^2]"
+    )
+    feed_forward_time: float = Field(
+        0.02, gt=0, le=1, description="time constant that smooths the target's velocity [s]"
+    )
 
     posture_gain: LiveFloat = Field(1.0, ge=0, le=20, description="pull towards the home posture [1/s]")
-    posture_speed: float = Field(0.5, gt=0, le=3, description="of that pull, at most [rad/s]")
-    posture_weight: LiveFloat = Field(1e-3, gt=0, le=1, description="against the tool task's 1; also regularises")
-    stretch_gain: LiveFloat = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
+    posture_speed: float = Field(0.5, gt=0, le=3, description="largest speed of that pull [rad/s]")
+    posture_weight: LiveFloat = Field(
+        1e-3,
+        gt=0,
+        le=1,
+        description="weight of the posture task, where the tool task has 1; it also regularises the QP",
+    )
+    stretch_gain: LiveFloat = Field(
+        10.0, gt=0, le=200, description="largest gain of an arm that is stretched out [1/s]"
+    )
     tasks: dict[str, dict[str, Any]] = Field(
         {}, description="tasks of other packages, by their entry point's name, with the settings of each"
     )
@@ -204,27 +238,39 @@ class WallSettings(StrictModel):
     """The wall between measured links; its depth is the distance that each pair keeps."""
 
     stiffness: float = Field(10000.0, gt=0, le=100000, description="force per depth below a pair's distance [N/m]")
-    damping_ratio: float = Field(1.0, ge=0.2, le=2, description="at each pair's effective mass")
-    maximum_force: float = Field(400.0, gt=0, le=2000, description="of each pair of links [N]")
+    damping_ratio: float = Field(1.0, ge=0.2, le=2, description="damping ratio at the effective mass of each pair")
+    maximum_force: float = Field(400.0, gt=0, le=2000, description="largest force between a pair of links [N]")
 
 
 class ImpedanceSettings(StrictModel):
     """Settings of :class:`ImpedanceController`. Nothing here may be zero or negative: a stiffness or a damping of -1,
     meant as "automatic", would drive an arm instead of holding it."""
 
-    translational_stiffness: LiveFloat = Field(2000.0, gt=0, le=5000, description="of the tool, all directions [N/m]")
-    rotational_stiffness: LiveFloat = Field(200.0, gt=0, le=300, description="of the tool, all axes [Nm/rad]")
-    damping_ratio: LiveFloat = Field(1.0, ge=0.1, le=2, description="of every mode of the tool; 1: no overshoot")
-    nullspace_stiffness: LiveFloat = Field(50.0, gt=0, le=500, description="towards the reference's posture [Nm/rad]")
-    nullspace_damping_ratio: LiveFloat = Field(1.0, ge=0.1, le=2, description="of the posture's motion")
-    max_position_error: float = Field(0.1, gt=0, le=1, description="a longer way from the reference is clipped [m]")
-    max_rotation_error: float = Field(0.5, gt=0, le=3, description="a wider turn from the reference is clipped [rad]")
-    limit_distance: float = Field(0.1, gt=0, le=0.5, description="joints are repelled nearer to a limit [rad]")
-    limit_stiffness: float = Field(300.0, gt=0, le=5000, description="of that repulsion [Nm/rad]")
-    limit_damping: float = Field(20.0, gt=0, le=200, description="of that repulsion [Nms/rad]")
+    translational_stiffness: LiveFloat = Field(
+        2000.0, gt=0, le=5000, description="stiffness of the tool in all directions [N/m]"
+    )
+    rotational_stiffness: LiveFloat = Field(
+        200.0, gt=0, le=300, description="stiffness of the tool about all axes [Nm/rad]"
+    )
+    damping_ratio: LiveFloat = Field(
+        1.0, ge=0.1, le=2, description="damping ratio of every mode of the tool; 1: no overshoot"
+    )
+    nullspace_stiffness: LiveFloat = Field(
+        50.0, gt=0, le=500, description="stiffness towards the posture of the reference [Nm/rad]"
+    )
+    nullspace_damping_ratio: LiveFloat = Field(1.0, ge=0.1, le=2, description="damping ratio of the posture's motion")
+    max_position_error: float = Field(0.1, gt=0, le=1, description="a larger position error is clipped to this [m]")
+    max_rotation_error: float = Field(0.5, gt=0, le=3, description="a larger rotation error is clipped to this [rad]")
+    limit_distance: float = Field(
+        0.1, gt=0, le=0.5, description="a joint that is nearer to its limit is pushed back [rad]"
+    )
+    limit_stiffness: float = Field(300.0, gt=0, le=5000, description="stiffness of that push [Nm/rad]")
+    limit_damping: float = Field(20.0, gt=0, le=200, description="damping of that push [Nms/rad]")
     torque_scale: float = Field(1.0, gt=0, le=1, description="fraction of the robot's torque limits")
-    torque_rate_limit: float = Field(5000.0, gt=0, le=1e5, description="of every joint [Nm/s]")
-    ramp_time: float = Field(0.5, ge=0.01, le=10, description="a change of stiffness or damping at run time takes [s]")
+    torque_rate_limit: float = Field(5000.0, gt=0, le=1e5, description="largest change of torque of every joint [Nm/s]")
+    ramp_time: float = Field(
+        0.5, ge=0.01, le=10, description="time that a change of stiffness or damping takes at run time [s]"
+    )
     wall: WallSettings = WallSettings()
 
 
@@ -255,16 +301,26 @@ LIVE_IMPEDANCE = _live_fields(ImpedanceSettings)  # The same for an impedance.
 
 
 class SupervisionSettings(StrictModel):
-    """Limits of what a plant may measure, and of what a stream of targets may be."""
+    """Limits of the measured states of a plant, and of streams of targets."""
 
-    state_timeout: float = Field(0.1, ge=0.01, le=1, description="without a measured state for this long: stop [s]")
-    unusable_time: float = Field(0.05, ge=0, le=0.5, description="states that are not finite are bridged for this [s]")
-    settle_time: float = Field(0.1, ge=0.02, le=10, description="states good and at rest before arms may move [s]")
-    max_deviation: float = Field(0.15, ge=0.01, le=3, description="of a measured joint from its reference [rad]")
+    state_timeout: float = Field(
+        0.1, ge=0.01, le=1, description="the arms stop if no state was measured for this time [s]"
+    )
+    unusable_time: float = Field(
+        0.05, ge=0, le=0.5, description="states that are not finite are ignored for this time, then the arms stop [s]"
+    )
+    settle_time: float = Field(
+        0.1, ge=0.02, le=10, description="states have to be valid and at rest for this time before arms may move [s]"
+    )
+    max_deviation: float = Field(
+        0.15, ge=0.01, le=3, description="largest deviation of a measured joint from its reference [rad]"
+    )
     max_deviation_torque: float = Field(
-        1.5, ge=0.01, le=3, description="the same in torque mode, where arms that are pushed yield [rad]"
+        1.5, ge=0.01, le=3, description="the same in torque mode, where an arm yields if it is pushed [rad]"
     )
     max_deviation_external: float = Field(
-        0.6, ge=0.01, le=3, description="the same where another controller follows safe targets, and may lag [rad]"
+        0.6, ge=0.01, le=3, description="the same with an external controller, which may lag behind its targets [rad]"
     )
-    deviation_time: float = Field(0.5, ge=0.05, le=10, description="a longer deviation stops the arms [s]")
+    deviation_time: float = Field(
+        0.5, ge=0.05, le=10, description="a larger deviation for longer than this time stops the arms [s]"
+    )

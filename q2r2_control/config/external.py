@@ -57,7 +57,7 @@ class GripperSettings(StrictModel):
     )
     open_position: float = Field(0.0, ge=-3.15, le=3.15, description="goal that opens [m or rad]")
     closed_position: float = Field(0.05, ge=-3.15, le=3.15, description="goal that closes [m or rad]")
-    max_effort: float = Field(5.0, ge=0, le=500, description="of a goal [N or Nm]")
+    max_effort: float = Field(5.0, ge=0, le=500, description="largest effort of a goal [N or Nm]")
     joint_name: str = Field("", description="joint of a ParallelGripperCommand")
 
     @model_validator(mode="after")
@@ -70,7 +70,9 @@ class GripperSettings(StrictModel):
 class ExternalGripper(GripperSettings):
     """An arm's gripper."""
 
-    topic: RosName | None = Field(None, description="its action or topic; none: /q2r2/left_gripper/gripper_cmd")
+    topic: RosName | None = Field(
+        None, description="action or topic of the gripper; null: /q2r2/left_gripper/gripper_cmd"
+    )
 
     def settings(self) -> GripperSettings:
         """Return the settings without the topic."""
@@ -78,12 +80,18 @@ class ExternalGripper(GripperSettings):
 
 
 class GuardLimits(StrictModel):
-    """How fast a target may move; none: as the preset says."""
+    """How fast a target may move; null: as fast as the preset says."""
 
-    max_velocity: float | None = Field(None, gt=0, le=5, description="of the target's position [m/s]")
-    max_acceleration: float | None = Field(None, gt=0, le=100, description="of the target's position [m/s^2]")
-    max_angular_velocity: float | None = Field(None, gt=0, le=20, description="of the target's rotation [rad/s]")
-    max_angular_acceleration: float | None = Field(None, gt=0, le=400, description="of the target's rotation [rad/s^2]")
+    max_velocity: float | None = Field(None, gt=0, le=5, description="largest speed of the target's position [m/s]")
+    max_acceleration: float | None = Field(
+        None, gt=0, le=100, description="largest acceleration of the target's position [m/s^2]"
+    )
+    max_angular_velocity: float | None = Field(
+        None, gt=0, le=20, description="largest speed of the target's rotation [rad/s]"
+    )
+    max_angular_acceleration: float | None = Field(
+        None, gt=0, le=400, description="largest acceleration of the target's rotation [rad/s^2]"
+    )
 
     def over(self, guard: GuardSettings) -> GuardSettings:
         """Return ``guard`` with the limits that are given here."""
@@ -96,10 +104,13 @@ class ExternalArm(StrictModel):
     ctrl_prefix: AbsoluteName = Field(description="name of the controller's node, with its namespace")
     base_frame: FrameName = Field(description="frame_id of its targets; a frame of /tf")
     tool_frame: FrameName | None = Field(
-        None, description="frame of /tf that the operator moves, in mode filtered at the cell's tool; none: the cell's"
+        None,
+        description="frame of /tf that the operator moves, in mode filtered at the cell's tool; null: the cell's tool",
     )
-    target_topic: RosName | None = Field(None, description="of its targets or joint commands; none: the preset's")
-    joint_states_topic: RosName = Field("joint_states", description="where the arm's joint states are")
+    target_topic: RosName | None = Field(
+        None, description="topic of the targets or joint commands; null: that of the preset"
+    )
+    joint_states_topic: RosName = Field("joint_states", description="topic of the arm's joint states")
     gripper: ExternalGripper = ExternalGripper()
 
 
@@ -114,9 +125,12 @@ class ExternalConfig(StrictModel):
         Mode.FILTERED,
         description="filtered: what the built-in controller makes of the hand's target; raw: that target itself",
     )
-    rate: float | None = Field(None, ge=1, le=1000, description="of what it is sent; none: as the preset says [Hz]")
+    rate: float | None = Field(
+        None, ge=1, le=1000, description="rate of the messages that the controller gets [Hz]; null: that of the preset"
+    )
     world_frame: FrameName | None = Field(
-        None, description="frame of /tf that is the cell's world, whose axes the hands' are; none: base_frame"
+        None,
+        description="frame of /tf that is the world frame of the cell, and whose axes the hands use; null: base_frame",
     )
     limits: GuardLimits = GuardLimits()
     arms: dict[Literal["left", "right"], ExternalArm] = Field(min_length=1)

@@ -58,8 +58,13 @@ class RotationFrame(StrEnum):
 class FilterSettings(StrictModel):
     """Interpolation between samples, then a One-Euro filter (Casiez, Roussel, Vogel, CHI 2012)."""
 
-    interpolation_delay: float = Field(0.0165, ge=0.005, le=0.2, description="1.25 periods of a 75 Hz headset [s]")
-    smoothing_delay: float = Field(0.0185, ge=0, le=0.2, description="of a motion at constant speed [s]")
+    interpolation_delay: float = Field(
+        0.0165,
+        ge=0.005,
+        le=0.2,
+        description="delay of the interpolation; the default is 1.25 periods of a 75 Hz headset [s]",
+    )
+    smoothing_delay: float = Field(0.0185, ge=0, le=0.2, description="delay of a motion at constant speed [s]")
     min_cutoff: float = Field(1.2, gt=0, le=100, description="cutoff frequency at rest; tremor is 8-12 Hz [Hz]")
     beta: float = Field(38.0, ge=0, le=1000, description="cutoff added per speed [Hz s/m]")
     rotation_beta: float = Field(9.0, ge=0, le=1000, description="cutoff added per speed [Hz s/rad]")
@@ -74,20 +79,30 @@ class FilterSettings(StrictModel):
 class GateSettings(StrictModel):
     """Limits beyond which a hand sample moves no arm."""
 
-    timeout: float = Field(STREAM_TIMEOUT, gt=0, le=2, description="no pose for this long disengages [s]")
-    max_jump: float = Field(0.15, gt=0, le=2, description="position change between two samples [m]")
-    max_rotation_jump: float = Field(1.0, gt=0, le=3.14, description="rotation between two samples [rad]")
-    max_speed: float = Field(5.0, gt=0, le=100, description="of a hand, over at least 50 ms [m/s]")
-    max_angular_speed: float = Field(30.0, gt=0, le=100, description="of a hand, over at least 50 ms [rad/s]")
+    timeout: float = Field(
+        STREAM_TIMEOUT, gt=0, le=2, description="an arm disengages if there was no pose for this time [s]"
+    )
+    max_jump: float = Field(0.15, gt=0, le=2, description="largest change of the position between two samples [m]")
+    max_rotation_jump: float = Field(1.0, gt=0, le=3.14, description="largest rotation between two samples [rad]")
+    max_speed: float = Field(5.0, gt=0, le=100, description="largest speed of a hand, over at least 50 ms [m/s]")
+    max_angular_speed: float = Field(
+        30.0, gt=0, le=100, description="largest angular speed of a hand, over at least 50 ms [rad/s]"
+    )
 
 
 class LeashSettings(StrictModel):
-    """How far a target may be from its tool; beyond that it slips along. None: as far as the hand goes."""
+    """How far a target may be from its tool. A target that would be farther follows the tool at this distance."""
 
-    distance: float | None = Field(0.1, ge=0.02, le=2, description="of positions [m]; none: no leash")
-    angle: float | None = Field(0.5, ge=0.1, le=2, description="of rotations [rad]; none: no leash")
-    carried_distance: float = Field(0.03, ge=0.01, le=2, description="of the frame between two tools that carry [m]")
-    carried_angle: float = Field(0.1, ge=0.03, le=2, description="of that frame's rotation [rad]")
+    distance: float | None = Field(
+        0.1, ge=0.02, le=2, description="largest distance of the positions [m]; null: no leash"
+    )
+    angle: float | None = Field(
+        0.5, ge=0.1, le=2, description="largest angle between the rotations [rad]; null: no leash"
+    )
+    carried_distance: float = Field(
+        0.03, ge=0.01, le=2, description="the same for the frame between two tools that carry one object [m]"
+    )
+    carried_angle: float = Field(0.1, ge=0.03, le=2, description="the same for the rotation of that frame [rad]")
 
     def carried(self) -> LeashSettings:
         """Return the leash of the frame between two tools, which is not longer than that of a tool."""
@@ -99,13 +114,13 @@ class LeashSettings(StrictModel):
 class HapticSettings(StrictModel):
     """Vibrations of the hand controllers."""
 
-    strength: float = Field(1.0, ge=0, le=1, description="of all vibrations; 0: none")
+    strength: float = Field(1.0, ge=0, le=1, description="strength of all vibrations; 0: none")
 
 
 class WorkspaceSettings(StrictModel):
     """A box in the world that one arm's targets stay in."""
 
-    x: Interval = Field(description="least and greatest of the target's position [m]")
+    x: Interval = Field(description="smallest and largest position of the target [m]")
     y: Interval = Field(description="the same [m]")
     z: Interval = Field(description="the same [m]")
 
@@ -124,7 +139,7 @@ class TeleopSettings(StrictModel):
     position_scale: float = Field(1.0, gt=0, le=10, description="tool metres per hand metre")
     rotation_scale: float = Field(1.0, ge=0, le=5, description="tool radians per hand radian")
     axis_scales: tuple[_Scale, _Scale, _Scale] = Field(
-        (1.0, 1.0, 1.0), description="of motion along the world's x, y and z, on top of position_scale"
+        (1.0, 1.0, 1.0), description="factors of motion along the world's x, y and z, multiplied by position_scale"
     )
     rotation_frame: RotationFrame = Field(RotationFrame.BASE, description="base or tool")
     axes: tuple[str, str, str] = Field(
@@ -132,18 +147,26 @@ class TeleopSettings(StrictModel):
         description="hand axes that become the world's x, y, z; e.g. [+z, -x, +y] for raw Unity (left-handed)",
     )
     chord_window: float = Field(
-        0.08, ge=0, le=0.5, description="a button waits this long for the other, which makes it a chord [s]"
+        0.08, ge=0, le=0.5, description="two buttons that are pressed within this time are a chord [s]"
     )
     hold_time: float = Field(
-        0.6, ge=0.2, le=3, description="after which a control counts as held, where that is bound [s]"
+        0.6,
+        ge=0.2,
+        le=3,
+        description="time after which a control counts as held, if its hold is bound to an action [s]",
     )
     linked: bool = Field(True, description="a fault of one hand disengages both arms")
-    precision_scale: float = Field(PRECISION_SCALE, gt=0, le=1, description="of all motion while precision is held")
+    precision_scale: float = Field(
+        PRECISION_SCALE, gt=0, le=1, description="factor of all motion while precision is held"
+    )
     gripper_speed: float = Field(
-        4.0, gt=0, le=50, description="of a gripper that is gripper_analog, in full openings a second [1/s]"
+        4.0,
+        gt=0,
+        le=50,
+        description="speed of a gripper that follows gripper_analog, in full openings per second [1/s]",
     )
     workspace: dict[Literal["left", "right"], WorkspaceSettings] = Field(
-        default_factory=dict, description="arm -> box that its targets stay in"
+        default_factory=dict, description="box of each arm by its name, in which its targets stay"
     )
     bindings: BindingSettings = Field(default_factory=BindingSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)
@@ -161,7 +184,11 @@ class TeleopSettings(StrictModel):
 class GuardSettings(StrictModel):
     """How fast a target may move, whatever the hand does."""
 
-    max_velocity: float = Field(0.5, gt=0, le=5, description="of the target's position [m/s]")
-    max_acceleration: float = Field(5.0, gt=0, le=100, description="of the target's position [m/s^2]")
-    max_angular_velocity: float = Field(2.0, gt=0, le=20, description="of the target's rotation [rad/s]")
-    max_angular_acceleration: float = Field(20.0, gt=0, le=400, description="of the target's rotation [rad/s^2]")
+    max_velocity: float = Field(0.5, gt=0, le=5, description="largest speed of the target's position [m/s]")
+    max_acceleration: float = Field(
+        5.0, gt=0, le=100, description="largest acceleration of the target's position [m/s^2]"
+    )
+    max_angular_velocity: float = Field(2.0, gt=0, le=20, description="largest speed of the target's rotation [rad/s]")
+    max_angular_acceleration: float = Field(
+        20.0, gt=0, le=400, description="largest acceleration of the target's rotation [rad/s^2]"
+    )
