@@ -65,6 +65,7 @@ from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
 LARGEST_SPREAD = 0.03  # Up to this displacement of the parts, all tasks reach them [m].
+_PORT = 8080  # of the page, where another program seldom listens
 _FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
@@ -104,7 +105,7 @@ def run(
     headless: Headless = False,
     web: Web = False,
     web_host: WebHost = "127.0.0.1",
-    web_port: WebPort = 8080,
+    web_port: WebPort = _PORT,
     rt: RealTime = False,
     record: Record = None,
     task: Task = None,
@@ -193,7 +194,9 @@ def demo(
     headless: Headless = False,
     web: Web = False,
     web_host: WebHost = "127.0.0.1",
-    web_port: WebPort = 8080,
+    web_port: Annotated[
+        int | None, Option(min=0, max=65535, metavar="PORT", help=f"Port of the page; 0: any free one. Else {_PORT}.")
+    ] = None,
     human: Human = False,
     hands: Annotated[
         str | None,
@@ -247,9 +250,10 @@ def demo(
     table = _shows_table(headless, viewer)
     if table and plant == "mujoco" and not (viewer or web or fast):
         viewer = window_fault() is None
-        web, web_port = not viewer and find_spec("viser") is not None, 0
+        web = not viewer and find_spec("viser") is not None
+        web_port = 0 if web_port is None else web_port  # another program may have the usual one
         if not (viewer or web):
-            say(f"--viewer shows the arms in MuJoCo's window, and --web in a browser: {install_line('web')}")
+            say(f"--web shows the arms in a browser: {install_line('web')}")
     given: dict[str, object] = {"trajectory": trajectory, "human": human or hands is not None, "seed": seed}
     given |= {"shaky": shaky, "spread": spread}
     options = RunOptions(
@@ -262,7 +266,7 @@ def demo(
         input_options=given,
         table=table,
         window=viewer,
-        page=(web_host, web_port, None) if web else None,
+        page=(web_host, _PORT if web_port is None else web_port, None) if web else None,
         real_time=rt or plant == "fri",  # A cabinet does not wait for a late answer of a busy computer.
         tasks=chosen,
         steps=work.steps,

@@ -284,7 +284,8 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
         data = yaml.load(text, Loader=_Loader)
     # Values such as dates and huge integers, and too deep nesting, raise Python's own exceptions.
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise ConfigError(f"{path}: not YAML: {_line(error)}") from error
+        said = str(error).replace(' "<unicode string>",', "")  # PyYAML's name for the text
+        raise ConfigError(f"{path}: not YAML: {_line(said)}") from error
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}")
     try:

@@ -51,7 +51,7 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     # The same page shows the next run at this address.
     command = ("q2r2_control", "run", CELL, "--plant", "kinematic", "--headless", "--json", "--web", "--web-port")
     again = start(*command, str(urlsplit(run.url).port))
-    wait_until(lambda: table(page).get("why", ["the run ends"])[0] != "the run ends")
+    wait_for(page, "certified")
     again.interrupt()
     assert again.end()["at_rest"]
 
