@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -42,7 +43,9 @@ def demo() -> Iterator[subprocess.Popen[str]]:
     if sys.platform != "linux":
         pytest.skip("looks into /proc")
     command = (sys.executable, "-m", "q2r2_control", "demo", "grasp", "--seeds", "2")
-    demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # A job in the background of a shell ignores SIGINT, and its children inherit that.
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=listen)
     try:
         yield demo
     finally:
