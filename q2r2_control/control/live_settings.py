@@ -138,7 +138,7 @@ class LiveSettings:
     ) -> None:
         self._robot, self._objects = robot, objects
         self._model, self._safety, self._data = model, model.safety, data.safety
-        self._gains, self._ramp = self._gains_of(settings), 0.0  # The goal, and the time until it is reached [s].
+        self._gains, self._ramp = self._gains_of(settings), 0.0  # The gains to reach, and the time until then [s].
         self._changing: list[tuple[Array, Array]] = []  # Arrays that kernels read, and their new values.
         self._goal = self._least = kept_distances(robot, settings).values  # The least is that of the first settings.
         self._stops = model.safety.approach.stop_distance[: len(self._goal)]  # Distances at which the QP stops pairs.

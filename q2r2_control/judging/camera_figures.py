@@ -22,7 +22,9 @@ _TRAVEL = 0.01  # If the joints of an arm move more than this between two pictur
 # number, plus the second number times the difference between these two.
 _ODD, _ODD_RATIO = 10.0, 3.0
 _PARTS = (4, 6, 4, 8)  # The parts of a view: rows of parts, rows in each; columns of parts, columns in each.
-_QUICK = 10.0  # From this rate on, nothing moves through a part of the picture between two pictures [Hz].
+# Damaged pictures are looked for in cameras of at least this rate [Hz]. At a lower rate, a body that moves may be in a
+# part of one picture only, as damage is.
+_QUICK = 10.0
 LARGEST_LAG = 0.4  # The largest lag that is searched for [s].
 _LAG_STEP = 0.02  # The step between two lags that are compared [s].
 _IN_TIME = 0.1  # A lag up to this is preferred if it explains the motion nearly as well as the best lag [s].

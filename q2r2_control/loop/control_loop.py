@@ -280,7 +280,9 @@ class ControlLoop:
 
 
 def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
-    """Return the opening that is granted while the arms do not move.
+    """Return the opening that a gripper gets while the arms do not move, and nothing is certified.
+
+    A gripper gets the wanted opening. If it was held up before, it does not go on in that direction.
 
     Args:
         wanted: The wanted opening.

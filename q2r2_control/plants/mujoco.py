@@ -58,7 +58,11 @@ class MujocoPlant:
     simulated = True
 
     def __init__(self, robot: Robot, config: Config) -> None:
-        """``robot`` must be the robot of ``config``; raises :class:`PlantError` if MuJoCo cannot model it."""
+        """Build the MuJoCo model of a cell, whose ``config`` must be the one that ``robot`` was built from.
+
+        Raises:
+            PlantError: If MuJoCo cannot model the robot.
+        """
         self.model: mujoco.MjModel = build_model(robot, config)
         self.data: mujoco.MjData = mujoco.MjData(self.model)
         self._qpos, self._qvel = self.data.qpos, self.data.qvel

@@ -62,7 +62,7 @@ class ComponentLeash:
             dt: Duration of the tick [s].
         """
         distance = math.hypot(*way)
-        # Below half of its length a leash is slack again: the tool has followed by itself.
+        # A leash that was taut stays so until the distance is below half of its length: then the tool has caught up.
         self.taut = distance >= self._length or (self.taut and distance >= 0.5 * self._length)
         if not self.taut:
             self._back = 0.0

@@ -103,11 +103,11 @@ class RelativeMotion:
         self.anchor_floats(hand, tool)
 
     def anchor_position(self, hand: Vector, tool: Vector) -> None:
-        """Map the hand's present position to the tool's position from now on. Rotations keep their anchor."""
+        """Make ``tool`` the target's position for the hand's present position. The anchor of rotations stays."""
         self._hand_position, self._tool_position = hand, tool
 
     def anchor_rotation(self, hand: Quaternion, tool: Quaternion) -> None:
-        """Map the hand's present rotation to the tool's rotation from now on. Positions keep their anchor."""
+        """Make ``tool`` the target's rotation for the hand's present rotation. The anchor of positions stays."""
         self._hand_rotation = normalized(hand)
         self._hand_back = inverse(self._hand_rotation)
         self._tool_rotation = tool = normalized(tool)

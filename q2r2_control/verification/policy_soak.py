@@ -165,7 +165,7 @@ class PolicySoak:
                 progress(f"tick {self._ticks} of {ticks}")
 
         self._pipeline.listeners.append(show)
-        log = logging.getLogger("q2r2_control.pipeline.operator_side")  # It would log every fault.
+        log = logging.getLogger("q2r2_control.pipeline.operator_side")  # This logger would print every provoked fault.
         log.disabled = True
         try:
             self._pipeline.run(ticks * self._period, realtime=False)

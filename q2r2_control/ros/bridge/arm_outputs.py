@@ -205,7 +205,7 @@ class FollowWatch:
         self._starts, self._reported_at = 0, -math.inf  # Starts of the controller, and time of the newest report [s].
         self._is_there, self._looked = False, -math.inf  # Whether a node reports, and when the graph was asked [s].
         self.homing = False  # Whether the controller reports that it goes home.
-        self.homing_outcome: Reason | None = None  # How the last way home ended, if by itself.
+        self.homing_outcome: Reason | None = None  # How the last way home ended, if nobody interrupted it.
         self.gripper_held = ""  # The pair of bodies that stops the gripper.
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, self._state_topic, self._on_state, 1)

@@ -45,7 +45,7 @@ _OLD = 0.5  # A target that is older than the one before by this much was made b
 # Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period.
 _LONGEST_PERIOD, _PERIOD_SHARE = 0.02, 0.05
 COMMAND_TIME = 0.01  # Time of a command to its driver and arm, if drivers do not report it [s].
-_PARTS = 64  # Number of kinds of messages that are remembered.
+_PARTS = 64  # Largest number of sets of joint names whose joints are remembered.
 _LAG_NOISE = 0.01  # Noise of a lag that is estimated from joint states [s].
 _WARNING_TIME = 1.0  # Time for which refused targets are reported [s].
 # Takes the target of an arm in the world frame, or None if it is not a pose; the time [s]; the number of the message;

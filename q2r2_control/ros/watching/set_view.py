@@ -96,7 +96,7 @@ class ArmView:
 
 @dataclass(slots=True)
 class DriverView:
-    """A KUKA driver by its topics."""
+    """A KUKA driver of one arm, as its topics and their publishers and subscribers show it."""
 
     arm: str
     command: str  # Topic of the arm's commands.
