@@ -65,7 +65,7 @@ from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
 LARGEST_SPREAD = 0.03  # Up to this displacement of the parts, all tasks reach them [m].
-_PORT = 8080  # of the page, where another program seldom listens
+_PORT = 8080  # The port of the page, if no other one is given.
 _FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
@@ -248,10 +248,10 @@ def demo(
     work = trajectory_named(trajectory, place)
     work = hurried(work, seed) if shaky else work
     table = _shows_table(headless, viewer)
+    usual_port = _PORT
     if table and plant == "mujoco" and not (viewer or web or fast):
         viewer = window_fault() is None
-        web = not viewer and find_spec("viser") is not None
-        web_port = 0 if web_port is None else web_port  # another program may have the usual one
+        web, usual_port = not viewer and find_spec("viser") is not None, 0  # Another program may have the usual one.
         if not (viewer or web):
             say(f"--web shows the arms in a browser: {install_line('web')}")
     given: dict[str, object] = {"trajectory": trajectory, "human": human or hands is not None, "seed": seed}
@@ -266,7 +266,7 @@ def demo(
         input_options=given,
         table=table,
         window=viewer,
-        page=(web_host, _PORT if web_port is None else web_port, None) if web else None,
+        page=(web_host, usual_port if web_port is None else web_port, None) if web else None,
         real_time=rt or plant == "fri",  # A cabinet does not wait for a late answer of a busy computer.
         tasks=chosen,
         steps=work.steps,

@@ -102,22 +102,31 @@ CAMERAS = ["above", "left_wrist", "right_wrist"]
 
 
 @pytest.mark.parametrize(
-    ("display", "viser", "shown"),
-    [(True, True, (True, None)), (False, True, (False, ("127.0.0.1", 0, None))), (False, False, (False, None))],
-    ids=["display", "no display", "neither"],
+    ("options", "display", "viser", "shown"),
+    [
+        pytest.param((), True, True, (True, None), id="display"),
+        pytest.param((), False, True, (False, ("127.0.0.1", 0, None)), id="no display"),
+        pytest.param((), False, False, (False, None), id="neither"),
+        pytest.param(("--web-port", "18082"), False, True, (False, ("127.0.0.1", 18082, None)), id="a port is given"),
+        pytest.param(("--web",), True, True, (False, ("127.0.0.1", 8080, None)), id="a page is asked for"),
+    ],
 )
 def test_a_demo_at_a_terminal_shows_the_arms_where_there_is_a_way_to(
-    monkeypatch: pytest.MonkeyPatch, display: bool, viser: bool, shown: tuple[bool, tuple[str, int, None] | None]
+    monkeypatch: pytest.MonkeyPatch,
+    options: tuple[str, ...],
+    display: bool,
+    viser: bool,
+    shown: tuple[bool, tuple[str, int, None] | None],
 ) -> None:
-    def run_cell(config: Config, options: RunOptions) -> None:
-        assert (options.window, options.page) == shown
+    def run_cell(config: Config, given: RunOptions) -> None:
+        assert (given.window, given.page) == shown
         raise Exit(7)
 
     monkeypatch.setattr(f"{MODULE}._shows_table", lambda headless, viewer: True)
     monkeypatch.setattr(f"{MODULE}.window_fault", lambda: None if display else "no display")
     monkeypatch.setattr(f"{MODULE}.find_spec", lambda name: viser or None)
     monkeypatch.setattr(f"{MODULE}.run_cell", run_cell)
-    result = q2r2("demo")
+    result = q2r2("demo", *options)
     assert result.exit_code == 7
     assert (install_line("web") in result.stderr) is (not (display or viser))
 
