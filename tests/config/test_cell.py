@@ -144,7 +144,7 @@ def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, va
         ("", "expected a mapping of keys such as name, arms"),
         ("- name\n- arms\n", "expected a mapping"),
         ("name: x\n", "arms: missing"),
-        ("name: x\narms:\n\tleft: {}\n", "not YAML: .*line 3"),
+        ("name: x\narms:\n\tleft: {}\n", "not YAML: .* in line 3, column 1$"),
         ("name: x\nname: y\n", "key 'name' is given twice .*line 2"),
         ("name: x\narms:\n  left: {model: a, model: b}\n", "key 'model' is given twice .*line 3"),
         ("name: x\narms: *nowhere\n", "undefined alias.*line 2, column 7"),

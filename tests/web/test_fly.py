@@ -67,7 +67,8 @@ LOOKS = """async ([events, looks, unsent = 0]) => {
     const held = [];
     for (let look = 0; look < looks; look++) {
         now += 20;
-        held.push(flying.read().left.buttons[1]);
+        const { left, right } = flying.read();
+        held.push(left.buttons[1] || right.buttons[1]);
         if (look >= unsent) flying.told();
     }
     flying.end();
@@ -120,4 +121,5 @@ def test_a_tap_between_two_messages_is_in_the_next_one_that_is_sent_unless_it_wa
     assert held(down, up, unsent=200) == 149  # for 3 s
     assert held(down, up, down, up) == 0
     assert held(down, up, ("blur", {})) == 0
+    assert held(down, up, ("keydown", {"code": "Digit2"})) == 0  # It was for the other hand.
     assert held(down, up, ("keydown", {"code": "KeyW", "ctrlKey": True})) == 0

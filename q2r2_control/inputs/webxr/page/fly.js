@@ -81,7 +81,16 @@ export class Flying {
     if (BUTTONS.includes(event.code) && !event.repeat) this.tap(event.code);
     // Only the last key repeats. The others move no more then, but a dead man among them holds while any key repeats.
     for (const code of BUTTONS) if (this.holds(code)) this.until.set(code, until);
-    this.hand = HANDS[event.code] ?? this.hand;
+    this.choose(HANDS[event.code] ?? this.hand);
+  }
+
+  /**
+   * Buttons that were tapped for one hand are not pressed for the other one.
+   * @param {string} hand
+   */
+  choose(hand) {
+    if (hand !== this.hand) this.taps.clear();
+    this.hand = hand;
   }
 
   /** @param {KeyboardEvent} event */
@@ -127,7 +136,7 @@ export class Flying {
     const pressed = (button) => Boolean(pad?.buttons[button].pressed);
     /** @param {string} code */
     const isDown = (code) => this.holds(code) || (this.taps.get(code) ?? 0) > now;
-    for (const [hand, bumper] of Object.entries(PAD.bumpers)) if (pressed(bumper)) this.hand = hand;
+    for (const [hand, bumper] of Object.entries(PAD.bumpers)) if (pressed(bumper)) this.choose(hand);
     const rates = [0, 0, 0, 0, 0, 0];
     for (const key in KEYS) if (this.holds(key)) rates[KEYS[key][0]] += KEYS[key][1];
     for (const [button, axis, sign] of PAD.tilt) if (pressed(button)) rates[axis] += sign;
