@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 # One call of pip at a time, also where make runs with -j.
 PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot lerobot-ros test-lerobot test-learning test-web web-setup chromium lint lint-page bench docs picture page-picture soak wheel release-check arena clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot lerobot-ros test-lerobot test-lerobot-ros test-learning test-web web-setup chromium lint lint-page bench docs picture page-picture soak wheel release-check arena clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed-dev
@@ -118,6 +118,9 @@ lerobot-ros: $(LEROBOT)/.installed-ros
 
 test-lerobot: lerobot
 	$(IN_LEROBOT) -m pytest tests/lerobot
+
+test-lerobot-ros: lerobot-ros
+	$(IN_LEROBOT) -m pytest tests/lerobot -k behind_ros
 
 # From scripted hands to a trained policy that grasps: some ten minutes where nothing else runs.
 test-learning: $(LEROBOT)/.installed

@@ -202,7 +202,12 @@ def export(
     anonymous: Anonymous = False,
     no_pictures: Annotated[bool, Option("--no-pictures", help="Leave out what cameras recorded.")] = False,
     ahead: Annotated[
-        int | None, Option(metavar="FRAMES", help="Actions of so many frames later in each row; 1 with hdf5, else 0.")
+        int | None,
+        Option(
+            metavar="FRAMES",
+            help="Put actions of so many frames later into each row; if not given, as the format has it: "
+            "1 with hdf5, 0 with lerobot and csv.",
+        ),
     ] = None,
 ) -> None:
     """Make a dataset to train on of recordings of q2r2 run --record, an episode each.

@@ -74,11 +74,7 @@ class RunDisplay:
     def _joints_of_tool(self, joints: Array) -> list[int]:
         """Return the last joint of an arm and all joints that it carries, such as fingers."""
         model = self._tree.model
-        carried = [model.getJointId(self._run.joint_names[joints[-1]])]
-        for joint in range(carried[0] + 1, model.njoints):
-            if model.parents[joint] in carried:
-                carried.append(joint)
-        return carried
+        return [int(joint) for joint in model.subtrees[model.getJointId(self._run.joint_names[joints[-1]])]]
 
     def message(self, shown: ShownTick) -> ShownState:
         """Return the message about one moment of the run."""

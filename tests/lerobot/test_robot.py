@@ -86,7 +86,7 @@ def test_arms_behind_cabinets_follow_actions_as_simulated_ones_do(tmp_path: Path
 
 
 def test_arms_behind_ros_follow_actions_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("rclpy", reason="ROS 2 cannot be installed for this Python")
+    pytest.importorskip("rclpy", reason="make test-lerobot-ros installs it")
     coordinator = pytest.importorskip("domain_coordinator")
     cell = write_cell(tmp_path, {"loop_rate_hz: auto": f"loop_rate_hz: {ROS_RATE}"})
     node = as_arguments(f"config:={cell}", f"rate:={ROS_RATE}")

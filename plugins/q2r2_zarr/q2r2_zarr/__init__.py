@@ -6,7 +6,6 @@ https://github.com/real-stanford/diffusion_policy, diffusion_policy/common/repla
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ def array_name(feature: str) -> str:
 
 def write_episode(episode: EpisodeVectors, path: Path) -> None:
     """Write one episode as a store of its own, at ``path``; what is there is removed."""
-    shutil.rmtree(path, ignore_errors=True)
+
     root = zarr.open_group(str(path), mode="w", zarr_format=_LAYOUT)
     root.attrs.update(
         {

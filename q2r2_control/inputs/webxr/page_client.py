@@ -17,7 +17,7 @@ from q2r2_control.inputs.webxr.shown import FromRun, ShownVibration
 from q2r2_control.types import HapticFeedback
 
 MAX_MESSAGES_PER_SECOND = 300  # Headsets send up to 120.
-_REQUESTS = 0.1  # Least time between two requests of a page. A stop is never refused [s].
+
 _LONGEST_REASON = 120  # Greatest length of the reason for which a socket is closed [bytes].
 
 
@@ -36,7 +36,7 @@ class PageClient(Peer):
         self.shown: Any = None
         self.picture: bytes | None = None
         self.driver: str | None = None  # The driver, if a page that watches has not been told yet.
-        self.rate, self.requests = RateLimit(MAX_MESSAGES_PER_SECOND), RateLimit(1, _REQUESTS)
+        self.rate = RateLimit(MAX_MESSAGES_PER_SECOND)
         self.reason = ""  # Why the server has closed the socket.
         self.closing: asyncio.Future[None] | None = None
 

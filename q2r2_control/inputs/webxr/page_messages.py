@@ -14,6 +14,7 @@ from q2r2_control.device_words import QUEST_WORDS
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.messages import HandMessage, HandPose, MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, Reception
+from q2r2_control.inputs.webxr.shown import Seven
 from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandFault, HandInputs
 
 LONGEST = 4096  # Greatest length of a message [bytes]. Those of the page have under 600.
@@ -35,7 +36,7 @@ class HeadsetRequest(StrEnum):
 
 
 _Hand = Literal["left", "right"]
-_Seven = tuple[float, float, float, float, float, float, float]
+
 _NO_POSE = HandPose(np.full(3, np.nan), np.full(4, np.nan), 0.0, "")
 _TOPICS = {(topic.hand, topic.kind): name for name, topic in HAND_TOPICS.items()}
 
@@ -48,7 +49,7 @@ class HeadsetHand(_PageModel):
     """One hand. Its numbers may have any value, also NaN, since the gate checks them as those of every headset."""
 
     # Position [m] and quaternion x y z w, in a frame with x forward, y left and z up; None if not known.
-    pose: _Seven | None
+    pose: Seven | None
     fault: Literal["hand_untracked", "hand_frame_moved"] | None = None
     buttons: tuple[bool, bool, bool] = (False, False, False)  # Upper, lower, pinch.
     axes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # Stick to the right and forward, index, middle.

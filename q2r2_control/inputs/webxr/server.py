@@ -180,9 +180,7 @@ class PageServer:
 
     def _ask(self, client: PageClient, request: HeadsetRequest | None) -> None:
         """Pass on the request of a button: a stop from every page, and any request from the page that drives."""
-        is_stop = request is HeadsetRequest.STOP
-        is_home = request is HeadsetRequest.HOME and client is self._driver and client.requests.take(self._clock())
-        if request is not None and (is_stop or is_home):
+        if request is HeadsetRequest.STOP or (request is not None and client is self._driver):
             self._answer(Requested(request))
 
     def _watch_with(self, client: PageClient) -> None:

@@ -148,9 +148,10 @@ class PageView(Page):
     @property
     def _driver(self) -> str:
         """The device that drives, in words; empty if the input does not know it."""
-        if self._nobody or not hasattr(self._source, "driver"):
+        driver = getattr(self._source, "driver", "")  # Another thread may change it.
+        if self._nobody or driver == "":
             return self._nobody
-        return "nobody drives" if self._source.driver is None else f"the headset at {self._source.driver} drives"
+        return "nobody drives" if driver is None else f"the headset at {driver} drives"
 
     def _do(self, answer: Any) -> None:
         """Obey an answer of the page. The thread of the answers calls this."""

@@ -6,8 +6,9 @@ const LONGEST = 0.05; // of a frame that a hand moves for [s]
 // A key counts for so long after it was pressed, and after each of its repeats: browsers do not always say that it is up.
 // Chromium on X begins to repeat after 660 ms, and goes on every 40 ms. A page that draws slowly hears it later.
 const [PRESSED, REPEATED] = [750, 600]; // [ms]
-// A button that was pressed between two messages is in the next one, also if it is up again. A later press is forgotten.
-const TAPPED = 3000; // [ms]
+// A button that was pressed between two messages is in the next one, also if it is up again. An arm whose hand is silent
+// for 150 ms stops. An older press is forgotten, because it would then engage the arm that it was to pause.
+const TAPPED = 140; // [ms]
 const DEAD = 0.12; // of a stick
 /** @type {Record<string, Seven>} */
 const START = { left: [0.3, 0.2, 1.1, 0, 0, 0, 1], right: [0.3, -0.2, 1.1, 0, 0, 0, 1] }; // x forward, y left, z up [m]
@@ -78,18 +79,20 @@ export class Flying {
     if (event.repeat && !this.holds(event.code)) return; // what has ended begins with a new press only
     const until = performance.now() + (event.repeat ? REPEATED : PRESSED);
     this.until.set(event.code, until);
-    if (BUTTONS.includes(event.code) && !event.repeat) this.tap(event.code);
+    if (BUTTONS.includes(event.code) && !event.repeat) this.taps.set(event.code, performance.now() + TAPPED);
     // Only the last key repeats. The others move no more then, but a dead man among them holds while any key repeats.
     for (const code of BUTTONS) if (this.holds(code)) this.until.set(code, until);
     this.choose(HANDS[event.code] ?? this.hand);
   }
 
   /**
-   * Buttons that were tapped for one hand are not pressed for the other one.
+   * Choose the hand that moves. A button that was pressed for one hand is not pressed for the other one.
    * @param {string} hand
    */
   choose(hand) {
-    if (hand !== this.hand) this.taps.clear();
+    if (hand === this.hand) return;
+    this.taps.clear();
+    for (const code of BUTTONS) this.until.delete(code);
     this.hand = hand;
   }
 
@@ -104,13 +107,6 @@ export class Flying {
     this.taps.clear();
   }
 
-  /**
-   * Two presses between two messages are none: the second one takes the first one back.
-   * @param {string} button
-   */
-  tap(button) {
-    if (!this.taps.delete(button)) this.taps.set(button, performance.now() + TAPPED);
-  }
 
   // The hands that were read last have been sent.
   told() {

@@ -16,7 +16,7 @@ const [DIM, BRIGHT, WARNING] = ["#9aa4ae", "#e8ecf0", "#ff7070"];
  * @param {string} text
  * @param {number} width
  */
-export function linesOf(context, text, width) {
+function linesOf(context, text, width) {
   /** @type {string[]} */
   const lines = [];
   for (const word of text.split(" ")) {
