@@ -18,7 +18,6 @@ from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.robot.unchecked import unchecked_faults
-from q2r2_control.viewer.joint_tree import JointTree
 from q2r2_control.viewer.shown_robot import ShownRobot
 
 
@@ -126,10 +125,11 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Config:
 
 @pytest.mark.parametrize("opening", [0.0, 0.4, 1.0])
 def test_a_fingertip_is_in_every_model_where_its_chain_of_mimics_puts_it(cell: Config, opening: float) -> None:
+    joint_tree = pytest.importorskip("q2r2_control.viewer.joint_tree", reason="needs trimesh", exc_type=ImportError)
     robot = Robot.from_config(cell)
     finger = 0.5 * opening
     expected_joints = {"left_finger": finger, "left_middle": -finger, "left_tip": -0.5 * finger + 0.1}
-    tree = JointTree(ShownRobot.of(robot, cell))
+    tree = joint_tree.JointTree(ShownRobot.of(robot, cell))
     q = tree.posture(robot.home, {"left": opening})
     for name, position in expected_joints.items():
         assert q[tree.model.joints[tree.model.getJointId(name)].idx_q] == pytest.approx(position)
