@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -362,8 +363,10 @@ class Pipeline(RequestedRun):
         braked, dt = (0.0, self.loop.pace(gap)) if self._sessions is None else self._sessions.due(now)
         began = time.perf_counter()
         samples = self._operator.poll(now) if self._following else []
-        state = self._state = self._turns.of_state(self.plant.state(), now)
-        seen, passed = self._plant_clock.stamped(state, now)
+        given = self.plant.state()
+        seen, passed = self._plant_clock.stamped(given, now)
+        seen = self._turns.of_state(seen)
+        state = self._state = replace(seen, stamp=given.stamp)
         lost = None if self._sessions is None else self._sessions.fault()
         self.loop.observe(seen, now, passed, lost)
         self._watch_skew(now)

@@ -23,28 +23,31 @@ class TurnCounter:
 
     def __init__(self, robot: Robot) -> None:
         joints = self._joints = np.flatnonzero(robot.endless)
-        self._half_turn_s = float((math.pi / robot.velocity_limit[joints]).min(initial=math.inf))
-        self._last: Array | None = None  # The last positions of these joints with their turns [rad].
-        self._at = -math.inf
+        self._half_turn_s = math.pi / robot.velocity_limit[joints]
+        self._last = np.zeros(len(joints))  # The last positions of these joints with their turns [rad].
+        self._at = np.full(len(joints), -math.inf)  # When each was measured [s].
 
-    def counted(self, q: Array, now: float) -> Array:
-        """Return the reported positions ``q`` (nv,) [rad] with the turns of continuous joints; ``now`` is the time [s].
+    def counted(self, q: Array, at: float | Array) -> Array:
+        """Return the reported positions ``q`` (nv,) [rad] with the turns of continuous joints.
 
-        Without a change ``q`` itself is returned. Positions that are not finite are not changed.
+        ``at`` is when they were measured [s]: one time, or one for each joint (nv,). Without a change ``q`` itself is
+        returned. Positions that are not finite are not changed.
         """
         if not len(self._joints) or not np.isfinite(given := q[self._joints]).all():
             return q
-        turns = np.zeros(len(given))
-        if self._last is not None and now - self._at < self._half_turn_s:
-            turns = np.rint((self._last - given) / _TURN)
-        self._last, self._at = given + _TURN * turns, now
+        at = np.broadcast_to(at, q.shape)[self._joints]
+        turns = np.where(at - self._at < self._half_turn_s, np.rint((self._last - given) / _TURN), 0.0)
+        self._last, self._at = given + _TURN * turns, at.copy()
         if not turns.any():
             return q
         q = q.copy()
         q[self._joints] = self._last
         return q
 
-    def of_state(self, state: RobotState, now: float) -> RobotState:
-        """Return the state with the positions of :meth:`counted`."""
-        q = self.counted(state.q, now)
-        return state if q is state.q else replace(state, q=q)
+    def of_state(self, state: RobotState) -> RobotState:
+        """Return the state with the positions of :meth:`counted`, and the held posture within half a turn of them."""
+        q, held = self.counted(state.q, state.stamp), state.held
+        if held is not None and len(joints := self._joints):
+            held = held.copy()
+            held[joints] += _TURN * np.rint((q[joints] - held[joints]) / _TURN)
+        return state if q is state.q and held is state.held else replace(state, q=q, held=held)

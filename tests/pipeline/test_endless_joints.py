@@ -39,3 +39,26 @@ def test_arms_follow_hands_across_the_angle_at_which_reports_begin_anew() -> Non
         assert arm.engaged_s > 1.0
         assert arm.position_error_mm_rms is not None
         assert arm.position_error_mm_rms < 10.0
+
+
+class TurnedPlant(KinematicPlant):
+    """Reports endless joints a turn lower than at first from the second report on."""
+
+    reports = 0
+
+    def state(self) -> RobotState:
+        self.reports += 1
+        state = super().state()
+        return replace(state, q=state.q - 2.0 * np.pi * self._robot.endless * (self.reports > 1))
+
+
+def test_a_turn_between_the_first_report_and_the_first_tick_is_counted_too() -> None:
+    config = load_config("config/dual_kinova.yaml").model_copy(update={"loop_rate_hz": 500.0})
+    robot = Robot.from_config(config)
+    plant = TurnedPlant(robot, config)
+    pipeline = Pipeline(config, robot, ScriptedInput.from_config(config, "circle"), plant)
+    measured: list[np.ndarray] = []
+    pipeline.listeners.append(lambda tick: measured.append(tick.state.q))
+    pipeline.run(0.01, realtime=False)
+    assert plant.reports > 1
+    np.testing.assert_allclose(measured[0], robot.home, atol=1e-9)

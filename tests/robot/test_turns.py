@@ -11,7 +11,7 @@ import pytest
 from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turns import TurnCounter
-from q2r2_control.types import Array
+from q2r2_control.types import Array, RobotState
 
 PERIOD = 0.01  # [s]
 
@@ -50,8 +50,35 @@ def test_a_joint_that_ends_is_never_turned(robot: Any) -> None:
 
 def test_after_a_gap_in_which_a_joint_may_have_turned_by_half_the_report_is_believed(robot: Any) -> None:
     counter = TurnCounter(robot)
+    counter.counted(np.array([3.1, 0.0, 3.1]), 0.0)
+    found = counter.counted(np.array([-3.1, 0.0, -3.1]), 0.8)
+    assert found[2] == -3.1, "at 4 rad/s half a turn takes 0.785 s"
+    assert found[0] == pytest.approx(2.0 * np.pi - 3.1), "at 2 rad/s it takes longer"
+
+
+def test_a_gap_of_one_joint_is_its_own(robot: Any) -> None:
+    counter = TurnCounter(robot)
+    counter.counted(np.array([3.1, 0.0, 3.1]), np.zeros(3))
+    for now in np.arange(PERIOD, 2.0, PERIOD):
+        counter.counted(np.array([3.1, 0.0, 3.1]), np.array([0.0, now, now]))
+    found = counter.counted(np.array([-3.1, 0.0, -3.1]), np.array([2.0, 2.0, 2.0]))
+    assert found[0] == -3.1, "silent for 2 s, in which this joint may have turned by more than half a turn"
+    assert found[2] == pytest.approx(2.0 * np.pi - 3.1)
+
+
+@pytest.mark.parametrize(("reported", "held"), [(-3.1, -3.08), (-3.1, 3.12), (3.12, -3.1)])
+def test_a_held_posture_is_as_near_to_the_measured_one_as_its_angle_allows(
+    robot: Any, reported: float, held: float
+) -> None:
+    counter, zero = TurnCounter(robot), np.zeros(3)
     counter.counted(np.array([3.1, 0.0, 0.0]), 0.0)
-    assert counter.counted(np.array([-3.1, 0.0, 0.0]), 0.8)[0] == -3.1, "at 4 rad/s half a turn takes 0.785 s"
+    state = RobotState(np.array([reported, 9.0, 0.0]), zero, zero, None, PERIOD, np.array([held, -9.0, 0.0]))
+    found = counter.of_state(state)
+    assert found.held is not None
+    assert found.q[0] == pytest.approx(reported % (2.0 * np.pi))
+    np.testing.assert_allclose(found.held, [held % (2.0 * np.pi), -9.0, 0.0])
+    assert state.held is not None
+    assert state.held[0] == held, "the plant's own array is not written to"
 
 
 def test_a_report_without_a_number_is_left_for_others_to_judge_and_forgets_nothing(robot: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import Robot
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from tests.ros.conftest import need_ros
@@ -149,6 +151,38 @@ def test_joint_states_of_an_arm_each_are_merged_and_need_all_joints(context: Any
     for _ in range(2):
         part("left")
     assert taken[-2].stamp == taken[-1].stamp > state.stamp  # as old as the joint that was measured longest ago
+    node.destroy_node()
+
+
+def test_turns_of_endless_joints_are_counted_for_each_arm_s_topic_on_its_own(
+    context: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Robot.from_config(load_config("config/dual_kinova.yaml"))
+    given = as_arguments(*(f"{arm}.joint_states_topic:=/{arm}/joint_states" for arm in robot.arms))
+    node, clock = BaseNode("intake", context=context, cli_args=given), SimpleNamespace(now=100.0)
+    monkeypatch.setattr(BaseNode, "now", property(lambda self: clock.now))
+    intake = JointIntake(node, robot)
+    taken: list[Any] = []
+    intake.subscribe(lambda state, now: taken.append(state), lambda message: None)
+    q, joint = robot.home.copy(), robot.joint_names.index("right_j2s6s200_joint_1")
+
+    def report(arm: str, angle: float, after: float = 0.01) -> None:
+        q[joint], clock.now = angle, clock.now + after
+        joints = [(name, at) for name, at in zip(robot.joint_names, q, strict=True) if name.startswith(arm)]
+        names, values = zip(*joints, strict=True)
+        Arrivals(node, f"/{arm}/joint_states").arrive(JointState(name=list(names), position=list(values)))
+
+    for arm in ("right", "left", "right"):
+        report(arm, 6.0)  # Of a driver that counts turns itself.
+    assert taken[-1].q[joint] == 6.0, "what was not measured before says nothing about turns"
+    report("right", 3.1, after=5.0)
+    report("right", -3.1)
+    assert taken[-1].q[joint] == pytest.approx(2.0 * np.pi - 3.1)
+    report("right", 3.1, after=5.0)
+    for _ in range(500):
+        report("left", 3.1)
+    report("right", -3.1)
+    assert taken[-1].q[joint] == -3.1, "this topic was silent for 5 s, while the other one was not"
     node.destroy_node()
 
 

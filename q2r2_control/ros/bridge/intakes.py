@@ -264,10 +264,10 @@ class JointIntake:
             take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=self._on_topic(topic, text)), now)
             return
         oldest = float(self._stamps.min())
-        q, v, tau = self._values.copy()
-        q = self._turns.counted(q, now)
         if oldest == -math.inf:
             return
+        q, v, tau = self._values.copy()
+        q = self._turns.counted(q, self._stamps)
         silent = now - self._external_stamp > STREAM_TIMEOUT
         external = None if silent else self._external
         self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest, held=self.driver_held(q))
