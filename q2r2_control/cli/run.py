@@ -123,9 +123,9 @@ def run(
     A cell in which q2r2 check finds a fault is refused with the same line and exit code 2, unless --force is given.
     One with real cabinets that is not commissioned is refused too, unless --i-know is given. Its joints go at a tenth
     of their speed until --full-speed is given.
-    Exit 1 where a tool is more than 100 mm from its reference at the end, where an arm refused every press that
-    engages it, and where measured links met in torque mode. Exit 3 where all that went well, and the recording ended
-    before the run did: a full disk, a writer that was killed.
+    Exit 1 where a tool is more than 100 mm from its reference at the end, an arm refused every press that engages it,
+    measured links met in torque mode, a tick had no certificate, or an arm still moves at the end. Exit 3 where all
+    that went well, and the recording ended before the run did: a full disk, a writer that was killed.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
     cell = with_solver(load_config(config), solver)
@@ -170,7 +170,7 @@ def run(
     )
     done = run_cell(cell, options)
     print_summary(done, json, verbose)
-    if not done.summary.followed or (done.summary.torque is not None and done.summary.torque.met):
+    if done.summary.broken:
         raise Exit(1)
     if not done.was_recorded:
         raise Exit(NOT_RECORDED)

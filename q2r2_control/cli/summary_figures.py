@@ -20,9 +20,9 @@ def verdict_line(summary: RunSummary, failed: Iterable[str] = ()) -> str:
 
     ``failed`` names further failures, such as tasks.
     """
-    wrong = [*_broken(summary), *failed]
+    wrong = [*summary.broken, *failed]
     if wrong:
-        return f"[red]not as it should be[/]: {'; '.join(wrong)}"
+        return f"[red]not as it should be[/]: {escape('; '.join(wrong))}"
     if stops := _last_faults(summary):
         told = (f"{name} arm {escape(sentence(event.reason))}" for name, event in stops.items())
         return f"[yellow]an arm was stopped or refused[/]: {'; '.join(told)}"
@@ -31,19 +31,6 @@ def verdict_line(summary: RunSummary, failed: Iterable[str] = ()) -> str:
     if not moved:
         return f"[yellow]no arm was engaged[/]: {kept}"
     return f"[green]as it should be[/]: {' and '.join(moved)} followed, {kept}"
-
-
-def _broken(summary: RunSummary) -> Iterator[str]:
-    """Yield the promises that were not kept, in words."""
-    for name, arm in summary.arms.items():
-        if not arm.followed:
-            yield f"{name} arm is {arm.end_error_mm:.0f} mm from its reference at the end"
-    if summary.torque is not None and summary.torque.met:
-        yield "measured links met"
-    if summary.uncertified_ticks:
-        yield f"{summary.uncertified_ticks} ticks without a certificate"
-    if not summary.at_rest:
-        yield "arms move at the end"
 
 
 def _last_faults(summary: RunSummary) -> dict[str, Event]:

@@ -128,22 +128,11 @@ def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[fl
 
 
 def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
-    """Return the ``results``, but all failed if links met, if a stop was not certified or if a tool did not follow."""
-    faults, torque = [], summary.torque
-    if torque is not None and torque.met and torque.measured_closest_pair:
-        met = " and ".join(torque.measured_closest_pair)
-        faults.append(f"measured {met} met: {torque.min_measured_distance_mm:.1f} mm, {torque.max_wall_force_n:.0f} N")
-    if summary.uncertified_ticks:
-        faults.append(f"{summary.uncertified_ticks} ticks without a certified stop")
-    faults += [
-        f"{name} tool {arm.end_error_mm:.0f} mm from its reference at the end"
-        for name, arm in summary.arms.items()
-        if not arm.followed
-    ]
+    """Return the ``results``, but all failed if the run broke a promise."""
     results = tuple(results)
-    if not faults:
+    if not summary.broken:
         return results
-    reasons = ("; ".join(filter(None, (result.reason, *faults))) for result in results)
+    reasons = ("; ".join(filter(None, (result.reason, *summary.broken))) for result in results)
     return tuple(replace(one, succeeded=False, reason=why) for one, why in zip(results, reasons, strict=True))
 
 

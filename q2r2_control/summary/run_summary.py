@@ -152,10 +152,23 @@ class RunSummary:
     events: list[Event]
 
     @property
-    def followed(self) -> bool:
-        """Whether every tool was where it should be at the end, and every arm that was to be engaged could be."""
-        refused = {event.arm for event in self.events if event.kind is ReasonKind.NOT_ENGAGED}
-        return all(arm.followed and (arm.engaged_s or name not in refused) for name, arm in self.arms.items())
+    def broken(self) -> tuple[str, ...]:
+        """What was not as promised, in words: a run with any of it ends with exit code 1."""
+        refusals = {event.arm: event.reason for event in self.events if event.kind is ReasonKind.NOT_ENGAGED}
+        broken = []
+        for name, arm in self.arms.items():
+            if not arm.followed:
+                broken.append(f"{name} arm is {arm.end_error_mm:.0f} mm from its reference at the end")
+            if name in refusals and not arm.engaged_s:
+                broken.append(f"{name} arm {sentence(refusals[name])}, at every press")
+        if self.torque is not None and self.torque.met:
+            met = " and ".join(self.torque.measured_closest_pair or ())
+            broken.append(f"measured {met} met: {self.torque.min_measured_distance_mm:.1f} mm")
+        if self.uncertified_ticks:
+            broken.append(f"{self.uncertified_ticks} ticks without a certificate")
+        if not self.at_rest:
+            broken.append("arms move at the end")
+        return tuple(broken)
 
     def as_json(self) -> dict[str, Any]:
         data = asdict(self)

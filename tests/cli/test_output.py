@@ -82,6 +82,17 @@ def test_the_verdict_says_what_is_wrong_or_that_nothing_is(summary: RunSummary) 
     )
 
 
+def test_an_arm_that_refused_every_press_is_not_as_it_should_be(summary: RunSummary) -> None:
+    refused = Event(
+        6.0, "left", "paused", "paused", Reason(ReasonKind.NOT_ENGAGED, cause=Reason(ReasonKind.TOOL_UNKNOWN))
+    )
+    arms = {name: replace(arm, engaged_s=0.0) for name, arm in summary.arms.items()}
+    never = replace(summary, events=[refused], arms=arms)
+    assert never.broken == (f"left arm {sentence(refused.reason)}, at every press",)
+    engaged_later = arms | {"left": replace(arms["left"], engaged_s=0.4)}
+    assert replace(never, arms=engaged_later).broken == ()
+
+
 def test_what_is_printed_of_a_run_begins_with_its_verdict_and_those_on_its_tasks(
     summary: RunSummary, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -162,12 +173,12 @@ def test_no_task_succeeds_while_measured_links_met_no_stop_was_certified_or_a_to
     assert held_to_promises([done], replace(summary, torque=torque)) == (done,)
     met = replace(summary, torque=replace(torque, min_measured_distance_mm=-6.9))
     (failed,) = held_to_promises([done], met)
-    assert (failed.succeeded, failed.reason) == (False, f"measured {pair[0]} and {pair[1]} met: -6.9 mm, 364 N")
+    assert (failed.succeeded, failed.reason) == (False, f"measured {pair[0]} and {pair[1]} met: -6.9 mm")
     assert "measured links met: -6.9 mm, left_link_6_0 | right_link_6_0; what was measured broke" in text_of(met)
     away = replace(summary, arms=summary.arms | {"left": replace(summary.arms["left"], end_error_mm=256.4)})
-    assert held_to_promises([done], away)[0].reason == "left tool 256 mm from its reference at the end"
+    assert held_to_promises([done], away)[0].reason == "left arm is 256 mm from its reference at the end"
     (failed,) = held_to_promises([TaskResult("stack", False, {}, "fell")], replace(summary, uncertified_ticks=3))
-    assert failed.reason == "fell; 3 ticks without a certified stop"
+    assert failed.reason == "fell; 3 ticks without a certificate"
 
 
 def test_a_tool_that_did_not_follow_is_said(summary: RunSummary) -> None:

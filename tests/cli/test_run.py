@@ -7,13 +7,15 @@ import os
 import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer import Exit
 
-from q2r2_control.cli.cell_run import RunOptions
+from q2r2_control.cli.cell_run import CellRun, RunOptions, run_cell
 from q2r2_control.config.cell import Config, load_config, parse_config
 from q2r2_control.extras import install_line
 from q2r2_control.recording.about import About
@@ -37,7 +39,7 @@ def test_what_check_refuses_is_refused_in_one_line_that_says_the_same(tmp_path: 
 def test_with_force_it_says_what_is_wrong_and_runs(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "0.0204, 0.348,", "0.0204, 2.09,")
     result = q2r2("run", file, *OPTIONS, "--force")
-    assert result.exit_code == 0
+    assert result.exit_code == 1, "no stop can be proven where links are in the floor"
     assert "FAULT home: left_A2 = 2.09" in result.stderr
     assert one_object(result.stdout)["ticks"] > 0
 
@@ -55,6 +57,23 @@ def test_an_arm_that_begins_in_the_table_ends_with_exit_code_1(tmp_path: Path, m
     result = q2r2("run", file, "--mode", mode, "--fast", "--headless", "--duration", "0.1", "--force")
     assert result.exit_code == 1
     assert said in " ".join(result.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("change", "code"), [({}, 0), ({"uncertified_ticks": 3}, 1), ({"at_rest": False}, 1)], ids=["none", "proof", "rest"]
+)
+def test_the_exit_code_says_what_the_verdict_says(
+    monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], code: int
+) -> None:
+    def as_if(*given: Any) -> CellRun:
+        done = run_cell(*given)
+        return replace(done, summary=replace(done.summary, **change))
+
+    monkeypatch.setattr(f"{MODULE}.run_cell", as_if)
+    result = q2r2("run", CELL, *OPTIONS[:-1], "0.01")
+    assert result.exit_code == code
+    data = one_object(result.stdout)
+    assert {name: data[name] for name in change} == change
 
 
 @pytest.mark.parametrize("command", [("run", CELL, *OPTIONS), ("demo", "--fast", "--headless")])

@@ -60,7 +60,7 @@ def test_a_run_waits_for_the_cabinets_and_refuses_presses_until_then(config: Con
     pipeline.listeners.append(lambda tick: told.update(tick.sessions))
     summary = pipeline.run(1.0, realtime=False)
     events = summary.events
-    assert not summary.followed
+    assert summary.broken
     assert told == dict.fromkeys(SIDES, "monitoring ready, connection excellent, drives off")
     assert {event.reason.root.kind for event in events} == {ReasonKind.FRI_SESSION}
     assert {event.kind for event in events} == {ReasonKind.NOT_ENGAGED}
