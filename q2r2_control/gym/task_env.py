@@ -26,6 +26,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plants.mujoco_cameras import CellPictures
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.unchecked import check_watched
 from q2r2_control.types import Array, is_number
 
 CELL = "config/dual_iiwa7.yaml"
@@ -86,6 +87,7 @@ class TaskEnv(gymnasium.Env):
         self.tasks = tasks_named([task])
         self.task = self.tasks[0].about
         self._robot = Robot.from_config(config)
+        check_watched(self._robot, config.name)
         self._plant = MujocoPlant(self._robot, config)
         self._policy = PolicyInput(space=space, rate=rate)
         self._pipeline = Pipeline(config, self._robot, self._policy, self._plant)

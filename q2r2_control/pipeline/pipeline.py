@@ -33,6 +33,7 @@ from q2r2_control.plants.base import Plant, SessionPlant, check_mode, check_stat
 from q2r2_control.process.scheduling import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turns import TurnCounter
+from q2r2_control.robot.unchecked import check_watched
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import RunStart, Tick
 from q2r2_control.supervision.joint_watch import watch_settings
@@ -140,8 +141,10 @@ class Pipeline(RequestedRun):
         Raises:
             ConfigError: If a name is not known, if the plant lacks the mode, or if the input lacks a control that is
                 bound.
+            RobotError: If a link is not watched, and the cell does not name it in ``unchecked_links``.
         """
         robot = Robot.from_config(config)
+        check_watched(robot, config.name)
         source = make_input(config.input if input is None else input, config)
         moves = make_plant(config.plant if plant is None else plant, robot, config)
         return cls(config, robot, source, moves, mode, solver=solver, tasks=tasks, constraints=constraints)

@@ -27,6 +27,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
 from q2r2_control.process.scheduling import real_time, stop_on_signals
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.unchecked import check_watched
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.types import SIDES, Array, HandInputs
@@ -88,6 +89,7 @@ class SlowRun:
         teleop = TeleopSettings(bindings=BindingSettings(lower=Action.NONE, grip=Action.DEAD_MAN))
         slow = config.model_copy(update={"control": control, "teleop": teleop})
         self.robot = Robot.from_config(slow)
+        check_watched(self.robot, config.name)
         self._hands = _Hands()
         self._pipeline = Pipeline(slow, self.robot, self._hands, plant(self.robot, slow))
         self._pipeline.listeners.append(self._look)

@@ -18,13 +18,10 @@ from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.followers import narrow_limits
 from q2r2_control.robot.packages import expand_xacro, package_file
 from q2r2_control.robot.urdf_forms import notes_on, scale_to_metres, unify
-from q2r2_control.robot.urdf_parts import ATTRIBUTES
+from q2r2_control.robot.urdf_parts import ATTRIBUTES, CONTINUOUS_RANGE
 
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
 MJCF_ENDS = (".xml", ".mjcf")
-
-# Range of a joint without limits: two turns each way.
-CONTINUOUS_RANGE = 4 * math.pi
 
 _JOINT_TYPES = ("fixed", "revolute", "prismatic", "continuous", "planar", "floating")
 _SHAPES = ("box", "cylinder", "sphere", "mesh")

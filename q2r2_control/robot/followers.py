@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from q2r2_control.errors import RobotError
-from q2r2_control.robot.urdf_parts import mimic_of
+from q2r2_control.robot.urdf_parts import CONTINUOUS_RANGE, mimic_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,8 @@ def with_followers(positions: Mapping[str, float], followers: Mapping[str, Follo
 def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
     """Narrow the limits of drivers in place, so that all followers stay within their own limits.
 
-    A follower without limits, and one that does not move, has no effect. A follower whose limits have the wrong sign,
-    as in models of mirrored fingers, gets the range in which it follows.
+    A follower without limits, one that turns on for ever, and one that does not move, has no effect. A follower whose
+    limits have the wrong sign, as in models of mirrored fingers, gets the range in which it follows.
 
     Raises:
         RobotError: With a text that begins with ``where``, as :func:`followers_of`, or if a follower leaves its driver
@@ -79,19 +79,21 @@ def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
             continue
         lower, upper = (float(own.get(end, "0")) for end in ("lower", "upper"))
         least, most = (float(driver.get(end, "0")) for end in ("lower", "upper"))
-        if not (lower < upper and least < most):
+        if not (lower < upper and least < most) or (lower <= -CONTINUOUS_RANGE and upper >= CONTINUOUS_RANGE):
             continue
         first, last = sorted((end - follower.offset) / follower.multiplier for end in (lower, upper))
         low, high = max(least, first), min(most, last)
-        if not low < high:  # The follower moves the other way.
+        mirrored = not low < high  # The follower moves the other way.
+        if mirrored:
             first, last = sorted((-end - follower.offset) / follower.multiplier for end in (lower, upper))
             low, high = max(least, first), min(most, last)
-            lower, upper = sorted(map(follower.at, (low, high)))
-            own.set("lower", repr(lower))
-            own.set("upper", repr(upper))
         if not low < high:
             follows = f"joint {name}, at {lower:g} .. {upper:g}, follows {follower.driver}, at {least:g} .. {most:g}"
             by = f"by {follower.multiplier:g} times it and {follower.offset:g}"
             raise RobotError(f"{where}{follows}, {by}, which leaves no way; allowed: limits that meet")
+        if mirrored:
+            lower, upper = sorted(map(follower.at, (low, high)))
+            own.set("lower", repr(lower))
+            own.set("upper", repr(upper))
         driver.set("lower", repr(low))
         driver.set("upper", repr(high))

@@ -19,7 +19,7 @@ from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.cell_parts import check_position
 from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.compose import compose
-from q2r2_control.robot.description import CONTINUOUS_RANGE, LinkTree, joint_limits, parse_srdf, parse_urdf
+from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.finger_bodies import sweep_fingers
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
@@ -38,8 +38,8 @@ from q2r2_control.robot.pairs import (
 )
 from q2r2_control.robot.pinocchio_models import build_models, checked_chain
 from q2r2_control.robot.turning_fingers import TurningBody
-from q2r2_control.robot.unchecked import unchecked_faults
-from q2r2_control.robot.urdf_parts import acceleration_limit
+from q2r2_control.robot.unchecked import check_watched
+from q2r2_control.robot.urdf_parts import CONTINUOUS_RANGE, acceleration_limit
 from q2r2_control.types import Array
 
 _logger = logging.getLogger(__name__)
@@ -202,8 +202,7 @@ class Robot:
         positions = _home_of(urdf, home or {}, where)
         check_kind("unchecked_links", unchecked_links, (list, tuple, set, frozenset), "names of links", RobotError)
         robot = cls(urdf, exclusions, dict(arms), positions, where, unchecked_links=unchecked_links)
-        if faults := unchecked_faults(robot, in_cell=False):
-            raise RobotError(f"{where}: {'; '.join(faults)}")
+        check_watched(robot, where, in_cell=False)
         if (warning := warning_at_home(robot, exclusions, positions)) is not None:
             _logger.warning(warning)
         return robot

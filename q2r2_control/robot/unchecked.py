@@ -1,6 +1,7 @@
 """Find links that move with an arm and have no collision shape, so that nothing keeps them apart from other bodies.
 
-A certificate says nothing about such a link. A robot with such a link is refused, unless its cell names the link.
+A certificate says nothing about such a link. Whatever commands arms refuses a robot with such a link by
+:func:`check_watched`, unless its cell names the link.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from q2r2_control.errors import RobotError
 from q2r2_control.robot.description import LinkTree
 
 if TYPE_CHECKING:
@@ -97,11 +99,24 @@ def unchecked_faults(robot: Robot, in_cell: bool = True) -> list[str]:
     return faults + [link.fault(in_cell) for link in unchecked]
 
 
+def check_watched(robot: Robot, where: str, in_cell: bool = True) -> None:
+    """Raise :class:`RobotError` with ``where`` and all lines of :func:`unchecked_faults`, if there are any."""
+    if faults := unchecked_faults(robot, in_cell):
+        raise RobotError(f"{where}: {'; '.join(faults)}")
+
+
 def unchecked_notes(robot: Robot) -> Iterator[str]:
     """Yield lines about links that are not watched, because the cell names them or because they are light."""
-    if robot.unchecked_links:
-        yield f"unchecked_links: nothing keeps {', '.join(robot.unchecked_links)} off anything"
-    if frames := [link.name for link in moving_links(robot) if link.drawn and not link.is_body]:
+    moving = moving_links(robot)
+    at_home = [link.name for link in moving if link.name in robot.unchecked_links and link.shaped and link.follows]
+    watched = [link.name for link in moving if link.name in robot.unchecked_links and link.shaped and not link.follows]
+    if alone := [name for name in robot.unchecked_links if name not in (*at_home, *watched)]:
+        yield f"unchecked_links: nothing keeps {', '.join(alone)} off anything"
+    if at_home:
+        yield f"unchecked_links: watched only where they are at home: {', '.join(at_home)}"
+    if watched:
+        yield f"unchecked_links: watched all the same, since they have collision shapes: {', '.join(watched)}"
+    if frames := [link.name for link in moving if link.drawn and not link.is_body]:
         lighter = f"drawn, without a collision shape, and lighter than {1e3 * LIGHTEST_BODY:g} g"
         yield f"not watched, since taken for frames ({lighter}): {', '.join(frames)}"
 

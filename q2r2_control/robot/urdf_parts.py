@@ -13,6 +13,9 @@ from q2r2_control.config.cell import ObstacleConfig
 
 WORLD = "world"  # root link of every cell
 
+# Range of a joint without limits: two turns each way.
+CONTINUOUS_RANGE = 4 * math.pi
+
 # Elements that name links or joints, and the attribute that does.
 _NAMING = {"parent": "link", "child": "link", "mimic": "joint"}
 

@@ -17,7 +17,7 @@ from q2r2_control.robot.followers import Follower, followers_of, with_followers
 from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import TurningBody
-from q2r2_control.robot.unchecked import unchecked_faults
+from q2r2_control.robot.unchecked import unchecked_faults, unchecked_notes
 from q2r2_control.viewer.shown_robot import ShownRobot
 
 
@@ -75,7 +75,11 @@ def test_a_fixed_joint_follows_none() -> None:
         pytest.param(
             (joint("a", "b 1 0"), joint("b", "c 1 0"), joint("c", "b 1 0")), "joint b mimics c mimics b", id="a circle"
         ),
-        pytest.param((joint("b", "a 1 5"), joint("a")), "which leaves no way; allowed: limits that meet", id="no way"),
+        pytest.param(
+            (joint("b", "a 1 5"), joint("a")),
+            "joint b, at 0 .. 1, follows a, at 0 .. 1, by 1 times it and 5, which leaves no way",
+            id="no way",
+        ),
     ],
 )
 def test_what_no_joint_can_follow_is_refused_by_name(joints: tuple[str, ...], complaint: str) -> None:
@@ -103,6 +107,18 @@ def test_a_driver_goes_no_farther_than_its_follower(follower: str, limits: tuple
     for name, one in followers_of(root.findall("joint")).items():
         for end in found["a"]:
             assert found[name][0] - 1e-9 <= one.at(end) <= found[name][1] + 1e-9
+
+
+ROTOR = '<joint name="b" type="continuous"><parent link="base"/><child link="b_link"/><axis xyz="0 0 1"/>{}</joint>'
+
+
+@pytest.mark.parametrize("multiplier", [100.0, -2.0])
+def test_a_follower_that_turns_on_for_ever_leaves_its_driver_all_its_range(multiplier: float) -> None:
+    follower = ROTOR.format(f'<mimic joint="a" multiplier="{multiplier}"/>')
+    text = ET.tostring(parse_urdf(model(joint("a", limit="-2.9 2.9"), follower), "arm.urdf"))
+    for root in (ET.fromstring(text), parse_urdf(text, "written again")):
+        (driver,) = (one for one in root.findall("joint") if one.get("name") == "a")
+        assert joint_limits(driver) == (-2.9, 2.9)
 
 
 HAND = (
@@ -167,5 +183,8 @@ def test_a_bar_that_follows_an_arm_s_joint_is_refused_unless_it_is_named(
     }
     (file := tmp_path_factory.mktemp("bar") / "arm.urdf").write_text(urdf)
     arm = {"model": str(file), "tip": "j3_link", "home": [0.3, 0.4, 0.5]}
-    (fault,) = unchecked_faults(Robot.from_config(Config.model_validate({"name": "cell", "arms": {"left": arm}})))
+    cell = {"name": "cell", "arms": {"left": arm}}
+    (fault,) = unchecked_faults(Robot.from_config(Config.model_validate(cell)))
     assert fault.startswith("left_bar_link: follows left_j2")
+    named = Robot.from_config(Config.model_validate(cell | {"unchecked_links": ["left_bar_link"]}))
+    assert list(unchecked_notes(named)) == ["unchecked_links: watched only where they are at home: left_bar_link"]

@@ -9,10 +9,13 @@ import pytest
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import RobotError
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.pipeline.slow_run import SlowRun
+from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.description import load_description
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
-from q2r2_control.robot.unchecked import unchecked_faults, unchecked_notes
+from q2r2_control.robot.unchecked import check_watched, unchecked_faults, unchecked_notes
 from q2r2_control.supervision.homing import preflight_faults
 from tests.robot.conftest import one_arm
 
@@ -128,6 +131,22 @@ def test_a_cell_names_links_or_encloses_their_drawings() -> None:
     robot = Robot.from_config(z1(capsules={"left_link05": 1}, unchecked_links=["left_link01"]))
     assert unchecked_faults(robot) == []
     assert list(unchecked_notes(robot)) == ["unchecked_links: nothing keeps left_link01 off anything"]
+    check_watched(robot, "cell")
     watched = {link_of(name) for pair in pair_names(robot.collision_model) for name in pair}
     assert "left_link05" in watched
     assert "left_link01" not in watched
+
+
+def test_what_commands_arms_refuses_them_with_the_line_of_check() -> None:
+    lines = "; ".join(unchecked_faults(Robot.from_config(z1())))
+    with pytest.raises(RobotError, match=re.escape(f"{z1().name}: {lines}")):
+        Pipeline.from_config(z1(), input="scripted", plant="kinematic")
+    with pytest.raises(RobotError, match=re.escape(lines)):
+        SlowRun(z1(), KinematicPlant)
+
+
+def test_a_named_link_with_a_shape_is_told_to_be_watched() -> None:
+    robot = Robot.from_urdf(arm(), {"left": "l5"}, unchecked_links=["l3"])
+    assert list(unchecked_notes(robot)) == [
+        "unchecked_links: watched all the same, since they have collision shapes: l3"
+    ]

@@ -22,6 +22,7 @@ from q2r2_control.drives.base import TorqueDrive, permitted
 from q2r2_control.events import ROUTINE, Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.unchecked import check_watched
 from q2r2_control.ros.base_node import ERROR, OK, WARN, ManagedNode
 from q2r2_control.ros.bridge.controller_feedback import GRIPPER_DELAY, ControllerFeedback, GripperLimits
 from q2r2_control.ros.bridge.intakes import COMMAND_TIME, JointIntake, TargetIntake
@@ -64,6 +65,7 @@ class CartesianControllerNode(ManagedNode):
         if self._only_leads:
             config = settings_for_external_arms(config)
         robot = Robot.from_config(config)
+        check_watched(robot, config.name)
         self._period = 1.0 / rate
         self._output = make_output(output, self, robot, config, self._period)
         self._targets = TargetIntake(self, robot, self.report_health)
