@@ -6,11 +6,7 @@ from collections.abc import Sequence
 
 
 class Q2R2Error(Exception):
-    """Base class of all errors that q2r2_control raises on purpose."""
-
-
-class ConfigError(Q2R2Error):
-    """A configuration cannot be used. The message names file, key and value, and says what is allowed.
+    """Base class of all errors that q2r2_control raises on purpose.
 
     Attributes:
         faults: A line for each fault if they are known; otherwise the message alone.
@@ -19,6 +15,10 @@ class ConfigError(Q2R2Error):
     def __init__(self, message: str, faults: Sequence[str] = ()) -> None:
         super().__init__(message)
         self.faults = tuple(faults) or (message,)
+
+
+class ConfigError(Q2R2Error):
+    """A configuration cannot be used. The message names file, key and value, and says what is allowed."""
 
     def at(self, where: str) -> ConfigError:
         """Return the same error with ``where`` at the beginning of each line."""

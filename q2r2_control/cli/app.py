@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from q2r2_control.cli.commands import COMMANDS, CommandOnDemand
-from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.errors import Q2R2Error
 
 # Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of either.
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
@@ -47,10 +47,8 @@ class ErrorHandlingGroup(TyperGroup):
             sys.exit(code if isinstance(code, int) else 0)
         except (KeyboardInterrupt, typer.Abort):
             sys.exit(130)
-        except ConfigError as error:
-            messages = error.faults
         except Q2R2Error as error:
-            messages = (str(error),)
+            messages = error.faults
         except _BadUsage as error:
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "q2r2"

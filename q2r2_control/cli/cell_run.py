@@ -194,7 +194,9 @@ def _run_pipeline(
 ) -> CellRun:
     config, source = pipeline.config, pipeline.input
     if faults and not options.force:
-        raise ConfigError(f"{config.name}: {'; '.join(faults)}; --force runs it all the same")
+        allowed = "--force runs it all the same"
+        lines = [f"{config.name}: {fault}" for fault in faults]
+        raise ConfigError(f"{config.name}: {'; '.join(faults)}; {allowed}", [*lines, f"{config.name}: {allowed}"])
     for fault in faults:
         say(f"FAULT {fault}", console, "red")
     if config.note_on_grippers is not None:

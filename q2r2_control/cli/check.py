@@ -89,11 +89,10 @@ def _verdict_on_refusal(file: str, json: bool) -> Iterator[None]:
     try:
         yield
     except Q2R2Error as error:
-        faults = error.faults if isinstance(error, ConfigError) else (str(error),)
-        for fault in faults:
+        for fault in error.faults:
             say(f"q2r2: {fault}")
-        verdict = verdict_on(faults)
-        print(as_json_text({"file": file, "faults": faults, "verdict": verdict}) if json else verdict)
+        verdict = verdict_on(error.faults)
+        print(as_json_text({"file": file, "faults": error.faults, "verdict": verdict}) if json else verdict)
         raise Exit(2) from error
 
 

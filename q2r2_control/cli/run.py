@@ -120,7 +120,7 @@ def run(
 ) -> None:
     """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
 
-    A cell in which q2r2 check finds a fault is refused with the same line and exit code 2, unless --force is given.
+    A cell in which q2r2 check finds a fault is refused with the same lines and exit code 2, unless --force is given.
     One with real cabinets that is not commissioned is refused too, unless --i-know is given. Its joints go at a tenth
     of their speed until --full-speed is given.
     Exit 1 where a tool is more than 100 mm from its reference at the end, an arm refused every press that engages it,

@@ -102,7 +102,7 @@ def unchecked_faults(robot: Robot, in_cell: bool = True) -> list[str]:
 def check_watched(robot: Robot, where: str, in_cell: bool = True) -> None:
     """Raise :class:`RobotError` with ``where`` and all lines of :func:`unchecked_faults`, if there are any."""
     if faults := unchecked_faults(robot, in_cell):
-        raise RobotError(f"{where}: {'; '.join(faults)}")
+        raise RobotError(f"{where}: {'; '.join(faults)}", [f"{where}: {fault}" for fault in faults])
 
 
 def unchecked_notes(robot: Robot) -> Iterator[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +14,7 @@ import pytest
 
 from q2r2_control import Robot
 from q2r2_control.config.cell import load_config
-from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from tests.ros.conftest import need_ros
 
@@ -32,7 +31,6 @@ from q2r2_control.ros.bridge.arm_outputs import FollowWatch
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.messages import pose_of, robot_state, stamped_pose
 from q2r2_control.ros.nodes.arm_controllers import LeftArmController
-from q2r2_control.ros.nodes.cartesian_controller import CartesianControllerNode
 from q2r2_control.ros.nodes.mujoco_robot import MujocoRobot
 from q2r2_control.types import RobotState
 from q2r2_control.wording import sentence
@@ -128,19 +126,6 @@ def test_a_late_command_does_not_move_the_simulated_robot_and_is_reported(defaul
     assert node.health()[2]["refused_commands"] == 1
     node.close()
     node.destroy_node()
-
-
-def test_a_controller_refuses_an_arm_with_a_link_that_nothing_watches(domain: int, tmp_path: Path) -> None:
-    (file := tmp_path / "z1.yaml").write_text(
-        "name: z1\narms:\n  left:\n    model: example-robot-data:z1\n    tip: gripperStator\n"
-        "    home: [0, 1, -0.5, 0, 0, 0]\n"
-    )
-    rclpy.init(domain_id=domain, args=as_arguments(f"config:={file}"))
-    try:
-        with pytest.raises(RobotError, match=r"z1: left_link01: weighs .* and has no collision shape"):
-            CartesianControllerNode()
-    finally:
-        rclpy.try_shutdown()
 
 
 def test_joint_states_of_an_arm_each_are_merged_and_need_all_joints(context: Any, robot: Robot) -> None:

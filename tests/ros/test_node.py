@@ -17,7 +17,7 @@ import pytest
 from q2r2_control.ros.launch.executables import NODES
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from tests.ros.conftest import need_ros
-from tests.ros.processes import PATIENCE, ROOT, Processes, States, wait_until
+from tests.ros.processes import PATIENCE, ROOT, Processes, States, as_arguments, environment_of, wait_until
 
 need_ros()
 
@@ -77,9 +77,23 @@ def test_help_of_an_executable_says_what_its_node_does_and_starts_none(tmp_path:
     path = {"PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, env=os.environ | path)
     assert (run.returncode, run.stderr) == (0, "")
-    assert run.stdout.startswith("``recorder``: keeps what the nodes of a cell publish")
+    assert run.stdout.startswith("``recorder``: writes what the nodes of a cell publish")
     assert "--ros-args -p NAME:=VALUE" in run.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_controller_refuses_an_arm_with_a_link_that_nothing_watches(domain: int, tmp_path: Path) -> None:
+    (file := tmp_path / "z1.yaml").write_text(
+        "name: z1\narms:\n  left:\n    model: example-robot-data:z1\n    tip: gripperStator\n"
+        "    home: [0, 1, -0.5, 0, 0, 0]\n"
+    )
+    command = [sys.executable, "-m", "q2r2_control.ros.launch.executables", "cartesian_controller"]
+    command += as_arguments(f"config:={file}")
+    environment = environment_of(domain, tmp_path)
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=environment)
+    assert run.returncode == 2
+    assert "z1: left_link01: weighs 0.673 kg and has" in run.stderr
+    assert "has no collision shape, so that nothing keeps it off anything; allowed: <collision>" in run.stderr
 
 
 def test_ctrl_c_before_the_interpreter_has_started_waits_for_the_executable_of_a_set() -> None:
