@@ -48,10 +48,16 @@ class RememberedAnswers:
         self._keep()
         return cast(Answer, answer)
 
+    def drop(self, question: str) -> None:
+        """Do not offer the answer to a question again, because it was refused."""
+        if self._answers.pop(question, None) is not None:
+            self._keep()
+
     def forget(self) -> None:
-        """Remove the file, because the command succeeded."""
-        with suppress(OSError):
-            self.file.unlink(missing_ok=True)
+        """Remove the file, because the command succeeded. With ``yes`` it stays, because none of it was used."""
+        if not self._yes:
+            with suppress(OSError):
+                self.file.unlink(missing_ok=True)
 
     def _keep(self) -> None:
         if not self._answers:

@@ -294,10 +294,12 @@ def _place(draft: _Draft, answers: RememberedAnswers) -> None:
             like = mirrored_home(robot, side, twins[0], q)
         found: Array = find_home(robot, side, q, kept, placed, like).round(3)
         text = " ".join(f"{value:g}" for value in found)
-        answer = answers.ask(f"home of the {side} arm, found; or yours in radians", text)
+        question = f"home of the {side} arm, found; or yours in radians"
+        answer = answers.ask(question, text)
         try:
             home = [float(part) for part in re.split(r"[,\s]+", answer.strip(" []"))]
         except ValueError:
+            answers.drop(question)
             raise ConfigError(f"home of the {side} arm = {answer!r:.80}: allowed: {len(found)} numbers") from None
         draft.data["arms"][side]["home"] = home
         q[arm.joints] = home if len(home) == len(found) else found

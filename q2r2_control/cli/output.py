@@ -124,8 +124,10 @@ def notice_of_compiling() -> Iterator[None]:
         yield
 
 
-def notes_of(task: str | None, operator: str | None, record: object) -> dict[str, str]:
-    """Return the notes for a recording; raises :class:`ConfigError` if a note has no recording or no text."""
+def notes_of(task: str | None, operator: str | None, record: object, anonymous: bool) -> dict[str, str]:
+    """Return the notes for a recording; raises :class:`ConfigError` if there is none, or if a note has no text."""
+    if anonymous and record is None:
+        raise ConfigError("--anonymous needs --record")
     notes = {name: text for name, text in (("task", task), ("operator", operator)) if text is not None}
     for name in notes:
         if record is None:

@@ -31,7 +31,6 @@ from q2r2_control.cli.output import (
     say,
 )
 from q2r2_control.config.cell import Config, load_config
-from q2r2_control.errors import ConfigError
 from q2r2_control.process.scheduling import StopRequest, check_folder, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
 from q2r2_control.ros.launch.processes import check_rclpy, in_ros, nodes_of, run_together
@@ -254,11 +253,9 @@ def up(
     stopped: exit 1. Exit 3 when the recording failed. Words after --ros-args are for all nodes: remappings, and
     parameters as NODE:NAME:=VALUE.
     """
-    notes = notes_of(task, operator, record)
+    notes = notes_of(task, operator, record, anonymous)
     if record is not None:
         check_folder(Path(record), "--record")
-    if anonymous and record is None:
-        raise ConfigError("--anonymous needs --record")
     leaves_out: dict[str, str | float] = {"anonymous": True} if anonymous else {}
     recording = None if record is None else {"folder": record, **notes, **leaves_out}
     page = (web_host, web_port) if web else None

@@ -165,7 +165,7 @@ def run(
         real_time=rt,
         record=record,
         anonymous=anonymous,
-        notes=notes_of(task, operator, record),
+        notes=notes_of(task, operator, record, anonymous),
         longest_wait=longest_wait(wait),
     )
     done = run_cell(cell, options)
@@ -272,7 +272,7 @@ def demo(
         steps=work.steps,
         record=record,
         anonymous=anonymous,
-        notes={"task": "; ".join(task.about for task in chosen)},
+        notes=notes_of(None, None, record, anonymous) | {"task": "; ".join(task.about for task in chosen)},
     )
     if plant == "fri":
         with rehearsal(_FRI_CONFIG, mode, chosen, period, rt=True) as results:

@@ -40,6 +40,7 @@ class Input(Protocol):
       function that prints a line.
     - ``cell``: A function that returns a cell with the settings that this input knows better, such as its own axes.
     - ``executable``: The ROS executable that is started for this input instead of ``hand_input``.
+    - ``feels``: False if there is no device that could vibrate, so that no feedback is computed.
     - ``simulated``: True if the samples depend only on the times of the polls, so that a run may be in simulated time.
     """
 

@@ -72,6 +72,19 @@ def test_nothing_is_asked_offered_or_kept_where_all_is_taken_as_found(
     RememberedAnswers(file, ABOUT).ask("height", 0.1)
     seen = offered(monkeypatch)
     before = file.read_text()
-    assert RememberedAnswers(file, ABOUT, yes=True).ask("height", 0.1) == 0.1
+    all_as_found = RememberedAnswers(file, ABOUT, yes=True)
+    assert all_as_found.ask("height", 0.1) == 0.1
+    all_as_found.forget()
     assert seen == []
     assert file.read_text() == before
+
+
+def test_an_answer_that_was_refused_is_not_offered_again(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    offered(monkeypatch, 0.4, "north", None, None)
+    first = RememberedAnswers(file, ABOUT)
+    first.ask("height", 0.1)
+    first.ask("home", "0 1")
+    first.drop("home")
+    first.drop("never asked")
+    again = RememberedAnswers(file, ABOUT)
+    assert (again.ask("height", 0.1), again.ask("home", "0 1")) == (0.4, "0 1")

@@ -42,6 +42,8 @@ def test_the_version_is_that_of_the_installed_package() -> None:
         (("run", CELL, "--viewer", "--headless"), "--viewer"),
         (("run", CELL, "--task", "something"), "--task needs --record"),
         (("run", CELL, "--operator", "Ada"), "--operator needs --record"),
+        (("run", CELL, "--anonymous"), "--anonymous needs --record"),
+        (("demo", "--anonymous"), "--anonymous needs --record"),
         (("demo", "juggle"), "task 'juggle': allowed: meet, clash, grasp, carry"),
         (("demo", "--fast", "--rt"), "exclude each other"),
         (("replay", "pyproject.toml"), "pyproject.toml"),
