@@ -23,7 +23,7 @@ from q2r2_control.cli.output import (
 from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
-from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, held_to_promises
+from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, held_to_promises, note_on_parts
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.base import is_simulated, make_input
 from q2r2_control.judging.episode_judge import EpisodeJudge
@@ -84,6 +84,9 @@ def show_window(pipeline: Pipeline) -> None:
     pipeline.listeners.append(show)
 
 
+_EARLY = 0.1  # A run that ends earlier than this before its time was stopped [s].
+
+
 @dataclass(frozen=True, slots=True)
 class RunOptions:
     """The choices of the user on the command line."""
@@ -122,6 +125,12 @@ class CellRun:
     summary: RunSummary
     tasks: tuple[TaskResult, ...] = ()
     recording: RecordingSummary | None = None
+    planned: float | None = None  # How long the run was to last [s]; None without an end.
+
+    @property
+    def cut_short(self) -> bool:
+        """Whether somebody ended the run before its time, so that a task may not be over."""
+        return self.planned is not None and self.summary.duration_s < self.planned - _EARLY
 
     @property
     def was_recorded(self) -> bool:
@@ -201,6 +210,8 @@ def _run_pipeline(
         say(f"FAULT {fault}", console, "red")
     if config.note_on_grippers is not None:
         say(config.note_on_grippers, console, "yellow")
+    if (note := note_on_parts(str(options.input_options.get("trajectory", "")), config)) is not None:
+        say(note, console, "yellow")
     watch = None
     if options.tasks and isinstance(pipeline.plant, MujocoPlant):
         watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
@@ -213,9 +224,11 @@ def _run_pipeline(
             say(line, console)
     summary = _run(pipeline, options, recorder, page, console)
     results = () if watch is None else held_to_promises(watch.results(), summary)
-    if recorder is not None and results:
-        recorder.success = all(task.succeeded for task in results)
-    return CellRun(summary, results)
+    run = CellRun(summary, results, planned=options.duration)
+    succeeded = all(task.succeeded for task in results)
+    if recorder is not None and results and (succeeded or not run.cut_short):
+        recorder.success = succeeded
+    return run
 
 
 def print_summary(run: CellRun, json: bool, verbose: bool = False) -> None:
@@ -231,9 +244,14 @@ def print_summary(run: CellRun, json: bool, verbose: bool = False) -> None:
         print(as_json_text(data))
         return
     console = Console()
-    failed = [f"task {task.name} failed" for task in run.tasks if not task.succeeded]
+    tasks = [task for task in run.tasks if task.succeeded or not run.cut_short]
+    failed = [f"task {task.name} failed" for task in tasks if not task.succeeded]
     failed += [] if run.was_recorded else ["the recording ended before the run"]
-    _print_lines(console, [verdict_line(run.summary, failed), *map(task_line, run.tasks)])
+    stopped = None
+    if open_tasks := [task.name for task in run.tasks if task not in tasks]:
+        after = f"stopped after {run.summary.duration_s:.1f} of {run.planned:.1f} s"
+        stopped = f"[yellow]{after}[/]: not judged: {', '.join(open_tasks)}"
+    _print_lines(console, [verdict_line(run.summary, failed, stopped), *map(task_line, tasks)])
     if (late := late_line(run.summary, run.tasks)) is not None:
         _print_lines(console, [late])
     if run.recording is not None:

@@ -15,14 +15,17 @@ from q2r2_control.viewer.tables import figure_table
 from q2r2_control.wording import sentence
 
 
-def verdict_line(summary: RunSummary, failed: Iterable[str] = ()) -> str:
+def verdict_line(summary: RunSummary, failed: Iterable[str] = (), stopped: str | None = None) -> str:
     """Return one line of markup that says whether the promises were kept and the arms followed, or else the faults.
 
-    ``failed`` names further failures, such as tasks.
+    ``failed`` names further failures, such as tasks. ``stopped`` is the line where there is no failure, but the run was
+    stopped before its tasks were over.
     """
     wrong = [*summary.broken, *failed]
     if wrong:
         return f"[red]not as it should be[/]: {escape('; '.join(wrong))}"
+    if stopped is not None:
+        return stopped
     if stops := _last_faults(summary):
         told = (f"{name} arm {escape(sentence(event.reason))}" for name, event in stops.items())
         return f"[yellow]an arm was stopped or refused[/]: {'; '.join(told)}"

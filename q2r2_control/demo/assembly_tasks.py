@@ -105,6 +105,15 @@ def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
     return tuple(task for name, task in TASKS.items() if name in wanted or ALL_TASKS in wanted)
 
 
+def note_on_parts(motion: str, config: Config) -> str | None:
+    """Return one line about parts that the tasks of a scripted motion need and the cell lacks; None without any."""
+    parts = [part for name in motion.split("+") if name in TASKS for part in TASKS[name].parts]
+    if not (missing := [part for part in parts if part not in config.mujoco.objects]):
+        return None
+    hands = f"the hands of {motion} move as if they were there"
+    return f"{config.name} has no {', '.join(missing)} under mujoco.objects: {hands}"
+
+
 def with_controls(config: Config) -> Config:
     """Return the cell with the tasks' controls for ``carry`` and ``precision``, if the cell binds none to them."""
     bindings = config.teleop.bindings

@@ -104,6 +104,20 @@ def test_what_is_printed_of_a_run_begins_with_its_verdict_and_those_on_its_tasks
     assert any("duration" in line for line in figures)
 
 
+def test_tasks_of_a_run_that_somebody_stopped_are_not_judged_unless_they_succeeded(
+    summary: RunSummary, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tasks = (TaskResult("grasp", True, {}, ""), TaskResult("stack", False, {}, "it fell"))
+    stopped = CellRun(replace(summary, events=[], duration_s=12.0), tasks, planned=45.2)
+    print_summary(stopped, json=False)
+    verdict, grasp, *figures = capsys.readouterr().out.splitlines()
+    assert verdict == "stopped after 12.0 of 45.2 s: not judged: stack"
+    assert grasp == "grasp succeeded ()"
+    assert not any("it fell" in line for line in figures)
+    print_summary(replace(stopped, summary=replace(stopped.summary, uncertified_ticks=3)), json=False)
+    assert capsys.readouterr().out.startswith("not as it should be: 3 ticks without a certificate\n")
+
+
 def test_the_summary_is_short_unless_all_is_asked_for_and_never_hides_what_is_wrong(summary: RunSummary) -> None:
     short, whole = text_of(summary, verbose=False), text_of(summary)
     for figure in ("input to command", "room to position limits", "velocity, acceleration", "certified stops"):

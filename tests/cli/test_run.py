@@ -38,6 +38,15 @@ def test_what_check_refuses_is_refused_with_the_same_lines(tmp_path: Path) -> No
     assert allowed == "q2r2: dual_iiwa7: --force runs it all the same"
 
 
+def test_hands_of_a_task_whose_parts_a_cell_lacks_are_said_to_move_without_them(tmp_path: Path) -> None:
+    file = changed_cell(tmp_path, "    bar:\n", "    rod:\n")
+    result = q2r2("run", file, *OPTIONS, "--trajectory", "handover")
+    assert (
+        "dual_iiwa7 has no bar under mujoco.objects: the hands of handover move as if they were there" in result.stderr
+    )
+    assert "mujoco.objects" not in q2r2("run", CELL, *OPTIONS, "--trajectory", "handover").stderr
+
+
 def test_with_force_it_says_what_is_wrong_and_runs(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "0.0204, 0.348,", "0.0204, 2.09,")
     result = q2r2("run", file, *OPTIONS, "--force")
