@@ -17,6 +17,7 @@ from typer import Argument, Exit
 from q2r2_control.cli.output import DEMO_CONFIG, Json, as_json_text
 from q2r2_control.cli.ros import print_findings
 from q2r2_control.config.cell import Config, load_config
+from q2r2_control.extras import install_line
 from q2r2_control.inputs.listener import access_lines
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
 from q2r2_control.process.machine_notes import has_display, machine_notes, network_notes
@@ -24,6 +25,16 @@ from q2r2_control.ros.launch.build import interface_packages
 from q2r2_control.ros.watching.findings import Finding, error
 
 _PACKAGE = "q2r2_control"
+
+# What does not work without the packages of each extra. The extra ros has findings of its own.
+_NEEDS_EXTRA = {
+    "web": "no --web, no --input webxr",
+    "export": "no q2r2 export hdf5 and lerobot-v2.1",
+    "lerobot": "no q2r2 export lerobot",
+    "gym": "no environments of Gymnasium",
+    "xacro": "no models that end in .xacro",
+    "modbus": "no Robotiq grippers by Modbus",
+}
 
 
 def doctor(
@@ -47,7 +58,8 @@ def doctor(
     }
     if cell.fri:
         facts["cabinets"] = f"q2r2 fri-check {config} says how evenly they send"
-    findings = [*_packages(requires(_PACKAGE) or ()), *_ros(), *_ports(cell), *_display(os.environ)]
+    required = requires(_PACKAGE) or ()
+    findings = [*_packages(required), *_extras(required), *_ros(), *_ports(cell), *_display(os.environ)]
     notes = machine_notes() + network_notes(cabinet.address for cabinet in cell.fri.values())
     findings += [Finding(False, *_what_and_cure(note)) for note in notes]
     lacks = any(finding.stops_arms for finding in findings)
@@ -61,22 +73,38 @@ def doctor(
 
 def _packages(required: Iterable[str]) -> Iterator[Finding]:
     """Yield the requirements in ``required`` that are not met. Those of extras do not count."""
+    for requirement, found in _unmet(required):
+        what = f"{requirement.name}: {found} is installed; needed: {requirement.specifier}"
+        yield error(what, f"{sys.executable} -m pip install '{requirement.name}{requirement.specifier}'")
+
+
+def _extras(required: Iterable[str]) -> Iterator[Finding]:
+    """Yield the extras whose requirements in ``required`` are not all met."""
+    required = tuple(required)
+    for extra, lacks in _NEEDS_EXTRA.items():
+        if names := [requirement.name for requirement, _ in _unmet(required, extra)]:
+            yield Finding(False, f"without {', '.join(names)}: {lacks}", install_line(extra))
+
+
+def _unmet(required: Iterable[str], extra: str = "") -> Iterator[tuple[Requirement, str]]:
+    """Yield each requirement of the package, or of its ``extra``, that is not met, with the version that is there."""
     for requirement in map(Requirement, required):
-        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+        marker = requirement.marker
+        needed_by = [name for name in ("", extra) if marker is None or marker.evaluate({"extra": name})]
+        if needed_by[:1] != [extra]:  # A requirement of the package itself is none of an extra.
             continue
         try:
             found = version(requirement.name)
         except PackageNotFoundError:
             found = "none"
         if found == "none" or not requirement.specifier.contains(found, prereleases=True):
-            what = f"{requirement.name}: {found} is installed; needed: {requirement.specifier}"
-            yield error(what, f"{sys.executable} -m pip install '{requirement.name}{requirement.specifier}'")
+            yield requirement, found
 
 
 def _ros() -> Iterator[Finding]:
     """Yield what is missing for the ROS nodes. Nothing else needs ROS."""
     if importlib.util.find_spec("rclpy") is None:
-        cure = f"pip install '{_PACKAGE}[ros]', or source a ROS 2 Jazzy, if you want them"
+        cure = f"{install_line('ros')}, or source a ROS 2 Jazzy, if you want them"
         yield Finding(False, "rclpy cannot be imported: no ROS nodes", cure)
     elif lacking := [its.name for its in interface_packages() if importlib.util.find_spec(its.name) is None]:
         yield Finding(False, f"no messages of {', '.join(lacking)}: no ROS nodes", "q2r2 ros build-interfaces")

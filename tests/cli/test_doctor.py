@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from importlib.metadata import metadata
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,19 @@ def test_a_package_that_is_missing_or_too_old_has_its_pip_line() -> None:
     assert [finding.what.partition(":")[0] for finding in found] == ["numpy", "no-such-package-of-ours"]
     assert all(finding.stops_arms for finding in found)
     assert found[0].cure.endswith("-m pip install 'numpy>=999'")
+
+
+def test_an_extra_that_is_not_there_is_named_with_what_needs_it() -> None:
+    wanted = ["numpy>=999", "no-such-viewer>=1; extra == 'web'", "scipy>=1; extra == 'gym'"]
+    (finding,) = doctor._extras(wanted)
+    assert finding.what == "without no-such-viewer: no --web, no --input webxr"
+    assert "[web]'" in finding.cure
+    assert not finding.stops_arms
+
+
+def test_every_extra_that_is_named_is_one_of_the_package() -> None:
+    extras = metadata("q2r2_control").get_all("Provides-Extra") or []
+    assert set(doctor._NEEDS_EXTRA) <= set(extras)
 
 
 def test_without_a_display_only_the_window_is_missing() -> None:
