@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 
 class Q2R2Error(Exception):
@@ -23,6 +24,34 @@ class ConfigError(Q2R2Error):
     def at(self, where: str) -> ConfigError:
         """Return the same error with ``where`` at the beginning of each line."""
         return ConfigError(f"{where}{self}", [f"{where}{fault}" for fault in self.faults])
+
+
+class AllFaults:
+    """Collects the errors of several parts, so that a user reads all of them at once.
+
+    Errors in ``with faults.of_part():`` end that part only. The end of ``with AllFaults() as faults:`` raises a single
+    error as it is, and several as one :class:`ConfigError`.
+    """
+
+    def __init__(self) -> None:
+        self._errors: list[Q2R2Error] = []
+
+    def __enter__(self) -> AllFaults:
+        return self
+
+    @contextmanager
+    def of_part(self) -> Iterator[None]:
+        try:
+            yield
+        except Q2R2Error as error:
+            self._errors.append(error)
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None or not self._errors:
+            return
+        if len(self._errors) == 1:
+            raise self._errors[0]
+        raise ConfigError("; ".join(map(str, self._errors)), [fault for one in self._errors for fault in one.faults])
 
 
 class RobotError(Q2R2Error):

@@ -15,7 +15,7 @@ import numpy as np
 
 from q2r2_control.config.arms import PoseConfig, check_models
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import AllFaults, ConfigError
 from q2r2_control.robot.cell_parts import ArmAssembly, Model, check_position, load_model
 from q2r2_control.robot.description import LinkTree
 from q2r2_control.robot.floor import FLOOR, floor_link
@@ -128,10 +128,12 @@ def _arms(config: Config) -> dict[str, ArmAssembly]:
     """Return every arm of the cell with its own joints."""
     robot = None if config.robot is None else Model(load_model(config.robot, config.packages, "robot"), "")
     arms: dict[str, ArmAssembly] = {}
-    for side in (side for side in SIDES if side in config.arms):
-        made = config.arms[side]
-        model = robot or Model(load_model(made, config.packages, f"arms.{side}"), f"{side}_")
-        arms[side] = ArmAssembly(made, model, config.packages, side)
+    with AllFaults() as faults:
+        for side in (side for side in SIDES if side in config.arms):
+            with faults.of_part():
+                made = config.arms[side]
+                model = robot or Model(load_model(made, config.packages, f"arms.{side}"), f"{side}_")
+                arms[side] = ArmAssembly(made, model, config.packages, side)
     for arm in arms.values():
         arm.leave_joints_of([other for other in arms.values() if other is not arm and other.model is arm.model])
     return arms
@@ -142,8 +144,13 @@ def _home(urdf: ET.Element, arms: Mapping[str, ArmAssembly]) -> dict[str, float]
     home: dict[str, float] = {}
     owner: dict[str, str] = {}
     fingers: set[str] = set()
-    for arm in arms.values():
-        for joint, position in arm.posture().items():
+    with AllFaults() as faults:
+        postures = {}
+        for side, arm in arms.items():
+            with faults.of_part():
+                postures[side] = arm.posture()
+    for side, arm in arms.items():
+        for joint, position in postures[side].items():
             name = arm.name_in_cell(joint)
             if name in home:
                 raise ConfigError(f"{arm.key}: joint {name} is one of {owner[name]} as well; allowed: one arm a joint")

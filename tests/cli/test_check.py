@@ -33,7 +33,6 @@ def test_check_prints_arms_limits_obstacles_and_the_nearest_pairs_of_a_good_cell
     assert result.stdout.endswith("\nthis cell can run\n")
 
 
-@pytest.mark.slow
 def other_arms(folder: Path, pattern: str, new: str) -> str:
     """The shipped cell with arms of its own, in whose model each text that fits ``pattern`` is another one."""
     text = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
@@ -43,6 +42,7 @@ def other_arms(folder: Path, pattern: str, new: str) -> str:
     return str(folder / "cell.yaml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pattern", "new", "fault"),
     [
@@ -63,6 +63,22 @@ def test_check_refuses_arms_that_a_run_refuses(tmp_path: Path, pattern: str, new
     assert re.search(r"\nthis cell cannot run: \d faults?\n$", checked.stdout)
     assert ran.exit_code == 2
     assert fault in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        ("model: iiwa7", "model: /nowhere.urdf", "model = '/nowhere.urdf'"),
+        ("home: [", "home: [0.1, ", "home"),
+    ],
+)
+def test_check_names_a_fault_in_both_arms_for_both(tmp_path: Path, old: str, new: str, fault: str) -> None:
+    (file := tmp_path / "cell.yaml").write_text(find_resource(CELL).read_text(encoding="utf-8").replace(old, new))
+    checked, ran = q2r2("check", str(file)), q2r2("run", str(file), "--fast", "--headless", "--duration", "0.1")
+    assert (checked.exit_code, ran.exit_code) == (2, 2)
+    for stderr in (checked.stderr, ran.stderr):
+        assert [line.partition(fault)[0] for line in stderr.splitlines()] == ["q2r2: arms.left.", "q2r2: arms.right."]
+    assert checked.stdout.endswith("this cell cannot run: 2 faults\n")
 
 
 def test_a_heavy_link_without_a_shape_is_a_fault_until_the_cell_names_it(tmp_path: Path) -> None:
