@@ -76,17 +76,17 @@ def test_a_cell_is_loaded_from_a_path_only(path: Any) -> None:
     [
         (
             lambda: ControllerSettings(acceleration_limit=-1),
-            "ControllerSettings: acceleration_limit = -1: Input should",
+            "ControllerSettings: acceleration_limit = -1: allowed: more than 0",
         ),
         (lambda: ControllerSettings(**{"foo": 1}), "ControllerSettings: foo = 1: unknown key; allowed here: acceler"),
         (
             lambda: ControllerSettings(**{"pairs": [{"pair": ("a", "b"), "distance": 3}]}),
-            "ControllerSettings: pairs.0.distance = 3: Input should be less than or equal to 0.2",
+            "ControllerSettings: pairs.0.distance = 3: allowed: 0.2 or less",
         ),
         (lambda: Config(**{"name": "cell"}), "Config: arms: missing"),
         (
             lambda: Config(**{"name": "cell", "arms": {"left": {"home": [0.0], "tool": {"link": 5}}}}),
-            "Config: arms.left.tool.link = 5: Input should be a valid string",
+            "Config: arms.left.tool.link = 5: allowed: text",
         ),
         (lambda: Config(**{"name": "cell", "arms": {"left": {"home": [0.0]}}}), "arms.left.model: missing; give one"),
         (
@@ -94,7 +94,7 @@ def test_a_cell_is_loaded_from_a_path_only(path: Any) -> None:
             "control.priority = 'up': allowed here: equal, left, right",
         ),
         (lambda: setattr(CONFIG.control, "min_distance", 0.1), "ControllerSettings.min_distance = 0.1: settings do no"),
-        (lambda: RelativeMotion(scale=-1), "RelativeMotion: position_scale = -1: Input should be greater than 0"),
+        (lambda: RelativeMotion(scale=-1), "RelativeMotion: position_scale = -1: allowed: more than 0"),
     ],
 )
 def test_settings_made_in_python_name_key_value_and_what_is_allowed(make: Callable[[], object], said: str) -> None:

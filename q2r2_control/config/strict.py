@@ -13,6 +13,35 @@ from q2r2_control.errors import ConfigError, shown
 Model = TypeVar("Model", bound=BaseModel)
 
 
+# What is allowed instead of a value, by pydantic's type of the fault. The names in braces are its numbers.
+_ALLOWED = {
+    "list_type": "a list such as [a, b]",
+    "tuple_type": "a list such as [a, b]",
+    "dict_type": "keys with values",
+    "model_type": "keys with values",
+    "model_attributes_type": "keys with values",
+    "string_type": "text",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "{ge:g} or more",
+    "less_than": "less than {lt:g}",
+    "less_than_equal": "{le:g} or less",
+    "too_short": "{min_length} or more entries",
+    "too_long": "{max_length} or fewer entries",
+    "string_too_short": "{min_length} or more characters",
+    "string_too_long": "{max_length} or fewer characters",
+    "enum": "{expected}",
+    "literal_error": "{expected}",
+}
+
+
 class StrictModel(BaseModel):
     """Settings that allow no unknown keys, no changes, and only finite numbers.
 
@@ -78,8 +107,11 @@ def _key(fault: ErrorDetails) -> str:
 def _line(key: str, fault: ErrorDetails, model: type[BaseModel]) -> str:
     """Return one line about a ``fault`` in a ``model``: key, value, and what is allowed."""
     if fault["type"] == "missing":
-        return f"{key}: missing, and has no default"
+        has = "allowed: a list with one more entry" if isinstance(fault["loc"][-1], int) else "and has no default"
+        return f"{key}: missing, {has}"
     allowed = fault["msg"].removeprefix("Value error, ")
+    if (words := _ALLOWED.get(fault["type"])) is not None:
+        allowed = f"allowed: {words.format(**fault.get('ctx', {}))}"
     if fault["type"] == "extra_forbidden":
         allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1], model))}"
     # For a whole block, the text itself names the keys that do not fit together.

@@ -27,7 +27,7 @@ def unify(root: ET.Element, where: str) -> None:
     """Bring origins by quaternion to roll, pitch and yaw, in place.
 
     Raises :class:`RobotError` that begins with ``where`` for elements of xacro, which all readers skip, and for links
-    with a mass and no inertia, which Pinocchio leaves out with their shapes.
+    with only one of mass and inertia, which Pinocchio leaves out with their shapes.
     """
     _refuse_xacro(root, where)
     for origin in root.iter("origin"):
@@ -112,7 +112,11 @@ def _unify_origin(origin: ET.Element, where: str) -> None:
 
 
 def _check_inertial(link: ET.Element, where: str) -> None:
-    inertial = link.find("inertial")
-    if inertial is None or inertial.find("mass") is None or inertial.find("inertia") is not None:
+    """Refuse an <inertial> with one of mass and inertia, for which Pinocchio leaves out the link's shapes."""
+    if (inertial := link.find("inertial")) is None:
         return
-    raise RobotError(f"{where}: the <inertial> of link {link.get('name')} has a mass and no <inertia>; allowed: both")
+    lacks = [tag for tag in ("mass", "inertia") if inertial.find(tag) is None]
+    if len(lacks) == 1:
+        raise RobotError(f"{where}: the <inertial> of link {link.get('name')} has no <{lacks[0]}>; allowed: both")
+    if lacks:  # An empty element says as much as none.
+        link.remove(inertial)

@@ -105,9 +105,9 @@ def test_check_and_run_list_everything_that_is_wrong_in_a_file(tmp_path: Path) -
     )
     lines = [
         f"q2r2: {file}: control.solvr = 'daqp': unknown key; allowed here: acceleration_limit, ",
-        f"q2r2: {file}: arms.left.home.6 = 'up': Input should be a valid number",
-        f"q2r2: {file}: floor = 'low': Input should be a valid number",
-        f"q2r2: {file}: control.min_distance = -1: Input should be greater than or equal to 0",
+        f"q2r2: {file}: arms.left.home.6 = 'up': allowed: a number",
+        f"q2r2: {file}: floor = 'low': allowed: a number",
+        f"q2r2: {file}: control.min_distance = -1: allowed: 0 or more",
     ]
     checked, ran = q2r2("check", str(file)), q2r2("run", str(file), "--headless")
     data = q2r2("check", str(file), "--json")

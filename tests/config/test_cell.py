@@ -80,7 +80,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
     ("path", "value", "allowed"),
     [
         # degrees, millimetres, milliseconds, percent
-        ("arms.left.mount.rpy", [0, 0, 90], "less than or equal to 6.28"),
+        ("arms.left.mount.rpy", [0, 0, 90], "6.2832 or less"),
         ("obstacles.table.size", [0.8, 1.6], "a box takes 3 size value(s)"),
         ("teleop.stance", "behind", "'side_by_side', 'mirror' or 'mirror_reflected'"),
         ("teleop.axes", ["+x", "+x", "+z"], "once each"),
@@ -101,9 +101,9 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
             "and tool.frame = 'link_7' mean the same link",
         ),
         ("arms.left.acceleration_limit", 5.0, "allowed: limits by joint, such as {A2: 5.4}"),
-        ("arms.left.acceleration_limit", {"A1": -8}, "greater than 0"),
+        ("arms.left.acceleration_limit", {"A1": -8}, "more than 0"),
         ("arms.left.gripper.object", {"box": [0.04, 0.04, 0.06], "sphere": 0.03}, "two shapes: give one"),
-        ("control.pairs", [{"pair": ["a", ""], "distance": 0.01}], "at least 1 character"),
+        ("control.pairs", [{"pair": ["a", ""], "distance": 0.01}], "1 or more characters"),
         ("cameras.front", {"position": [1, 0, 1]}, "allowed: either look_at or rpy"),
         ("cameras.front", {"width": 640}, "allowed: position, or topic of a real camera"),
         ("cameras.front", {"topic": "/front", "position": [1, 0, 1]}, "position: allowed: without topic"),
@@ -116,7 +116,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("arms.left.gripper.closed_position", 0.025, "have to differ"),
         # not numbers, or not the ones meant
         ("control.acceleration_limit", math.nan, "finite number"),
-        ("control.position_margin", "0.01 rad", "valid number"),
+        ("control.position_margin", "0.01 rad", "allowed: a number"),
         ("control.priority", "middle", "allowed here: equal, left, right"),
         ("arms.middle", {"model": "iiwa7", "home": [0] * 7}, "'left' or 'right'"),
         # of a cell with another controller
@@ -126,7 +126,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("external.arms.left.ctrl_prefix", "left_ctrl", "begins with /"),
         ("external.arms.left.ctrl_prefix", "/left ctrl", "allowed is a ROS name"),
         ("external.arms.left.ctrl_prefix", "/left_ctrl/", "without / at its end"),
-        ("external.arms.left.base_frame", "", "at least 1 character"),
+        ("external.arms.left.base_frame", "", "1 or more characters"),
         ("external.arms.left.gripper.closed_position", 0.0, "have to differ"),
     ],
     ids=lambda value: value if isinstance(value, str) else f"{value!r:.24}",

@@ -199,7 +199,7 @@ def test_a_pair_that_closes_in_keeps_no_more_than_the_stop_leaves_it(controller:
     [
         ({"min_distance": 0.06}, "up to 0.05"),
         ({"acceleration_limit": 5.0}, r"control.acceleration_limit = 5.0: while a controller runs: min_distance, "),
-        ({"position_gain": 0.0}, "control.position_gain = 0.0: Input should be greater than 0"),
+        ({"position_gain": 0.0}, "control.position_gain = 0.0: allowed: more than 0"),
         ({"position_gain": 1.0, "min_distance": -1.0}, "control.min_distance"),
     ],
     ids=["pairs are not watched", "not a live one", "out of range", "as a whole"],

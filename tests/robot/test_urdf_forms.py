@@ -51,9 +51,17 @@ def test_elements_of_xacro_are_refused_by_name_since_readers_skip_them() -> None
         parse_urdf(text, "arm.urdf")
 
 
-def test_a_mass_without_an_inertia_is_refused_with_the_link_that_has_it() -> None:
-    with pytest.raises(RobotError, match="link hand has a mass and no <inertia>"):
-        arm(link="<inertial><mass value='1'/></inertial>")
+INERTIA = "<inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/>"
+
+
+@pytest.mark.parametrize(("has", "lacks"), [("<mass value='1'/>", "inertia"), (INERTIA, "mass")])
+def test_one_of_mass_and_inertia_is_refused_with_the_link_that_lacks_the_other(has: str, lacks: str) -> None:
+    with pytest.raises(RobotError, match=f"the <inertial> of link hand has no <{lacks}>; allowed: both"):
+        arm(link=f"<inertial>{has}</inertial>")
+
+
+def test_an_empty_inertial_says_as_much_as_none() -> None:
+    assert arm(link="<inertial><origin/></inertial>").find("link[@name='hand']/inertial") is None
 
 
 @pytest.mark.parametrize(
