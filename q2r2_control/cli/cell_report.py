@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from q2r2_control.cli.output import notice_of_compiling
+from q2r2_control.cli.output import counted, notice_of_compiling
 from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.control import ContactPair
@@ -134,8 +134,7 @@ def check_cell(config: Config) -> CellCheck:
 
 def verdict_on(faults: Sequence[str]) -> str:
     """Return one line that says whether a cell with these ``faults`` can run."""
-    number = f"{len(faults)} fault{'s' * (len(faults) > 1)}"
-    return f"this cell cannot run: {number}" if faults else "this cell can run"
+    return f"this cell cannot run: {counted(len(faults), 'fault')}" if faults else "this cell can run"
 
 
 def _plant_faults(config: Config, robot: Robot) -> list[str]:

@@ -137,6 +137,11 @@ def notes_of(task: str | None, operator: str | None, record: object, anonymous: 
     return notes
 
 
+def counted(number: int, noun: str) -> str:
+    """Return ``number`` and ``noun``, which gets an s unless the number is one."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def positive(option: str, value: float | None) -> float | None:
     """Return the ``value`` [s] of ``option``; raises :class:`ConfigError` if it is not positive and finite."""
     if value is not None and not (math.isfinite(value) and value > 0.0):

@@ -20,6 +20,7 @@ from q2r2_control.cli.output import (
     WebHost,
     WebPort,
     as_json_text,
+    counted,
     counting,
     notice_of_compiling,
     say,
@@ -156,9 +157,9 @@ def report(
     try:
         output.write_text(page, encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"--output {output}: {error.strerror}") from error
+        raise ConfigError(f"--output {output}: {error.strerror}; allowed: a file that you may write") from error
     kept, count = sum(one.verdict.keep for one in judged), len(found.all)
-    print(f"{output}: {count} episodes, {kept} kept, {count - kept} discarded")
+    print(f"{output}: {counted(count, 'episode')}, {kept} kept, {count - kept} discarded")
     for bad in unreadable:
         say(f"{bad.file}: {bad.line}", style="yellow")
     if unreadable:
@@ -243,8 +244,8 @@ def export(
         raise RecordingError(f"none of the recordings can be exported{discarded}")
     target.write(lambda path: chosen.join(made.kept, path))
     whole = len(made.kept) + len(made.left_out) + len(made.unreadable) == len(files)
-    count = f"{len(made.kept)} of" if whole else f"{len(made.kept)} episodes of"
-    print(f"{output}: {count} {len(files)} recordings at {fps} frames per second")
+    count = f"{len(made.kept)} of" if whole else f"{counted(len(made.kept), 'episode')} of"
+    print(f"{output}: {count} {counted(len(files), 'recording')} at {fps} frames per second")
     if made.left_out:
         say(f"left out, since q2r2 judge discards them: {len(made.left_out)}; --keep-discarded exports them too")
     if chosen.advice is not None:

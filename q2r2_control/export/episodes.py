@@ -29,6 +29,7 @@ from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
 
 FASTEST = 1000  # The highest rate of frames [Hz].
+_OUTPUT = "allowed: a new folder where you may write"
 _FORMAT = 7  # The version of kept episodes. Episodes of another version are made again.
 
 
@@ -228,7 +229,7 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
     except RecordingError as error:  # Pictures are read from the recording only while they are written to the dataset.
         return None, _reason(error, job)
     except OSError as error:
-        raise ConfigError(f"--output {target.parent}: {error.strerror or error}") from error
+        raise ConfigError(f"--output {target.parent}: {error.strerror or error}; {_OUTPUT}") from error
     return None, None
 
 
@@ -265,7 +266,7 @@ class Output:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(f"--output {self._path}: {error.strerror}: {error.filename}") from error
+            raise ConfigError(f"--output {self._path}: {error.strerror}: {error.filename}; {_OUTPUT}") from error
         return folder
 
     def tidy(self) -> None:
@@ -284,7 +285,7 @@ class Output:
             made.rename(self._path)
             shutil.rmtree(self._partial)
         except OSError as error:
-            raise ConfigError(f"--output {self._path}: {error.strerror or error}") from error
+            raise ConfigError(f"--output {self._path}: {error.strerror or error}; {_OUTPUT}") from error
 
     def _refuse_existing(self) -> None:
         if self._path.exists() or self._path.is_symlink():

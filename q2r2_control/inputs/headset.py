@@ -15,7 +15,7 @@ from q2r2_control.config.strict import Network
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.connections import TURN, Client, Connections, Handlers
 from q2r2_control.inputs.hand_stream import HandStream
-from q2r2_control.inputs.listener import HostLog, TcpListener, access_lines, written
+from q2r2_control.inputs.listener import HostLog, TcpListener, access_lines, why_not_bound, written
 from q2r2_control.inputs.messages import WireFrame, warm_up
 from q2r2_control.inputs.samples import HandsWatch, Watched
 from q2r2_control.inputs.session import HeadsetStatistics
@@ -94,7 +94,8 @@ class HeadsetServer:
         try:
             door = TcpListener(host, port, HostLog(_LOG))
         except (OSError, OverflowError, ValueError) as error:
-            raise InputError(f"headset: cannot listen on {written(host, port)}: {error}") from error
+            why = why_not_bound(error)
+            raise InputError(f"headset: cannot listen on {written(host, port)}: {why}; allowed: a free port") from error
         self.address = (host, door.port)
         handlers = Handlers(admitted=self._admit, lost=self._stream.lose, receive=self._receive, due=self._take_owed)
         self._connections = Connections(door, self._allow, self._clock, handlers)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import socket
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -151,6 +152,11 @@ class TcpListener:
 def written(host: str, port: int) -> str:
     """Return host and port in one text, such as ``[::1]:10000`` with IPv6."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def why_not_bound(error: Exception) -> str:
+    """Return why an address cannot be bound. An OSError's own text repeats the address."""
+    return os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
 
 
 def app_settings(host: str, port: int) -> str:

@@ -15,7 +15,7 @@ from websockets.http11 import Request, Response
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.addresses import reachable_addresses
-from q2r2_control.inputs.listener import is_loopback, written
+from q2r2_control.inputs.listener import is_loopback, why_not_bound, written
 
 _LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 _PORT = re.compile(r":\d{1,5}$")
@@ -90,8 +90,7 @@ class PageDoor:
             family, both = (socket.AF_INET6, socket.has_dualstack_ipv6()) if ipv6 else (socket.AF_INET, False)
             self.socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)
         except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
-            message = f"{option}: cannot listen on {host} port {port}: {reason}; allowed: a free port"
+            message = f"{option}: cannot listen on {host} port {port}: {why_not_bound(error)}; allowed: a free port"
             raise ConfigError(message) from error
         self.port: int = self.socket.getsockname()[1]
         self._scheme = "http" if certificate is None else "https"
