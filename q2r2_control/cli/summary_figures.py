@@ -52,8 +52,9 @@ def summary_table(summary: RunSummary, verbose: bool = False) -> Table:
 
 
 def _result(summary: RunSummary) -> Iterator[tuple[str, str]]:
-    factor = "" if summary.real_time_factor is None else f", {summary.real_time_factor:.1f} x real time"
-    yield "duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {summary.loop_rate_hz:.0f} Hz{factor}"
+    factor = summary.real_time_factor
+    pace = f"{summary.loop_rate_hz:.0f} Hz" if factor is None else f"{factor:.1f} x real time"
+    yield "duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {pace}"
     for name, arm in summary.arms.items():
         yield f"{name} arm", ", ".join(_arm_figures(arm))
         if not arm.followed:
