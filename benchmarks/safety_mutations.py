@@ -39,7 +39,7 @@ _LONGEST = 1800.0  # of a soak or the tests [s]
 
 def broken_copy(mutation: Mutation, folder: Path) -> None:
     """Write the package with one line broken, its tests, its cells and its compiled kernels, into ``folder``."""
-    for name in ("q2r2_control", "tests", "config", "robots"):
+    for name in ("q2r2_control", "tests", "config", "robots", "docs"):  # Some tests compare a page with the code.
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", folder)
     kernels = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "q2r2_control"

@@ -12,15 +12,18 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mcap.exceptions import EndOfFile
+
 from q2r2_control.config.recording import TOPIC_RATE, CameraConfig
-from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.camera_recorder import CameraRecorder
+from q2r2_control.recording.mcap_file import McapFile
 from q2r2_control.recording.messages import Message, Topic, run_topics
-from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.reader import BROKEN
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, RecordingSetup, Written
 from q2r2_control.robot.robot import Robot
@@ -93,7 +96,7 @@ class BaseRecorder:
                 self.writer.send(conclusion or Conclusion())
             self.writer.finish(PATIENCE)
             self._check()
-        if self.fault is not None and self.file is not None and _is_empty(self.file):
+        if self.fault is not None and self.file is not None and is_empty(self.file):
             with suppress(OSError):
                 self.file.unlink(missing_ok=True)
                 self.file.parent.rmdir()
@@ -109,15 +112,15 @@ class BaseRecorder:
             self.record_outcome(Reason.of(ReasonKind.RECORDING_ENDED, text=self.fault))
 
 
-def _is_empty(file: Path) -> bool:
+def is_empty(file: Path) -> bool:
     """Return whether a file has no message; the file may be that of a writer that was killed."""
+    if not file.exists():
+        return True
     try:
-        recording = Recording(file)
-    except RecordingError as error:  # The missing data stands before all messages, unless the disk fails.
-        return not isinstance(error.__cause__, OSError) or not file.exists()
-    try:
-        return not any(recording.messages())
-    except RecordingError:
+        return not any(McapFile(file).messages())
+    except EndOfFile:  # The file was cut before its first message was whole.
+        return True
+    except (OSError, *BROKEN):  # The file may hold messages that cannot be read now, so it stays.
         return False
 
 

@@ -187,7 +187,7 @@ class TestAnImpedanceThatChanges:
     @pytest.mark.parametrize(
         ("values", "arm", "message"),
         [
-            ({"translational_stiffness": 0.0}, None, "translational_stiffness = 0.0: .*greater than 0"),
+            ({"translational_stiffness": 0.0}, None, "translational_stiffness = 0.0: .*more than 0"),
             ({"translational_stiffness": 1e4}, None, "translational_stiffness = 10000.0: .*5000"),
             ({"rotational_stiffness": np.nan}, None, "rotational_stiffness = nan"),
             ({"rotational_stiffness": True}, None, "rotational_stiffness = True"),

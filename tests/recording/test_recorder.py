@@ -21,11 +21,12 @@ import yaml
 
 from q2r2_control.config.cell import parse_config
 from q2r2_control.config.recording import TOPIC_RATE
-from q2r2_control.recording.about import About
+from q2r2_control.errors import RecordingError
+from q2r2_control.recording.about import ABOUT, About
 from q2r2_control.recording.bag import BagWriter
 from q2r2_control.recording.messages import STATE, TEXT, Message, Topic, run_topics, text
 from q2r2_control.recording.reader import Recording
-from q2r2_control.recording.recorder import Recorder
+from q2r2_control.recording.recorder import Recorder, is_empty
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.summary.tick import Tick
@@ -163,6 +164,16 @@ def test_a_file_that_fails_before_its_first_message_is_whole_is_removed_with_its
     with pytest.raises(OSError, match="full"):
         write_and_fail()
     assert not folder.exists()
+
+
+def test_a_file_with_messages_is_not_empty_although_what_stands_before_them_is_damaged(tmp_path: Path) -> None:
+    file = file_of(record(tmp_path, pipeline(), 0.2))
+    whole = file.read_bytes()
+    assert not is_empty(file)
+    file.write_bytes(whole.replace(ABOUT.encode(), b"?" * len(ABOUT))[:-100])
+    with pytest.raises(RecordingError):
+        Recording(file)
+    assert not is_empty(file)
 
 
 @pytest.mark.parametrize("least", [0, 5000], ids=["nothing yet", "some of its header"])

@@ -122,7 +122,7 @@ def test_every_axis_convention_gives_the_world_what_the_hand_did_in_the_world(ax
         ({"axes": ("+x", "+y")}, "axes"),
         ({"stance": "behind"}, "stance = 'behind'.*side_by_side"),
         ({"rotation_frame": "hand"}, "rotation_frame = 'hand'.*base"),
-        ({"scale": 0.0}, "position_scale = 0.0.*greater than 0"),
+        ({"scale": 0.0}, "position_scale = 0.0.*more than 0"),
         ({"rotation_scale": -1.0}, "rotation_scale = -1.0"),
     ],
     ids=lambda value: str(value) if isinstance(value, dict) else "",
