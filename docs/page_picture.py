@@ -47,6 +47,7 @@ class Photographer:
         with one_processor():
             playwright = sync_playwright().start()
         page = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS).new_page(viewport=VIEW)
+        page.set_default_timeout(0)  # A busy computer may draw slowly; Ctrl-C ends the wait.
         page.goto(f"{self.url}?fixedDpr=1")
         page.add_style_tag(content=HIDDEN)
         page.wait_for_timeout(1e3 * _SETTLE)
