@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.constraints import Constraint
+from q2r2_control.control.held_targets import HeldTargets
 from q2r2_control.control.jit import bound
 from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver
@@ -57,6 +58,8 @@ class CartesianController(WatchedPairs):
             (guard.py), so that nothing that it answers, raises or writes can break the contract.
         tasks: Your own costs, in addition to those of ``settings.tasks``.
         constraints: Your own rows, soft or hard.
+        bridge_held: Whether targets that come less often than steps are bridged, see
+            :mod:`q2r2_control.control.held_targets`. False for a loop whose targets are new at every step anyway.
 
     Raises:
         ConfigError: If an argument is of another kind, if a task or a constraint has no usable answer at home, or if
@@ -71,6 +74,7 @@ class CartesianController(WatchedPairs):
         solver: Solver | str | None = None,
         tasks: Sequence[Task] = (),
         constraints: Sequence[Constraint] = (),
+        bridge_held: bool = True,
     ) -> None:
         check_kind("robot", robot, Robot, "a Robot, as Robot.from_config and Robot.from_urdf return")
         settings = ControllerSettings() if settings is None else settings
@@ -92,6 +96,7 @@ class CartesianController(WatchedPairs):
         self._before = tuple(array.copy() for array in self._restored)  # Their values before the last step.
         self._kept_before = self._live.kept, self._objects.kept
         self._solution = np.zeros(self._nv)  # The solution of the QP, copied from the solver's array.
+        self._held = HeldTargets() if bridge_held else None
         self._targets = TargetTracker(self._model_pointer.value.tasks, self._arms, settings)
         self._compile()
         self.reset(robot.home)
@@ -144,6 +149,8 @@ class CartesianController(WatchedPairs):
         self._active.used[0] = 0
         self._live.restart()
         self._targets.reset(state.q)
+        if self._held is not None:
+            self._held.clear()
         self._obstacles.keep_clear(0.0)
         proven = start_reference(self._model_pointer, self._data_pointer)
         self._live.begin()
@@ -155,7 +162,8 @@ class CartesianController(WatchedPairs):
 
         Args:
             targets: Poses of the tools by arm, in the world frame. An arm that is missing or None holds. If a target is
-                not a finite pose, the arm keeps its last target, and the report names the arm.
+                not a finite pose, the arm keeps its last target, and the report names the arm. A target that replaces
+                one which was held for several steps, up to 110 ms, is reached within 1.25 times that time.
             dt: Duration of the step [s]. Above 0.1 s the reference moves by 0.1 s; if it is not above 0, by nothing.
             posture: Where the joints go that the tools leave free (nv,) [rad]; None for home. A posture that is not
                 finite is not used.
@@ -198,6 +206,8 @@ class CartesianController(WatchedPairs):
         check_kind("targets", targets, Mapping, _TARGETS, RobotError)
         if not _passes(dt) or dt > LONGEST_DT:
             raise RobotError(f"dt = {shown(dt)}: allowed: a number above 0, up to {LONGEST_DT:g} s")
+        if self._held is not None:
+            targets = self._held.peek(targets, float(dt))
         with put_back((*self._kernel_values, self._targets.pointer.value), (self._live, self._objects)):
             self._targets.aim_posture(posture)
             self._targets.offer(targets)
@@ -244,6 +254,8 @@ class CartesianController(WatchedPairs):
         summary = StepSummary()
         if usable and dt > time:
             self._obstacles.pass_time(float(dt) - time)
+        if self._held is not None and time > 0.0:
+            targets = self._held.between(targets, time)
         known = self._targets.offer(targets)
         if time > 0.0:
             parts = self._parts_of(time)

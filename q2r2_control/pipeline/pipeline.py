@@ -105,7 +105,7 @@ class Pipeline(RequestedRun):
         if isinstance(solver, str):
             self.config = config.model_copy(update={"control": config.control.with_solver(solver)})
             solver = None
-        self._own: dict[str, Any] = {"solver": solver, "tasks": tasks, "constraints": constraints}
+        self._own: dict[str, Any] = {"solver": solver, "tasks": tasks, "constraints": constraints, "bridge_held": False}
         self.controller = CartesianController(robot, permitted(self.config.control, self.drive), **self._own)
         self._data = robot.model.createData()
         self.listeners: list[Callable[[Tick], None]] = []

@@ -142,7 +142,9 @@ class ReplayPipeline(Pipeline):
     def _prepare(self, realtime: bool) -> None:
         settings = permitted(self.config.control.timed(realtime=False), self.drive)
         inner = solver_of(settings, self.robot.model.nv)
-        self.controller = CartesianController(self.robot, settings, solver=_Solver(inner, self._recorded))
+        self.controller = CartesianController(
+            self.robot, settings, solver=_Solver(inner, self._recorded), bridge_held=False
+        )
         super()._prepare(realtime)
 
 

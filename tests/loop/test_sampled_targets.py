@@ -55,15 +55,6 @@ def test_joints_are_hardly_ever_at_their_limits_while_a_tool_follows_sampled_tar
     assert max(off[300:]) < 0.01
 
 
-def test_targets_that_are_held_drive_a_joint_to_its_limit_in_most_steps(
-    controller: CartesianController,
-) -> None:
-    controller.reset(controller.robot.home)
-    start = controller.tool_pose("left")
-    held = (wave(start, math.floor(step * DT * 90.0) / 90.0) for step in range(1500))
-    assert share_at_limit([controller.step({"left": target}, DT).v for target in held]) > 0.5
-
-
 def test_targets_begin_at_the_tool_and_rest_at_the_newest_sample_and_end_with_a_release(
     controller: CartesianController,
 ) -> None:

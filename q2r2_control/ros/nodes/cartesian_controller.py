@@ -87,7 +87,7 @@ class CartesianControllerNode(ManagedNode):
         if isinstance(self._output.drive, TorqueDrive):
             make_impedance_live(self, self._output.drive.impedance)
         self._controller = CartesianController(
-            robot, permitted(config.control.timed(realtime=True), self._output.drive)
+            robot, permitted(config.control.timed(realtime=True), self._output.drive), bridge_held=False
         )
         make_control_live(self, self._controller)
         self._obstacles = ObstacleIntake(self, self._controller)

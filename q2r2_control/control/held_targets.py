@@ -1,0 +1,88 @@
+"""Bridges the time between targets that come less often than the controller's steps, as those of a tracker do.
+
+A target that is held until the next one stands still in most steps and jumps in one of them. The controller would
+follow each jump with a joint at its limit of acceleration. Here, a target that replaces one which was held for some
+steps is reached in 1.25 times as long, along a straight line and by a constant rotation. It therefore arrives later by
+that time. A target that changes at every step, or after more than :data:`LONGEST_HOLD`, is passed on at once.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+LONGEST_HOLD = 0.11  # A target that was held for longer was not one of a stream [s].
+_SPARE = 1.25  # A target is reached in this many times the last hold, so that the next one may come late by a quarter.
+_STEPS = 1.5  # A target that changes after fewer steps than this is new at every step, or nearly so.
+
+
+@dataclass(slots=True)
+class _Way:
+    """The way of one arm's target from an earlier pose to the newest one."""
+
+    start: pin.SE3
+    goal: pin.SE3
+    duration: float = 0.0  # [s]
+    held: float = 0.0  # How long the goal has been given [s].
+
+    def begin(self, goal: pin.SE3, dt: float) -> None:
+        """Begin a way to a new ``goal``, with steps of ``dt`` [s]. It has no length if the goals are no samples."""
+        if _STEPS * dt < self.held <= LONGEST_HOLD and _is_finite(self.goal) and _is_finite(goal):
+            self.start, self.duration = self.now(), _SPARE * self.held
+        else:
+            self.duration = 0.0
+        self.goal, self.held = goal, 0.0
+
+    def now(self) -> pin.SE3:
+        if self.held >= self.duration:
+            return self.goal
+        part, turn = self.held / self.duration, pin.log3(self.start.rotation.T @ self.goal.rotation)
+        rotation = self.start.rotation @ pin.exp3(part * turn)
+        return pin.SE3(rotation, self.start.translation + part * (self.goal.translation - self.start.translation))
+
+
+class HeldTargets:
+    """The targets of all arms, with what lies between two of them while the newest one is held."""
+
+    def __init__(self) -> None:
+        self._ways: dict[str, _Way] = {}
+
+    def clear(self) -> None:
+        """Forget all targets."""
+        self._ways.clear()
+
+    def between(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
+        """Return the targets of a step of ``dt`` [s] for the ``targets`` that were given for it."""
+        found: dict[str, pin.SE3 | None] = {}
+        for arm, pose in targets.items():
+            way = self._ways.get(arm)
+            if not isinstance(pose, pin.SE3):
+                self._ways.pop(arm, None)
+                found[arm] = pose
+                continue
+            if way is None:
+                way = self._ways[arm] = _Way(pose, pose.copy())
+            elif pose != way.goal:
+                way.begin(pose.copy(), dt)
+            way.held += dt
+            found[arm] = pose if way.held >= way.duration else way.now()
+        if len(found) < len(self._ways):
+            self._ways = {arm: way for arm, way in self._ways.items() if arm in found}
+        return found
+
+    def peek(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
+        """Return what :meth:`between` would return, and change nothing."""
+        kept = self._ways
+        try:
+            self._ways = {arm: copy.copy(way) for arm, way in kept.items()}
+            return self.between(targets, dt)
+        finally:
+            self._ways = kept
+
+
+def _is_finite(pose: pin.SE3) -> bool:
+    return bool(np.isfinite(pose.homogeneous).all())
