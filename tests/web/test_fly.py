@@ -17,11 +17,26 @@ STICK_FORWARD = """navigator.getGamepads = () => [{
     mapping: "standard", axes: [0, -1, 0, 0], buttons: Array.from({ length: 17 }, () => ({ pressed: false })) }]"""
 
 
-# Repeats do not count before the key is pressed.
-REPEATING = """code => {
-    const repeat = () => dispatchEvent(new KeyboardEvent("keydown", { code, repeat: true }));
-    window.repeating = setInterval(repeat, 40);
-}"""  # as a keyboard does, which no emulated one does
+# Presses the key in ``window.pressed`` before each look of the page at its keys, so that the key is held however slowly
+# the page draws and sends.
+HOLDING = """() => {
+    const look = requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = (then) => look((time) => {
+        if (window.pressed) dispatchEvent(new KeyboardEvent("keydown", { code: window.pressed }));
+        then(time);
+    });
+}"""
+
+
+def hold(page: Page, code: str) -> None:
+    """Press a key of the keyboard, and hold it until :func:`let_go`."""
+    page.evaluate("code => { window.pressed = code; }", code)
+    page.keyboard.down(code)
+
+
+def let_go(page: Page, code: str) -> None:
+    page.evaluate("() => { window.pressed = null; }")
+    page.keyboard.up(code)
 
 
 def targets_of_left(page: Page) -> Array:
@@ -35,17 +50,16 @@ def test_keys_and_a_gamepad_engage_an_arm_move_it_and_leave_it_when_the_page_is_
     run = start(*RUN)
     page = open_page(run.url, emulated())
     wait_until(lambda: said(page) is not None)
+    page.evaluate(HOLDING)
     page.click("#fly")
     wait_until(lambda: count(pixels(page), ORANGE) > 5)
-    page.keyboard.down("Space")
+    hold(page, "Space")
     wait_until_said(page, lambda: arms(page, "state") == ["engaged", "idle"])
-    page.keyboard.up("Space")
+    let_go(page, "Space")
     before = targets_of_left(page)
-    page.evaluate(REPEATING, "KeyW")
-    page.keyboard.down("KeyW")
+    hold(page, "KeyW")
     wait_until_said(page, lambda: targets_of_left(page)[0] > before[0] + 0.02)
-    page.evaluate("clearInterval(repeating)")
-    page.keyboard.up("KeyW")
+    let_go(page, "KeyW")
     page.evaluate(STICK_FORWARD)
     stood = targets_of_left(page)[0]
     wait_until_said(page, lambda: targets_of_left(page)[0] > stood + 0.02)
