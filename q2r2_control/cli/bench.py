@@ -51,19 +51,23 @@ _SOLVER_NOTES = (
 
 
 def bench(
-    rounds: Annotated[int | None, Option(min=1, help=f"How often: {_ROUNDS}, with --work 1.")] = None,
-    peers: Annotated[bool, Option(help="Measure roboplan, mink, pink and embodik too, where installed.")] = True,
-    work: Annotated[bool, Option("--work", help="Two-armed work motions instead of circle and contact.")] = False,
+    rounds: Annotated[
+        int | None, Option(min=1, help=f"How often each motion runs: {_ROUNDS} by default, 1 with --work.")
+    ] = None,
+    peers: Annotated[bool, Option(help="Measure also roboplan, mink, pink and embodik, if they are installed.")] = True,
+    work: Annotated[bool, Option("--work", help="Run two-armed work motions instead of circle and contact.")] = False,
     motion: Annotated[
-        list[str] | None, Option(metavar="NAME", help="With --work: only this, or such as begin so; repeatable.")
+        list[str] | None,
+        Option(metavar="NAME", help="With --work: run only motions whose names begin so. May be repeated."),
     ] = None,
     solver: Solver = None,
     json: Json = False,
 ) -> None:
-    """Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.
+    """Time a tick of the controller with both arms, all pairs and the certificate, and compare public controllers.
 
-    Also measured are errors, distances, rest and certified stops, beside ours in free air. Without --work a second
-    table has the contact motion with each QP solver that is installed; with --solver, with DAQP and that one.
+    Errors, distances, rest and certified stops are measured too, and compared with our controller in free air. Without
+    --work, a second table compares all installed QP solvers in the contact motion. With --solver, it has only DAQP and
+    that solver.
     """
     if motion and not work:
         raise ConfigError("--motion needs --work")
@@ -138,19 +142,19 @@ def _cells(row: BenchRow, figures: MotionFigures) -> tuple[Cell, ...]:
 
 
 def soak(
-    ticks: Annotated[int, Option(min=100, help="How many.")] = 1_000_000,
-    contact: Annotated[bool, Option("--contact", help="Fingers may touch table and fingers.")] = False,
+    ticks: Annotated[int, Option(min=100, help="Number of ticks.")] = 1_000_000,
+    contact: Annotated[bool, Option("--contact", help="Allow fingers to touch the table and each other.")] = False,
     policy: Annotated[
-        bool, Option("--policy", help="Hostile actions of a policy, through the whole pipeline.")
+        bool, Option("--policy", help="Send hostile actions of a policy through the whole pipeline.")
     ] = False,
-    seed: Annotated[int, Option(min=0, help="Of all that is drawn at random.")] = 0,
+    seed: Annotated[int, Option(min=0, help="Seed of all random numbers.")] = 0,
     solver: Solver = None,
     json: Json = False,
 ) -> None:
-    """Check every promise of the controller in random hostile targets, ticks, starts and solver failures.
+    """Check every promise of the controller under random hostile targets, ticks, starts and solver failures.
 
-    A healthy solver, as --solver names it, is asked at the other ticks.
-    Prints the worst margin of each promise. Exit 1 if one was broken.
+    At ticks without a solver failure, the solver that --solver names is used. The worst margin of each promise is
+    printed. Exit code 1 if a promise was broken.
     """
     config = with_solver(load_config(DEMO_CONFIG), solver)
     config = with_contact(config, FINGERS) if contact else config

@@ -56,12 +56,19 @@ def write_pairs(
 
 def check(
     config: ConfigFile,
-    pairs: Annotated[Path | None, Option(metavar="FILE", help="Write pairs that can never meet as an SRDF.")] = None,
-    samples: Annotated[int, Option(help="Random postures that --pairs looks at.")] = 20_000,
-    clearance: Annotated[float, Option(help="Pairs that stay farther apart need no watching [m].")] = 0.05,
+    pairs: Annotated[
+        Path | None, Option(metavar="FILE", help="Write the pairs that can never meet into an SRDF file.")
+    ] = None,
+    samples: Annotated[int, Option(help="Number of random postures that --pairs examines.")] = 20_000,
+    clearance: Annotated[
+        float, Option(help="With --pairs: pairs that stay farther apart are not monitored [m].")
+    ] = 0.05,
     json: Json = False,
 ) -> None:
-    """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
+    """Validate a cell and print its arms, limits, obstacles and distances at home.
+
+    Exit code 1 if home is unsafe.
+    """
     if pairs is not None:
         cell = load_config(config)
         with counting() as progress:

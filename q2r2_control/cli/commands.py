@@ -24,15 +24,14 @@ COMMANDS = (
     ListedCommand(
         "demo",
         "run:demo",
-        "Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted "
-        "hands.",
+        "Let two simulated arms hand a bar to each other and stack blocks, driven only by samples of scripted hands.",
         "Move arms",
         "q2r2 demo --viewer",
     ),
     ListedCommand(
         "run",
         "run:run",
-        "Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.",
+        "Run a cell until the duration is over or until Ctrl-C, and bring the arms to rest at the end.",
         "Move arms",
         "q2r2 run config/dual_iiwa7.yaml --input headset --host 0.0.0.0",
     ),
@@ -54,7 +53,7 @@ COMMANDS = (
     ListedCommand(
         "check",
         "check:check",
-        "Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe.",
+        "Validate a cell and print its arms, limits, obstacles and distances at home.",
         "Describe your cell",
         "q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf",
     ),
@@ -68,7 +67,7 @@ COMMANDS = (
     ListedCommand(
         "judge",
         "recordings:judge",
-        "Say of each recorded episode whether to keep or to discard it, why, and by which numbers.",
+        "Say whether to keep or to discard each recorded episode, with reasons and numbers.",
         "Data to learn from",
         "q2r2 judge recordings --json",
     ),
@@ -82,14 +81,14 @@ COMMANDS = (
     ListedCommand(
         "export",
         "recordings:export",
-        "Make a dataset to train on of recordings of q2r2 run --record, an episode each.",
+        "Make a training dataset from recordings of q2r2 run --record, with one episode for each recording.",
         "Data to learn from",
         "q2r2 export lerobot recordings --output datasets/circle --fps 30",
     ),
     ListedCommand(
         "doctor",
         "doctor:doctor",
-        "Say what this computer lacks to run a cell, a line each with what cures it; exit 1 where it cannot run it.",
+        "Say what this computer lacks to run a cell, and the cure of each fault.",
         "Devices",
         "q2r2 doctor my_cell.yaml",
     ),
@@ -103,22 +102,21 @@ COMMANDS = (
     ListedCommand(
         "fri-check",
         "fri_check:fri_check",
-        "Listen to the cabinets of a cell and say what they send; exit 1 where an arm could not be commanded.",
+        "Listen to the cabinets of a cell and say what they send.",
         "Devices",
         "q2r2 fri-check config/dual_iiwa7_fri.yaml --duration 60",
     ),
     ListedCommand(
         "fri-cabinet",
         "fri:fri_cabinet",
-        "Stand in for the Sunrise cabinets of a cell: q2r2 run CONFIG --plant fri, in another terminal, drives its "
-        "arms.",
+        "Simulate the Sunrise cabinets of a cell, whose arms q2r2 run --plant fri can drive.",
         "Devices",
         "q2r2 fri-cabinet config/dual_iiwa7_fri.yaml --period 2",
     ),
     ListedCommand(
         "commission",
         "commission:commission",
-        "Commission the arms behind real cabinets, step by step: what each has to show is asked for, or measured.",
+        "Commission the arms behind real cabinets step by step, with questions to you and with measurements.",
         "Devices",
         "q2r2 commission my_cell.yaml --duration 60",
     ),
@@ -131,14 +129,14 @@ COMMANDS = (
     ListedCommand(
         "bench",
         "bench:bench",
-        "Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.",
+        "Time a tick of the controller with both arms, all pairs and the certificate, and compare public controllers.",
         "Measure",
         "q2r2 bench --work --motion meet",
     ),
     ListedCommand(
         "soak",
         "bench:soak",
-        "Check every promise of the controller in random hostile targets, ticks, starts and solver failures.",
+        "Check every promise of the controller under random hostile targets, ticks, starts and solver failures.",
         "Measure",
         "q2r2 soak --ticks 100000 --contact",
     ),

@@ -247,15 +247,17 @@ class _Commissioning:
 
 def commission(
     config: ConfigFile,
-    duration: Annotated[float, Option(min=1, max=3600, help="Of listening to the cabinets [s].")] = 60.0,
+    duration: Annotated[
+        float, Option(min=1, max=3600, help="Time for which the messages of the cabinets are measured [s].")
+    ] = 60.0,
     tip: Tip = (0.0, 0.0, 0.0),
     json: Json = False,
 ) -> None:
-    """Commission the arms behind real cabinets, step by step: what each has to show is asked for, or measured.
+    """Commission the arms behind real cabinets step by step, with questions to you and with measurements.
 
-    Cabinets, joints, mounts, motion of each joint, loads, stops, a kill; then a sign-off is kept beside the cell,
-    without which q2r2 run asks for --i-know. Arms move at 5 % of their speed. Exit 1 where a step is not passed:
-    nothing is kept.
+    The steps are: cabinets, joints, mounts, motion of each joint, loads, stops, and a kill of the process. After them,
+    a sign-off is written beside the cell. Without it, q2r2 run asks for --i-know. The arms move at 5 % of their speed.
+    Exit code 1 if a step is not passed; then no sign-off is written.
     """
     work = _Commissioning(find_resource(config), duration, tip)
     logger = logging.getLogger("q2r2_control")

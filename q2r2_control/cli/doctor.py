@@ -41,10 +41,11 @@ def doctor(
     config: Annotated[str, Argument(metavar="[CONFIG]", help="YAML of the cell.")] = DEMO_CONFIG,
     json: Json = False,
 ) -> None:
-    """Say what this computer lacks to run a cell, a line each with what cures it; exit 1 where it cannot run it.
+    """Say what this computer lacks to run a cell, and the cure of each fault.
 
-    It looks at Python and the packages, ROS, the ports of the cell, real-time scheduling, the display, and whether a
-    headset can reach this computer. It changes nothing. With ROS, q2r2 ros doctor looks at what runs.
+    Exit code 1 if it cannot run the cell. The command examines Python and its packages, ROS, the ports of the cell,
+    real-time scheduling, the display, and whether a headset can reach this computer. It changes nothing. With ROS, q2r2
+    ros doctor examines the running nodes.
     """
     cell = load_config(config)
     for group, name in ((INPUTS, cell.input), (PLANTS, cell.plant)):

@@ -101,45 +101,53 @@ def _enter_pressed() -> bool:
 
 def fri_cabinet(
     config: ConfigFile,
-    mode: Annotated[CommandMode, Option(help="What the application lets a client command.")] = CommandMode.POSITION,
-    period: Annotated[float, Option(min=1, max=10, help="Between two messages [ms].")] = 10.0,
-    right_period: Annotated[float | None, Option(min=1, max=10, help="Of the right arm's cabinet [ms].")] = None,
-    multiplier: Annotated[int, Option(min=1, max=10, help="Messages to one answer: FRI's receiveMultiplier.")] = 1,
+    mode: Annotated[
+        CommandMode, Option(help="What the application allows a client to command.")
+    ] = CommandMode.POSITION,
+    period: Annotated[float, Option(min=1, max=10, help="Time between two messages of a cabinet [ms].")] = 10.0,
+    right_period: Annotated[
+        float | None, Option(min=1, max=10, help="The same for the right arm's cabinet, if it differs [ms].")
+    ] = None,
+    multiplier: Annotated[int, Option(min=1, max=10, help="Messages for each answer: receiveMultiplier of FRI.")] = 1,
     stiffness: Annotated[
-        float, Option(min=0, max=5000, help="Of the joint impedance under torques; it has to be 0 [Nm/rad].")
+        float, Option(min=0, max=5000, help="Stiffness of the joint impedance in mode torque; it has to be 0 [Nm/rad].")
     ] = 0.0,
     fri: Annotated[int, Option(min=1, max=2, help="Version of FRI.")] = 2,
     source_port: Annotated[
-        int | None, Option(min=0, max=65535, help="Messages come from it, not from the client's; 0: any free one.")
+        int | None,
+        Option(min=0, max=65535, help="Port that messages come from, instead of the client's; 0: any free one."),
     ] = None,
-    start_after: Annotated[float, Option(min=0, help="An overlay is started after so long with a client [s].")] = 0.5,
-    drop_every: Annotated[float | None, Option(help="The pendant ends a session as often as this [s].")] = None,
+    start_after: Annotated[float, Option(min=0, help="Time with a client after which the overlay starts [s].")] = 0.5,
+    drop_every: Annotated[float | None, Option(help="Time in a session after which the pendant ends it [s].")] = None,
     safety_stop_every: Annotated[
-        float | None, Option(help="A safety stop, for a second, ends a session as often as this [s].")
+        float | None, Option(help="Time in a session after which a safety stop of 1 s ends it [s].")
     ] = None,
     t1: Annotated[
-        bool, Option("--t1", help="Operation mode T1: a tool is not commanded faster than 250 mm/s.")
+        bool, Option("--t1", help="Operation mode T1, in which a tool must not be faster than 250 mm/s.")
     ] = False,
     wrong_load: Annotated[
-        bool, Option("--wrong-load", help="Load data do not fit the tool: no client is let command.")
+        bool, Option("--wrong-load", help="The load data do not fit the tool, so that no client may command.")
     ] = False,
-    loss: Annotated[float, Option(min=0, max=0.5, help="Share of datagrams that are lost, each way.")] = 0.0,
+    loss: Annotated[float, Option(min=0, max=0.5, help="Share of datagrams that are lost, in each direction.")] = 0.0,
     duplicate: Annotated[float, Option(min=0, max=0.5, help="Share of messages that come twice.")] = 0.0,
-    cut: Annotated[float, Option(min=0, max=0.5, help="Share of datagrams that lose their end, each way.")] = 0.0,
-    jitter: Annotated[
-        float, Option(min=0, max=20, help="Datagrams are late by up to this, and overtake others [ms].")
+    cut: Annotated[
+        float, Option(min=0, max=0.5, help="Share of datagrams that lose their end, in each direction.")
     ] = 0.0,
-    seed: Annotated[int, Option(min=0, help="Of what is lost and late.")] = 0,
-    task: Annotated[list[str] | None, Option(help="A task of q2r2 demo to be judged.")] = None,
-    duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
+    jitter: Annotated[
+        float, Option(min=0, max=20, help="Largest delay of a datagram; later ones may overtake it [ms].")
+    ] = 0.0,
+    seed: Annotated[int, Option(min=0, help="Seed of losses and delays.")] = 0,
+    task: Annotated[list[str] | None, Option(help="A task of q2r2 demo to judge. May be repeated.")] = None,
+    duration: Annotated[float | None, Option(help="Duration [s]; by default until Ctrl-C.")] = None,
     rt: RealTime = False,
     json: Json = False,
 ) -> None:
-    """Stand in for the Sunrise cabinets of a cell: q2r2 run CONFIG --plant fri, in another terminal, drives its arms.
+    """Simulate the Sunrise cabinets of a cell, whose arms q2r2 run --plant fri can drive.
 
-    Each cabinet goes through the states of a session, guards its arm's limits, and ends the session of a client that
-    breaks one, as a real one does. Enter at the terminal is the pendant's key: it stops and starts the overlays.
-    It is a rehearsal: KUKA's own controller and its safety are not in it.
+    Start q2r2 run CONFIG --plant fri in another terminal.     Like a real one, each cabinet goes through the states of
+    a session, guards the limits of its arm, and ends the session of a client that breaks a limit. The Enter key stands
+    for the key of the pendant: it stops and starts the overlays. This is only a rehearsal, because KUKA's own
+    controller and its safety functions are not simulated.
     """
     cell, console, stop = load_config(config), Console(stderr=True), StopRequest()
     if mode not in _KINDS:

@@ -111,14 +111,15 @@ def listen(plant: FriPlant, duration: float, asked: Callable[[], bool] = lambda:
 
 def fri_check(
     config: ConfigFile,
-    duration: Annotated[float, Option(min=1, max=3600, help="[s].")] = 10.0,
+    duration: Annotated[float, Option(min=1, max=3600, help="Time to listen [s].")] = 10.0,
     wait: Wait = None,
     json: Json = False,
 ) -> None:
-    """Listen to the cabinets of a cell and say what they send; exit 1 where an arm could not be commanded.
+    """Listen to the cabinets of a cell and say what they send.
 
-    Messages are answered, so the connection becomes good. Where an application starts its overlay meanwhile, the arm is
-    held where it is. Move an arm by hand guiding, and see which numbers change.
+    Exit code 1 if an arm could not be commanded. The messages are answered, so that the connection becomes good. If an
+    application starts its overlay meanwhile, the arm is held where it is. Move an arm by hand guiding, and see which
+    numbers change.
     """
     cell, stop = load_config(config), StopRequest()
     plant = FriPlant(Robot.from_config(cell), cell)

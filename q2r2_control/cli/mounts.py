@@ -24,7 +24,7 @@ from q2r2_control.types import SIDES, Array
 from q2r2_control.viewer.tables import figure_table
 from q2r2_control.wording import sentence
 
-Tip = Annotated[tuple[float, float, float], Option(help="Of either tool, where both touch, in its frame [m].")]
+Tip = Annotated[tuple[float, float, float], Option(help="Point of each tool that touches, in the tool's frame [m].")]
 _FEWEST = 3  # Least number of points.
 _MOST_APART = 5.0  # Largest distance after the fit between tips that touched the same point [mm].
 _BEYOND = 0.1  # A joint farther beyond its limits than this was probably not written in radians [rad].
@@ -84,11 +84,11 @@ def mounts(
     config: ConfigFile,
     postures: Annotated[
         Path | None,
-        Option(metavar="FILE", help="Instead of KUKA's cabinets: a line a point, joints left, right [rad]."),
+        Option(metavar="FILE", help="File instead of KUKA's cabinets: a line per point, joints left, right [rad]."),
     ] = None,
     points: Annotated[
         int | None,
-        Option(min=_FEWEST, max=20, help="That both tips touch, far apart and not on a line.  [default: 3]"),
+        Option(min=_FEWEST, max=20, help="Number of points to touch, far apart and not on a line.  [default: 3]"),
     ] = None,
     tip: Tip = (0.0, 0.0, 0.0),
     wait: Wait = None,
@@ -96,8 +96,8 @@ def mounts(
 ) -> None:
     """Find where the right arm's base is: guide both tips by hand to the same points, one after the other.
 
-    KUKA's cabinets tell where the arms are. For others write down the joints of both arms at each point. The left arm's
-    mount is taken as it is in the cell. Lines for the YAML are printed; nothing is written.
+    KUKA's cabinets send the joints of the arms. With other arms, write down the joints of both arms at each point. The
+    left arm's mount is assumed to be right. Lines for the YAML are printed; no file is written.
     """
     cell, console = load_config(config), Console(stderr=True)
     robot = Robot.from_config(cell)

@@ -34,25 +34,26 @@ SCRIPTS_WAIT_S = 60.0  # Longest wait for cabinets if nobody at a terminal can e
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
 ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
-RealTime = Annotated[bool, Option("--rt", help="Lock memory and run under SCHED_FIFO, as far as permitted.")]
+RealTime = Annotated[bool, Option("--rt", help="Lock memory and use SCHED_FIFO, as far as permitted.")]
 WebHost = Annotated[str, Option(metavar="HOST", help="Address of the page; beyond 127.0.0.1: HTTPS and a token.")]
 WebPort = Annotated[int, Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0: any free one.")]
 Wait = Annotated[
     float | None,
     Option(
-        min=0, metavar="SECONDS", help="For KUKA's cabinets to be there; by default 60, and without end at a terminal."
+        min=0, metavar="SECONDS", help="Longest wait for KUKA's cabinets; by default 60, or without end at a terminal."
     ),
 ]
-Verbose = Annotated[bool, Option("--verbose", help="All figures of the summary, not only those of the result.")]
-Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
-Task = Annotated[str | None, Option(help="With --record: what is done, noted in the recording.")]
+Verbose = Annotated[bool, Option("--verbose", help="Print all figures of the summary, not only those of the result.")]
+Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and everything else on stderr.")]
+Task = Annotated[str | None, Option(help="With --record: the task in words, which the recording keeps.")]
 Solver = Annotated[
-    str | None, Option(metavar="NAME", help="Of the QP, not control.solver: daqp, osqp, or another that is installed.")
+    str | None,
+    Option(metavar="NAME", help="QP solver, instead of control.solver: daqp, osqp, or another installed one."),
 ]
 Anonymous = Annotated[
-    bool, Option("--anonymous", help="Leave out the operator and the name of the computer that recorded.")
+    bool, Option("--anonymous", help="Leave out the names of the operator and of the recording computer.")
 ]
-Operator = Annotated[str | None, Option(help="With --record: whose hands, noted as well.")]
+Operator = Annotated[str | None, Option(help="With --record: the operator's name, which the recording keeps.")]
 
 
 def as_json_text(value: Any) -> str:

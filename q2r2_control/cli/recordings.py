@@ -43,17 +43,25 @@ from q2r2_control.viewer.web.view import PageView
 # The columns that fit into a terminal. The page has all columns.
 _SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")
 
-Recordings = Annotated[list[Path], Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them.")]
-Thresholds = Annotated[str | None, Option(metavar="CONFIG", help="The cell whose thresholds to use instead.")]
+Recordings = Annotated[list[Path], Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders with recordings.")]
+Thresholds = Annotated[
+    str | None, Option(metavar="CONFIG", help="Cell whose thresholds are used, instead of the recorded ones.")
+]
 
 
 def replay(
-    file: Annotated[str, Argument(metavar="FILE", help="The .mcap of q2r2 run --record, or its folder.")],
-    compare: Annotated[bool, Option("--compare", help="Say what first differs, or identical; exit 1 or 0.")] = False,
-    config: Annotated[str | None, Option(metavar="CONFIG", help="Another cell than the recorded one.")] = None,
-    plant: Annotated[str | None, Option(metavar="NAME", help="Let it move, and measure it.")] = None,
-    viewer: Annotated[bool, Option("--viewer", help="With --plant mujoco: its window, in real time.")] = False,
-    web: Annotated[bool, Option("--web", help="Show it in a browser with a time line; the extra `web`.")] = False,
+    file: Annotated[str, Argument(metavar="FILE", help="The .mcap file of q2r2 run --record, or its folder.")],
+    compare: Annotated[
+        bool, Option("--compare", help="Print the first difference and exit with 1, or print identical.")
+    ] = False,
+    config: Annotated[str | None, Option(metavar="CONFIG", help="Cell to use instead of the recorded one.")] = None,
+    plant: Annotated[str | None, Option(metavar="NAME", help="Move and measure this plant.")] = None,
+    viewer: Annotated[
+        bool, Option("--viewer", help="With --plant mujoco: open its window and run in real time.")
+    ] = False,
+    web: Annotated[
+        bool, Option("--web", help="Show the recording in a browser with a time line; needs the extra `web`.")
+    ] = False,
     web_host: WebHost = "127.0.0.1",
     web_port: WebPort = 8080,
     verbose: Verbose = False,
@@ -61,8 +69,8 @@ def replay(
 ) -> None:
     """Give a recorded run's hand samples and measured states to the same loop again, tick by tick.
 
-    With the same version and cell all commands are the same to the bit. Lines on stderr say what is not as it was.
-    With --plant the measured states are those of a plant that moves.
+    With the same version and cell, all commands are equal to the bit. Lines on stderr name the differences between now
+    and the time of the recording. With --plant, a plant moves, and its measured states replace the recorded ones.
     """
     if viewer:
         check_window(plant)
@@ -109,9 +117,9 @@ def replay(
 
 
 def judge(recordings: Recordings, config: Thresholds = None, json: Json = False) -> None:
-    """Say of each recorded episode whether to keep or to discard it, why, and by which numbers.
+    """Say whether to keep or to discard each recorded episode, with reasons and numbers.
 
-    Thresholds are those of the recorded cell, its block `judge`. Exit code 2 if there was a file that cannot be read.
+    The thresholds are those of the recorded cell, in its block `judge`. Exit code 2 if a file cannot be read.
     """
     found = _judged(recordings, config)
     if json:
@@ -141,12 +149,12 @@ def _print_verdicts(found: _Judgements) -> None:
 
 def report(
     recordings: Recordings,
-    output: Annotated[Path, Option(metavar="HTML", help="The page to write; one that exists is replaced.")],
+    output: Annotated[Path, Option(metavar="HTML", help="The page to write. An existing one is replaced.")],
     config: Thresholds = None,
 ) -> None:
-    """Write one HTML page of recorded episodes: verdicts, numbers and plots. It needs no network to be looked at.
+    """Write one HTML page of recorded episodes: verdicts, numbers and plots. The page needs no network.
 
-    Exit code 2 if there was a file that cannot be read; it is named on the page.
+    Exit code 2 if a file cannot be read. The page names it.
     """
     if output.is_dir() or not output.parent.is_dir():
         raise ConfigError(f"--output {output}: allowed: a file in a folder that exists")
@@ -190,33 +198,37 @@ def _judged(recordings: Sequence[Path], config: str | None) -> _Judgements:
 
 
 def export(
-    name: Annotated[str, Argument(metavar="FORMAT", help=f"One of {', '.join(FORMATS)}, or of an installed package.")],
+    name: Annotated[
+        str, Argument(metavar="FORMAT", help=f"{', '.join(FORMATS)}, or a format of an installed package.")
+    ],
     recordings: Recordings,
-    output: Annotated[Path, Option(metavar="OUT", help="A folder that does not exist yet.")],
+    output: Annotated[Path, Option(metavar="OUT", help="Folder to write, which must not exist yet.")],
     fps: Annotated[int, Option(help=f"Frames per second: 1 .. {FASTEST}.")] = 30,
-    trim: Annotated[bool, Option("--trim", help="Leave out times before and after motion.")] = False,
-    workers: Annotated[int, Option(min=1, help="Processes; the result is the same for any number.")] = 1,
+    trim: Annotated[bool, Option("--trim", help="Leave out the time before and after all motion.")] = False,
+    workers: Annotated[int, Option(min=1, help="Number of processes. It does not change the result.")] = 1,
     keep_discarded: Annotated[
-        bool, Option("--keep-discarded", help="Export episodes too that q2r2 judge discards.")
+        bool, Option("--keep-discarded", help="Export also the episodes that q2r2 judge discards.")
     ] = False,
-    skip_bad: Annotated[bool, Option("--skip-bad", help="Exit code 0 although recordings cannot be read.")] = False,
+    skip_bad: Annotated[
+        bool, Option("--skip-bad", help="End with exit code 0 even if recordings cannot be read.")
+    ] = False,
     anonymous: Anonymous = False,
-    no_pictures: Annotated[bool, Option("--no-pictures", help="Leave out what cameras recorded.")] = False,
+    no_pictures: Annotated[bool, Option("--no-pictures", help="Leave out the pictures of cameras.")] = False,
     ahead: Annotated[
         int | None,
         Option(
             metavar="FRAMES",
-            help="Put actions of so many frames later into each row; if not given, as the format has it: "
-            "1 with hdf5, 0 with lerobot and csv.",
+            help="Write the action of this many frames later into each row. The default depends on the format: "
+            "1 for hdf5, 0 for lerobot and csv.",
         ),
     ] = None,
 ) -> None:
-    """Make a dataset to train on of recordings of q2r2 run --record, an episode each.
+    """Make a training dataset from recordings of q2r2 run --record, with one episode for each recording.
 
-    lerobot: a LeRobotDataset, with a video of each camera; needs the extra `lerobot`. lerobot-v2.1: the same for openpi
-    and Isaac GR00T. hdf5: a file each, for ACT and robomimic. Both need the extra `export`. csv: tables of the same
-    numbers. Episodes that q2r2 judge discards are left out and named. Exit code 2 if there was a recording that cannot
-    be read.
+    lerobot: a LeRobotDataset with a video of each camera; needs the extra `lerobot`. lerobot-v2.1: the same for openpi
+    and Isaac GR00T; needs the extra `export`. hdf5: a file for each episode, for ACT and robomimic; needs the extra
+    `export`. csv: tables of the same numbers. Episodes that q2r2 judge discards are left out and named. Exit code 2 if
+    a recording cannot be read.
     """
     chosen = format_named(name)
     chosen.require()

@@ -88,14 +88,16 @@ def _joined(names: tuple[str, ...]) -> str:
 
 def watch(
     config: Annotated[str, Argument(metavar="[CONFIG]", help="YAML of the cell.")] = DEMO_CONFIG,
-    once: Annotated[bool, Option("--once", help="Print one table after --duration, and end.")] = False,
-    duration: Annotated[float | None, Option(help=f"[s]; {_ONCE:g} with --once or --json, else until Ctrl-C.")] = None,
+    once: Annotated[bool, Option("--once", help="Print one table after --duration, then end.")] = False,
+    duration: Annotated[
+        float | None, Option(help=f"Duration [s]; by default {_ONCE:g} with --once or --json, else until Ctrl-C.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Show nodes, topics, rates and ages of a running set, the state of each arm, and why it does not move.
 
-    It only listens, and to no command: a set runs as if nobody watched. Where stderr is no terminal it prints a line
-    for an arm whenever that changes. Exit 1 when no node of a set was heard.
+    The command only listens, and not to commands, so that it does not influence the set. If stderr is not a terminal,
+    it prints a line whenever the state of an arm changes. Exit code 1 if no node of a set was heard.
     """
     cell = load_config(config)
     duration = positive("--duration", duration) or (_ONCE if once or json else None)
@@ -142,14 +144,14 @@ def _watch_live(cell: Config, domain: str, duration: float | None) -> SetView:
 
 def doctor(
     config: Annotated[str, Argument(metavar="[CONFIG]", help="YAML of the cell.")] = DEMO_CONFIG,
-    duration: Annotated[float, Option(help="How long to listen to what runs [s].")] = _TIME,
+    duration: Annotated[float, Option(help="Time to listen to the running nodes [s].")] = _TIME,
     json: Json = False,
 ) -> None:
-    """Say what of ROS is missing, which domain and middleware are used, which nodes run and what is wrong with them.
+    """Say which parts of ROS are missing, which domain and middleware are used, which nodes run, and their faults.
 
-    Each finding stands with what helps. Like watch it takes part in nothing. Exit 1 when something was found that
-    stops the arms; where no node of a set runs, only the environment is judged. With a preset lbr_* it also looks at
-    the KUKA drivers: their topics and sessions, and the limits of their robot_description beside the cell's.
+    The cure of each fault is printed. Like watch, the command only listens. Exit code 1 if a fault stops the arms. If
+    no node of a set runs, only the environment is examined. With a preset lbr_*, the command also examines the KUKA
+    drivers: their topics and sessions, and the limits of their robot_description, compared with those of the cell.
     """
     positive("--duration", duration)
     cell = load_config(config)
@@ -201,11 +203,12 @@ class RobotSource(StrEnum):
 
 @app.command("build-interfaces", epilog="Example: q2r2 ros build-interfaces")
 def build_interfaces_command(
-    force: Annotated[bool, Option("--force", help="Build again what this environment holds.")] = False,
+    force: Annotated[bool, Option("--force", help="Build packages again that this environment has already.")] = False,
 ) -> None:
     """Build the message packages that cannot be imported: quest2ros, lbr_fri_idl, and tf2_msgs and control_msgs.
 
-    They land in the running virtual environment; what a sourced ROS has is left alone. Exit 1 when a tool is missing.
+    The packages are installed into the running virtual environment. A sourced ROS is not changed. Exit code 1 if a tool
+    is missing.
     """
     try:
         build_interfaces(lambda line: print(line, flush=True), force)
@@ -233,25 +236,33 @@ class _WithRosArguments(TyperCommand):
 def up(
     context: typer.Context,
     config: Annotated[str, Argument(metavar="CONFIG", help="YAML of the cell.")],
-    input: Annotated[str | None, Option(metavar="NAME", help="An installed input, or none for another node.")] = None,
-    robot: Annotated[RobotSource, Option(help="auto: mujoco for controller: builtin, else none.")] = RobotSource.AUTO,
+    input: Annotated[
+        str | None, Option(metavar="NAME", help="An installed input, or none if another node is the input.")
+    ] = None,
+    robot: Annotated[
+        RobotSource, Option(help="auto: mujoco if the cell has controller: builtin, else none.")
+    ] = RobotSource.AUTO,
     record: Annotated[str | None, Option(metavar="DIR", help="Record all topics to a new folder in DIR.")] = None,
-    separate: Annotated[bool, Option("--separate", help="A process an arm, which its hand alone stops.")] = False,
-    web: Annotated[bool, Option("--web", help="Show the set in a browser; the extra `web`.")] = False,
+    separate: Annotated[
+        bool, Option("--separate", help="Run each arm in its own process. Only its own hand stops it.")
+    ] = False,
+    web: Annotated[bool, Option("--web", help="Show the set in a browser; needs the extra `web`.")] = False,
     web_host: WebHost = "127.0.0.1",
     web_port: WebPort = 8080,
     task: Task = None,
     operator: Operator = None,
     anonymous: Anonymous = False,
-    namespace: Annotated[str | None, Option(metavar="NAME", help="Of all nodes, such as /cell.")] = None,
-    sim_time: Annotated[bool, Option("--sim-time", help="Take the time from /clock: use_sim_time.")] = False,
+    namespace: Annotated[str | None, Option(metavar="NAME", help="Namespace of all nodes, such as /cell.")] = None,
+    sim_time: Annotated[
+        bool, Option("--sim-time", help="Set use_sim_time, so that nodes take the time from /clock.")
+    ] = False,
 ) -> None:
     """Start what a cell needs as ROS nodes, until Ctrl-C: robot, controller, the arms' teleop and an input.
 
-    With controller: external the robot and its controllers are yours. The arms' teleop and an input run here, and in
-    mode filtered the built-in controller between both. A node that ends by itself is reported, and all others are
-    stopped: exit 1. Exit 3 when the recording failed. Words after --ros-args are for all nodes: remappings, and
-    parameters as NODE:NAME:=VALUE.
+    With controller: external, you start the robot and its controllers yourself. This command then starts the arms'
+    teleop and an input, and in mode filtered also the built-in controller between them. If a node ends by itself, it is
+    reported, and all others are stopped with exit code 1. Exit code 3 if the recording failed. Words after --ros-args
+    are for all nodes: remappings, and parameters as NODE:NAME:=VALUE.
     """
     notes = notes_of(task, operator, record, anonymous)
     if record is not None:

@@ -70,32 +70,36 @@ _FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
 
-Fast = Annotated[bool, Option("--fast", help="Simulated time, as fast as it can, repeatable.")]
-Headless = Annotated[bool, Option("--headless", help="No live table, no window.")]
+Fast = Annotated[bool, Option("--fast", help="Use simulated time, as fast as possible. Results are repeatable.")]
+Headless = Annotated[bool, Option("--headless", help="Show no live table and no window.")]
 Viewer = Annotated[bool, Option("--viewer", help="Open MuJoCo's window; closing it ends the run.")]
-Human = Annotated[bool, Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
-Seed = Annotated[int, Option(min=0, help="Of what --human adds.")]
+Human = Annotated[bool, Option("--human", help="Let scripted hands tremble, and samples be lost or late.")]
+Seed = Annotated[int, Option(min=0, help="Seed of the random numbers of --human.")]
 Record = Annotated[Path | None, Option(metavar="DIR", help="Record the run to a new folder in DIR.")]
-Web = Annotated[bool, Option("--web", help="Show the run in a browser, at http://127.0.0.1:8080; the extra `web`.")]
+Web = Annotated[bool, Option("--web", help="Show the run at http://127.0.0.1:8080; needs the extra `web`.")]
 
-Host = Annotated[str | None, Option(help="Address to bind, not the config's; 0.0.0.0: all, :: IPv6 too.")]
-Port = Annotated[int | None, Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
+Host = Annotated[str | None, Option(help="Address to bind, instead of the config's; 0.0.0.0: all, :: IPv6 too.")]
+Port = Annotated[int | None, Option(min=0, max=65535, help="Port, instead of the config's; 0: any free port.")]
 Usb = Annotated[bool, Option("--usb", help="webxr: the headset is on a USB cable; its page is http://localhost:8443.")]
-Certificate = Annotated[Path | None, Option(metavar="FILE", help="webxr: PEM of your own certificate and its key.")]
+Certificate = Annotated[Path | None, Option(metavar="FILE", help="webxr: PEM file with your certificate and its key.")]
 
 
 def run(
     config: ConfigFile,
     input: Annotated[str | None, Option(metavar="NAME", help="An installed input; by default the cell's.")] = None,
     plant: Annotated[str | None, Option(metavar="NAME", help="An installed plant; by default the cell's.")] = None,
-    mode: Annotated[CommandMode, Option(help="What the plant gets; torque: arms that yield.")] = (CommandMode.POSITION),
-    duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
+    mode: Annotated[
+        CommandMode, Option(help="Commands to the plant. With torque, arms yield when they are pushed.")
+    ] = (CommandMode.POSITION),
+    duration: Annotated[float | None, Option(help="Duration [s]; by default until Ctrl-C.")] = None,
     fast: Fast = False,
-    trajectory: Annotated[str | None, Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
+    trajectory: Annotated[str | None, Option(help=f"With --input scripted: {', '.join(TRAJECTORIES)}.")] = None,
     human: Human = False,
     seed: Seed = 0,
-    policy: Annotated[str | None, Option(metavar="MODULE:NAME", help="With --input policy: what drives.")] = None,
-    takeover: Annotated[str | None, Option(metavar="NAME", help="The same: an input whose hands take over.")] = None,
+    policy: Annotated[str | None, Option(metavar="MODULE:NAME", help="With --input policy: the policy.")] = None,
+    takeover: Annotated[
+        str | None, Option(metavar="NAME", help="With --input policy: input whose hands may take over.")
+    ] = None,
     solver: Solver = None,
     host: Host = None,
     port: Port = None,
@@ -111,21 +115,23 @@ def run(
     task: Task = None,
     operator: Operator = None,
     anonymous: Anonymous = False,
-    force: Annotated[bool, Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
-    i_know: Annotated[bool, Option("--i-know", help="Run real cabinets without q2r2 commission.")] = False,
-    full_speed: Annotated[bool, Option("--full-speed", help="Run real cabinets faster than a tenth.")] = False,
+    force: Annotated[bool, Option("--force", help="Run even if q2r2 check finds a fault.")] = False,
+    i_know: Annotated[bool, Option("--i-know", help="Run real cabinets that are not commissioned.")] = False,
+    full_speed: Annotated[
+        bool, Option("--full-speed", help="Run real cabinets at full speed, not a tenth of it.")
+    ] = False,
     wait: Wait = None,
     verbose: Verbose = False,
     json: Json = False,
 ) -> None:
-    """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
+    """Run a cell until the duration is over or until Ctrl-C, and bring the arms to rest at the end.
 
-    A cell in which q2r2 check finds a fault is refused with the same lines and exit code 2, unless --force is given.
-    One with real cabinets that is not commissioned is refused too, unless --i-know is given. Its joints go at a tenth
-    of their speed until --full-speed is given.
-    Exit 1 where a tool is more than 100 mm from its reference at the end, an arm refused every press that engages it,
-    measured links met in torque mode, a tick had no certificate, or an arm still moves at the end. Exit 3 where all
-    that went well, and the recording ended before the run did: a full disk, a writer that was killed.
+    A cell in which q2r2 check finds a fault is refused with the same lines and exit code 2, unless --force is given. A
+    cell with real cabinets that is not commissioned is refused too, unless --i-know is given. The joints of real
+    cabinets move at a tenth of their speed, unless --full-speed is given.
+    Exit code 1 if a tool is more than 100 mm from its reference at the end, if an arm refused every press that engages
+    it, if measured links met in torque mode, if a tick had no certificate, or if an arm still moves at the end. Exit
+    code 3 if there is no such fault, but the recording ended before the run, as with a full disk or a killed writer.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
     cell = with_solver(load_config(config), solver)
@@ -177,39 +183,44 @@ def run(
 
 
 def demo(
-    tasks: Annotated[list[str] | None, Argument(metavar=_TASKS, help=f"By default handover stack. {_ABOUT}.")] = None,
+    tasks: Annotated[
+        list[str] | None, Argument(metavar=_TASKS, help=f"Tasks in their order; by default handover stack. {_ABOUT}.")
+    ] = None,
     mode: Annotated[
         CommandMode | None,
-        Option(help="What the arms get; by default torque, for arms that yield, and position by FRI."),
+        Option(help="Commands to the arms; by default torque, so that the arms yield, but position with --plant fri."),
     ] = None,
-    plant: Annotated[str, Option(metavar="[mujoco|fri]", help="fri: through two KUKA cabinets that are simulated.")] = (
+    plant: Annotated[str, Option(metavar="[mujoco|fri]", help="fri: arms behind two simulated KUKA cabinets.")] = (
         "mujoco"
     ),
     period: Annotated[
-        float, Option(min=1, max=10, help="With --plant fri: between two messages of a cabinet [ms].")
+        float, Option(min=1, max=10, help="With --plant fri: time between two messages of a cabinet [ms].")
     ] = 10.0,
-    duration: Annotated[float | None, Option(help="Ends earlier [s].")] = None,
+    duration: Annotated[float | None, Option(help="End the run earlier, after this time [s].")] = None,
     fast: Fast = False,
     viewer: Viewer = False,
     headless: Headless = False,
     web: Web = False,
     web_host: WebHost = "127.0.0.1",
     web_port: Annotated[
-        int | None, Option(min=0, max=65535, metavar="PORT", help=f"Port of the page; 0: any free one. Else {_PORT}.")
+        int | None,
+        Option(min=0, max=65535, metavar="PORT", help=f"Port of the page; 0: any free one; by default {_PORT}."),
     ] = None,
     human: Human = False,
     hands: Annotated[
         str | None,
         Option(
-            metavar="[careful|shaky]", help="careful: as --human; shaky: faster, 2 mm of tremor, lost for a second."
+            metavar="[careful|shaky]",
+            help="careful: same as --human; shaky: faster, 2 mm of tremor, lost for a second.",
         ),
     ] = None,
     seed: Seed = 0,
     seeds: Annotated[
-        int | None, Option(min=1, help="Try each task so often with --human, in simulated time; count successes.")
+        int | None,
+        Option(min=1, help="Try each task this many times with --human in simulated time, and count successes."),
     ] = None,
     spread: Annotated[
-        float, Option(min=0, max=LARGEST_SPREAD, help="Parts lie elsewhere, as --seed has it, by up to so much [m].")
+        float, Option(min=0, max=LARGEST_SPREAD, help="Largest displacement of the parts, which --seed draws [m].")
     ] = 0.0,
     record: Record = None,
     anonymous: Anonymous = False,
@@ -218,14 +229,14 @@ def demo(
     verbose: Verbose = False,
     json: Json = False,
 ) -> None:
-    """Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted hands.
+    """Let two simulated arms hand a bar to each other and stack blocks, driven only by samples of scripted hands.
 
-    At a terminal the arms are shown in MuJoCo's window, or in a browser where there is no display. With --plant fri all
-    processes have real-time priority where that is permitted, as with --rt: cabinets do not wait for a busy computer.
-    The summary has a line for each task, as the simulation measured it. Exit code 1 where one did not succeed.
-    With --record, whether all succeeded is in the recording, of which q2r2 report makes plots. Exit code 3 where the
-    recording ended before the run did.
-    With --seeds, exit code 1 where a task succeeded in less than 19 of 20 trials.
+    At a terminal, the arms are shown in MuJoCo's window, or in a browser if there is no display. With --plant fri, all
+    processes have real-time priority as with --rt, if that is permitted, because cabinets do not wait for a busy
+    computer.
+    The summary has a line for each task, with the result that the simulation measured. Exit code 1 if a task failed.
+    With --record, the recording says whether all tasks succeeded, and q2r2 report makes plots of it. Exit code 3 if the
+    recording ended before the run. With --seeds, exit code 1 if a task succeeded in less than 19 of 20 trials.
     """
     _check_times(fast, rt)
     if plant not in ("mujoco", "fri"):
@@ -315,19 +326,23 @@ def _shows_table(headless: bool, viewer: bool) -> bool:
 
 
 def headset_check(
-    config: Annotated[str, Argument(metavar="[CONFIG]", help="Whose address and teleop.axes to use.")] = (DEMO_CONFIG),
-    input: Annotated[str, Option(metavar="[headset|webxr]", help="Quest2ROS, or a page in its browser.")] = "headset",
+    config: Annotated[str, Argument(metavar="[CONFIG]", help="Cell whose address and teleop.axes are used.")] = (
+        DEMO_CONFIG
+    ),
+    input: Annotated[
+        str, Option(metavar="[headset|webxr]", help="headset: Quest2ROS; webxr: a page in the headset's browser.")
+    ] = "headset",
     host: Host = None,
     port: Port = None,
     usb: Usb = False,
     certificate: Certificate = None,
-    duration: Annotated[float | None, Option(help="[s]; without it, until Ctrl-C.")] = None,
+    duration: Annotated[float | None, Option(help="Duration [s]; by default until Ctrl-C.")] = None,
     json: Json = False,
 ) -> None:
     """Show what a headset sends: connection, rates, ages, last values, and which way each hand moves.
 
-    Move a hand forwards, to the left, up: where the words do not agree, change teleop.axes in the config.
-    Exit 1 unless poses and inputs came of every hand that leads an arm; without both, run has nothing to engage.
+    Move a hand forwards, to the left, and up. If the printed directions differ, change teleop.axes in the config.
+    Exit code 1 if poses or inputs of a hand that leads an arm did not come. Without them, the arm cannot be engaged.
     """
     console, stop = Console(stderr=True), StopRequest()
     positive("--duration", duration)
