@@ -1,4 +1,7 @@
-"""Figures of a work motion are those of the motion, of ours and of peers; the bench has all go through the same."""
+"""Figures of a work motion describe the motion, our controller and peers
+
+the bench gives all of them the same motion.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ SHORT = replace(
 
 
 class Standing:
-    """Stands still but for one joint in one tick, and has no solution in another one."""
+    """A controller that stands still, except for one joint in one tick, and that has no solution in another tick."""
 
     name, limitations = "standing", "everything"
 
@@ -42,7 +45,7 @@ class Standing:
 
     def reset(self, q: Array) -> None:
         self._q, self._tick = q, -1
-        self.given: list[pin.SE3] = []  # targets of the left tool
+        self.given: list[pin.SE3] = []  # Targets of the left tool.
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
         self.given.append(targets["left"])
@@ -92,13 +95,13 @@ def test_what_happens_during_the_approach_is_not_measured(robot: Robot) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("goal", "arrival"), [(0.0099, 0.0), (0.0101, None)])
-def test_who_is_within_10_mm_of_the_goal_has_arrived(robot: Robot, goal: float, arrival: float | None) -> None:
+def test_a_tool_within_10_mm_of_the_goal_has_arrived(robot: Robot, goal: float, arrival: float | None) -> None:
     away = replace(SHORT, path=lambda t, home: home + np.array([[0.0, goal, 0.0], [0.0, 0.0, 0.0]]))
     assert run_motion(Standing(), robot, away).arrival_s == arrival
     assert run_motion(Standing(), robot, replace(away, has_goal=False)).arrival_s is None
 
 
-def test_who_leaves_the_goal_has_arrived_when_it_is_back_for_good(robot: Robot) -> None:
+def test_a_tool_that_leaves_the_goal_has_arrived_when_it_is_back_for_good(robot: Robot) -> None:
     way = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     there_and_back = replace(SHORT, path=lambda t, home: home + 0.2 * min(t, 0.2 - t) * way)
     figures = run_motion(OwnController(robot, CONFIG), robot, there_and_back)
@@ -107,14 +110,14 @@ def test_who_leaves_the_goal_has_arrived_when_it_is_back_for_good(robot: Robot) 
     assert 0.1 < figures.arrival_s < 0.4
 
 
-def test_a_controller_that_is_too_slow_to_wait_for_says_how_far_it_got(robot: Robot) -> None:
+def test_the_report_says_how_far_a_too_slow_controller_got(robot: Robot) -> None:
     figures = run_motion(Standing(), robot, SHORT, patience=0.0)
     assert figures.done < 0.01
     assert figures == MotionFigures("short", "standing", figures.done)
 
 
 @pytest.mark.slow
-def test_a_row_has_ours_in_free_air_and_near_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_row_has_our_controller_in_free_air_and_near_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PEERS, "missing", "no_such_package_anywhere")
     monkeypatch.setitem(PEERS, "broken", "json")
     said: list[str] = []
@@ -126,17 +129,17 @@ def test_a_row_has_ours_in_free_air_and_near_the_pairs(monkeypatch: pytest.Monke
     assert report.notes[0] == f"missing: not installed; {INSTALL}"
     assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
     assert ours.min_distance_mm is not None
-    assert ours.min_distance_mm >= 1.0  # fingers and obstacles
+    assert ours.min_distance_mm >= 1.0  # The nearest pair is one of fingers and obstacles.
     assert row.free_air.rms_error_mm is not None
     assert ours.rms_error_mm is not None
-    # It is asked for 10 mm that the table does not allow.
+    # The target is 10 mm lower than the table allows.
     assert row.free_air.rms_error_mm < 2.0 < 9.0 < ours.rms_error_mm
     assert ours.times_us is not None
     assert list(ours.times_us) == sorted(ours.times_us)
     assert (ours.motion, ours.controller) == ("slide", "q2r2_control")
 
 
-def test_a_peer_is_given_its_target_ahead_by_speed_over_gain() -> None:
+def test_the_target_of_a_peer_is_ahead_by_speed_over_gain() -> None:
     peer = Standing()
     leading = Leading(peer, gain=8.0)
     leading.reset(np.ones(14))
@@ -145,7 +148,7 @@ def test_a_peer_is_given_its_target_ahead_by_speed_over_gain() -> None:
         pose = pin.SE3(pin.exp3(tick * turn), np.array([0.0004 * tick, 0.0, 0.1]))
         leading.step({"left": pose}, 0.001)
     assert peer.given[0].isApprox(pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.1])), 1e-15)
-    # 0.4 m/s and 1 rad/s, an eighth of a second ahead.
+    # The target is ahead by an eighth of a second at 0.4 m/s and 1 rad/s.
     np.testing.assert_allclose(peer.given[2].translation, [0.0008 + 0.05, 0.0, 0.1], atol=1e-12)
     np.testing.assert_allclose(pin.log3(peer.given[2].rotation), [0.0, 0.0, 0.002 + 0.125], atol=1e-12)
     assert (leading.hold()[0] == 1.0).all()

@@ -50,7 +50,7 @@ def test_a_peer_stays_at_its_targets_and_goes_to_others_within_the_limits(peer: 
         np.testing.assert_allclose(q - before, v * DT, atol=1e-12)
     for arm, pose in goals.items():
         error = ROBOT.tool_pose(q, arm).actInv(pose)
-        # The rest is the posture's pull, which weighs a thousandth of the tool's.
+        # The remaining error comes from the posture task, whose weight is a thousandth of the tool task's.
         assert np.linalg.norm(error.translation) < 0.001
         assert np.linalg.norm(pin.log3(error.rotation)) < 0.002
 
@@ -61,7 +61,7 @@ def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_we_do(peer: Bench
     peer.reset(ROBOT.home)
     goals = {arm: pin.SE3(pose.rotation, pose.translation + 0.1) for arm, pose in HOME.items()}
     _, v = peer.step(goals, DT)
-    # roboplan's solver tolerance, 1e-6 rad in a tick, is a tenth of what the limit allows.
+    # The tolerance of roboplan's solver, 1e-6 rad in a tick, is a tenth of what the limit allows.
     limit = ROBOT.capped_acceleration(CONFIG.control.acceleration_limit)
     assert (np.abs(v) <= 1.25 * limit * DT).all()
 
@@ -69,7 +69,7 @@ def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_we_do(peer: Bench
 @pytest.mark.slow
 def test_a_peer_follows_in_free_motion_as_well_as_its_gain_allows(peer: BenchController) -> None:
     figures = run_motion(Leading(peer, CONFIG.control.position_gain), ROBOT, WORK_MOTIONS["reach-under"])
-    # Without the lead it would lag 35 mm at the target's 0.28 m/s.
+    # Without the lead, the tool would be 35 mm late at the target's 0.28 m/s.
     assert figures.max_error_mm is not None
     assert figures.max_error_mm < 5.0
     assert figures.arrival_s is not None

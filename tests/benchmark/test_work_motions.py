@@ -1,4 +1,4 @@
-"""Work motions ask for what arms can be asked: from home, without jumps, at bounded speed, with rest at the end."""
+"""Work motions can be followed: they begin at home, have no jumps, keep their speed bounded, and end at rest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 DT = 0.001
-FASTEST, STRONGEST = 0.55, 5.0  # of a target [m/s], [m/s^2]
+FASTEST, STRONGEST = 0.55, 5.0  # Largest speed [m/s] and acceleration [m/s^2] of a target.
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def start() -> dict[str, pin.SE3]:
 
 
 def ways(motion: WorkMotion, start: dict[str, pin.SE3]) -> Array:
-    """Positions (n, arms, 3) of the targets at every tick."""
+    """Return the positions (n, arms, 3) of the targets at every tick."""
     ticks = range(round(motion.ends / DT))
     return np.array([[pose.translation for pose in motion.targets(tick * DT, start).values()] for tick in ticks])
 
@@ -54,12 +54,12 @@ def test_a_carry_keeps_its_gap_and_has_the_speed_of_its_name(
     motion = WORK_MOTIONS[f"carry-{gap:.2f}-{speed:.2f}"]
     carried = ways(motion, start)[round(motion.begins / DT) :]
     np.testing.assert_allclose(carried[:, 0] - carried[:, 1], np.tile([0.0, gap, 0.0], (len(carried), 1)), atol=1e-12)
-    # Sideways goes the whole speed, up and down half of it.
+    # The sideways motion has the whole speed, and the motion up and down half of it.
     assert np.abs(np.diff(carried[:, 0, 0])).max() / DT == pytest.approx(speed, rel=1e-3)
     np.testing.assert_allclose(carried[-1], carried[0], atol=1e-9)
 
 
-def test_motions_are_found_by_their_names_and_by_what_these_begin_with() -> None:
+def test_motions_are_found_by_their_names_and_by_the_first_letters_of_these() -> None:
     assert [motion.name for motion in motions_named(["swap", "pass", "pass"])] == ["pass", "pass-back", "swap"]
     assert {motion.name for motion in motions_named(["carry-0.16"])} == {
         f"carry-0.16-{speed}" for speed in ("0.04", "0.15", "0.30", "0.50")
