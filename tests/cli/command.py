@@ -22,7 +22,7 @@ def q2r2(*arguments: str, typed: str | None = None) -> Result:
 
 
 def one_object(text: str) -> dict[str, Any]:
-    """The one JSON object on the one line that stdout has to be."""
+    """Return the JSON object on the only line of stdout."""
     assert text.count("\n") == 1
     found = json.loads(text, parse_constant=pytest.fail)
     assert isinstance(found, dict)
@@ -30,7 +30,7 @@ def one_object(text: str) -> dict[str, Any]:
 
 
 def changed_cell(folder: Path, old: str, new: str) -> str:
-    """The shipped cell in a file of its own, with another text in it."""
+    """Return a file with the shipped cell, in which one text is replaced."""
     text = find_resource(CELL).read_text(encoding="utf-8")
     assert old in text
     file = folder / "cell.yaml"

@@ -1,4 +1,4 @@
-"""The output of commands does not depend on what is in the cache of kernels; cabinets that stand in for KUKA's."""
+"""Fixtures for commands: no notices about the cache of kernels, and simulated KUKA cabinets."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def _no_notice_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kernels may have to be compiled in any test."""
+    """Any test may have to compile kernels, so notices about this are switched off."""
     monkeypatch.setattr("q2r2_control.cli.output.compiling", nullcontext)
 
 
 @pytest.fixture
 def fri_cell(tmp_path: Path) -> str:
-    """The shipped cell on ports that are free."""
+    """The shipped cell on free ports."""
     text = Path("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
     for port in ("30200", "30201"):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
@@ -32,7 +32,7 @@ def fri_cell(tmp_path: Path) -> str:
 
 @pytest.fixture
 def cabinets(fri_cell: str) -> Iterator[None]:
-    """Those of ``fri_cell`` that stand in, in a process of their own."""
+    """Simulated cabinets of ``fri_cell``, in their own process."""
     command = (sys.executable, "-m", "q2r2_control", "fri-cabinet", fri_cell)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None

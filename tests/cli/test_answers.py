@@ -1,4 +1,4 @@
-"""Answers outlast a command that was interrupted or failed, and are offered about the same things only."""
+"""Answers outlast a command that was interrupted or failed. They are offered again only for the same subject."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def offered(monkeypatch: pytest.MonkeyPatch, *typed: Any) -> list[Any]:
-    """The defaults that are offered from now on, while ``typed`` is answered; None: what is offered is accepted."""
+    """Return the defaults that are offered from now on, while ``typed`` is answered. None accepts each default."""
     seen: list[Any] = []
     left = list(typed)
 
@@ -32,7 +32,7 @@ def offered(monkeypatch: pytest.MonkeyPatch, *typed: Any) -> list[Any]:
     return seen
 
 
-def test_the_next_try_offers_what_was_answered_and_not_what_was_accepted(
+def test_the_next_try_offers_given_answers_but_not_accepted_defaults(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = offered(monkeypatch, 0.4, None, None, None)
@@ -49,7 +49,7 @@ def test_the_next_try_offers_what_was_answered_and_not_what_was_accepted(
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"about": {"left": "panda"}, "answers": {"height": 3.0}}'])
-def test_a_file_about_something_else_or_a_damaged_one_is_not_offered(
+def test_a_file_about_another_subject_and_a_damaged_file_are_not_offered(
     text: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file.write_text(text)
@@ -65,7 +65,7 @@ def test_an_answer_of_another_kind_is_not_offered(file: Path, monkeypatch: pytes
     assert seen == [0.1]
 
 
-def test_nothing_is_asked_offered_or_kept_where_all_is_taken_as_found(
+def test_nothing_is_asked_offered_or_kept_if_all_defaults_are_accepted(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     offered(monkeypatch, 0.4)

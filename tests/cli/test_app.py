@@ -96,7 +96,7 @@ def test_a_fast_run_prints_one_json_object_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("option", ["--plant fri", "--viewer", "--rt", "--duration 4", "--seed 3", "--record rec"])
-def test_trials_of_a_demo_refuse_what_is_for_one_run(option: str) -> None:
+def test_trials_of_a_demo_refuse_options_of_a_single_run(option: str) -> None:
     done = q2r2("demo", "grasp", "--seeds", "2", *option.split())
     assert done.exit_code == 2
     assert f"{option.split()[0]}" in done.stderr
@@ -104,7 +104,7 @@ def test_trials_of_a_demo_refuse_what_is_for_one_run(option: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_demo_says_of_a_task_that_did_not_succeed_why_and_so_does_its_exit_code(
+def test_a_failed_task_of_the_demo_is_explained_and_changes_the_exit_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     coarse = load_config(CELL).model_copy(update={"loop_rate_hz": 200.0})
@@ -129,7 +129,7 @@ def test_bench_times_free_motion_and_contact_or_the_work_motions_that_are_asked_
 
 
 @pytest.mark.parametrize("command", [("run", CELL), ("demo",), ("demo", "--plant", "fri")], ids=" ".join)
-def test_a_run_gets_the_solver_of_its_option(command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_uses_the_solver_of_its_option(command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[str] = []
 
     def run_cell(config: Config, options: Any) -> Any:
@@ -143,7 +143,7 @@ def test_a_run_gets_the_solver_of_its_option(command: tuple[str, ...], monkeypat
     assert chosen == ["daqp", "osqp"]
 
 
-def test_trials_of_a_demo_get_the_solver_of_its_option(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trials_of_a_demo_use_the_solver_of_its_option(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[str] = []
 
     def try_tasks(config: Config, *given: Any) -> list[Any]:
@@ -155,13 +155,13 @@ def test_trials_of_a_demo_get_the_solver_of_its_option(monkeypatch: pytest.Monke
     assert chosen == ["osqp"]
 
 
-def test_a_soak_asks_the_solver_of_its_option_and_says_so() -> None:
+def test_a_soak_uses_the_solver_of_its_option_and_names_it() -> None:
     report = one_object(q2r2("soak", "--ticks", "100", "--solver", "osqp", "--json").stdout)
     assert (report["solver"], report["passed"]) == ("osqp", True)
 
 
 @pytest.mark.slow
-def test_a_soak_prints_every_promise_and_ends_in_0_when_all_were_kept() -> None:
+def test_a_soak_prints_every_promise_and_exits_with_0_if_all_were_kept() -> None:
     result = q2r2("soak", "--ticks", "400", "--seed", "1", "--json")
     report = one_object(result.stdout)
     assert (result.exit_code, report["passed"], report["ticks"]) == (0, True, 400)
@@ -169,7 +169,7 @@ def test_a_soak_prints_every_promise_and_ends_in_0_when_all_were_kept() -> None:
     assert "acceleration / limit" in q2r2("soak", "--ticks", "100").stdout
 
 
-def test_a_soak_that_finds_something_ends_in_1(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_soak_that_finds_a_broken_promise_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*arguments: Any) -> SoakReport:
         report = run_soak(*arguments)
         report.margins[0].note(1.0, 7)

@@ -1,4 +1,4 @@
-"""A window beside a run: what it is shown, and that closing it ends the run."""
+"""The window of a run shows moving obstacles, and closing it ends the run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HAND = MovingObstacle(shape="sphere", size=(0.1,), position=(0.9, 0.0, 0.6), spe
 
 
 class PlantWithWindow(RecordingPlant):
-    """Its window is closed after some looks."""
+    """A plant whose window is closed after some redraws."""
 
     def __init__(self, looks: int) -> None:
         super().__init__()

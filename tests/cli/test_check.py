@@ -1,4 +1,4 @@
-"""q2r2 check: what a cell consists of, what is wrong with it, and the pairs that it finds."""
+"""q2r2 check lists the parts of a cell, its faults, and the pairs that can never meet."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_check_prints_arms_limits_obstacles_and_the_nearest_pairs_of_a_good_cell
 
 
 def other_arms(folder: Path, pattern: str, new: str) -> str:
-    """The shipped cell with arms of its own, in whose model each text that fits ``pattern`` is another one."""
+    """Return the shipped cell with changed models of its arms. Each text that fits ``pattern`` is replaced."""
     text = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
     (folder / "other.urdf").write_text(re.sub(pattern, new, text, flags=re.DOTALL), encoding="utf-8")
     cell = find_resource(CELL).read_text(encoding="utf-8").replace("model: iiwa7", f"model: {folder / 'other.urdf'}")
@@ -72,7 +72,7 @@ def test_check_refuses_arms_that_a_run_refuses(tmp_path: Path, pattern: str, new
         ("home: [", "home: [0.1, ", "home"),
     ],
 )
-def test_check_names_a_fault_in_both_arms_for_both(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_check_names_both_arms_if_both_have_the_fault(tmp_path: Path, old: str, new: str, fault: str) -> None:
     (file := tmp_path / "cell.yaml").write_text(find_resource(CELL).read_text(encoding="utf-8").replace(old, new))
     checked, ran = q2r2("check", str(file)), q2r2("run", str(file), "--fast", "--headless", "--duration", "0.1")
     assert (checked.exit_code, ran.exit_code) == (2, 2)
@@ -97,7 +97,7 @@ def test_a_heavy_link_without_a_shape_is_a_fault_until_the_cell_names_it(tmp_pat
     assert "NOTE unchecked_links: nothing keeps left_link_3, right_link_3 off anything\n" in named.stdout
 
 
-def test_check_and_run_list_everything_that_is_wrong_in_a_file(tmp_path: Path) -> None:
+def test_check_and_run_list_all_faults_of_a_file(tmp_path: Path) -> None:
     (file := tmp_path / "cell.yaml").write_text(
         "name: cell\narms: {left: {model: iiwa7, home: [0, 0, 0, 0, 0, 0, up]}}\nfloor: low\n"
         "control: {solvr: daqp, min_distance: -1}\n",
@@ -122,7 +122,7 @@ def test_check_and_run_list_everything_that_is_wrong_in_a_file(tmp_path: Path) -
     assert found["verdict"] == "this cell cannot run: 4 faults"
 
 
-def test_a_model_that_cannot_be_read_has_a_verdict_too(tmp_path: Path) -> None:
+def test_a_model_that_cannot_be_read_gets_a_verdict_too(tmp_path: Path) -> None:
     result = q2r2("check", changed_cell(tmp_path, "model: iiwa7", "model: iiwa8"))
     assert (result.exit_code, result.stdout) == (2, "this cell cannot run: 1 fault\n")
     assert "iiwa8" in result.stderr
@@ -136,7 +136,7 @@ def test_check_compiles_no_kernel(tmp_path: Path) -> None:
     assert not any(tmp_path.rglob("*.nb?"))
 
 
-def test_check_says_what_drives_the_arms_and_how(tmp_path: Path) -> None:
+def test_check_names_the_controller_and_the_mode(tmp_path: Path) -> None:
     file = external_cell(tmp_path)
     topic = "/bh_robot/right_arm_clik_controller/target_frame"
     source = "what the built-in controller makes of the hand's target"
@@ -146,7 +146,7 @@ def test_check_says_what_drives_the_arms_and_how(tmp_path: Path) -> None:
     assert one_object(q2r2("check", file, "--json").stdout)["driven"]["right"] == line
 
 
-def test_check_says_what_raw_targets_lack_where_a_cell_asks_for_them(tmp_path: Path) -> None:
+def test_check_says_which_limits_raw_targets_do_not_have(tmp_path: Path) -> None:
     line = "raw: no limits, no distances, no self-collision"
     assert f"NOTE {line}\n" in q2r2("check", external_cell(tmp_path, new="mode: raw")).stdout
     assert line not in q2r2("check", external_cell(tmp_path)).stdout
@@ -210,10 +210,10 @@ def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old:
         pytest.param("srdf: mine.srdf\ncontrol:\n  min_distance: 0.02\n", "/mine.srdf:", id="an SRDF"),
     ],
 )
-def test_the_lines_that_check_prints_for_links_that_are_too_near_make_the_cell_green_where_they_say(
+def test_the_lines_that_check_prints_for_too_near_links_make_the_cell_valid(
     tmp_path: Path, written: str, says: str
 ) -> None:
-    bare = load_description("example-robot-data:ur5").file  # by this path the model has no SRDF
+    bare = load_description("example-robot-data:ur5").file  # A model that is loaded by its path has no SRDF.
     arm = f"{{model: {bare}, tip: tool0, mount: {{position: [0, 0, 0.1]}}, home: [-0.6, -1.1, 1.0, -1.4, -0.6, 0]}}"
     (cell := tmp_path / "cell.yaml").write_text(f"name: my cell\narms:\n  left: {arm}\n{written}", encoding="utf-8")
     (tmp_path / "mine.srdf").write_text('<robot name="cell">\n</robot>\n', encoding="utf-8")
@@ -235,7 +235,7 @@ def test_the_lines_that_check_prints_for_links_that_are_too_near_make_the_cell_g
     assert q2r2("check", str(cell)).exit_code == 0
 
 
-def test_check_says_how_to_do_without_the_floor_that_is_in_the_way(tmp_path: Path) -> None:
+def test_check_says_how_to_remove_a_floor_that_is_in_the_way(tmp_path: Path) -> None:
     low = changed_cell(tmp_path, "[0.0, 0.4, 0.0]", "[0.0, 0.4, -0.6]")
     lines = [line for line in q2r2("check", low).stdout.splitlines() if line.startswith("FAULT") and "floor_0" in line]
     assert lines
@@ -246,7 +246,7 @@ def test_check_says_how_to_do_without_the_floor_that_is_in_the_way(tmp_path: Pat
     assert (result.exit_code, "floor" in result.stdout) == (0, False)
 
 
-def test_check_notes_where_a_stop_asks_for_more_torque_than_there_is_and_that_is_no_fault(tmp_path: Path) -> None:
+def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path) -> None:
     fast = changed_cell(tmp_path, "acceleration_limit: {} ", "acceleration_limit: {A1: 10.0, A2: 10.0, A3: 10.0} ")
     result = q2r2("check", fast)
     (note,) = (line for line in result.stdout.splitlines() if line.startswith("NOTE "))
@@ -263,9 +263,9 @@ def test_check_notes_where_a_stop_asks_for_more_torque_than_there_is_and_that_is
     assert cell["stop_torques"][1]["stop"]["share_over"] == 0.0
 
 
-def test_where_gravity_alone_is_too_much_the_note_says_so_and_promises_nothing_of_slower_stops(tmp_path: Path) -> None:
+def test_if_gravity_alone_needs_too_much_torque_the_note_does_not_advise_slower_stops(tmp_path: Path) -> None:
     urdf = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
-    assert urdf.count('velocity="2.268928" effort="110"') == 1  # of A4
+    assert urdf.count('velocity="2.268928" effort="110"') == 1  # The line is that of A4.
     (tmp_path / "arm.urdf").write_text(urdf.replace('velocity="2.268928" effort="110"', 'velocity="2.2" effort="12"'))
     (note,) = check_cell(one_arm(model=str(tmp_path / "arm.urdf"))).notes
     assert re.search(
@@ -275,7 +275,7 @@ def test_where_gravity_alone_is_too_much_the_note_says_so_and_promises_nothing_o
     )
 
 
-def test_check_notes_a_control_that_leads_grippers_of_which_there_are_none() -> None:
+def test_check_notes_a_control_for_grippers_that_do_not_exist() -> None:
     def notes_with(gripper: dict[str, object]) -> list[str]:
         cell = one_arm(tool={"model": "hand_e", "frame": "tool_frame"}, gripper=gripper)
         bindings = BindingSettings(upper=Action.NONE, trigger=Action.GRIPPER_ANALOG)
@@ -287,7 +287,7 @@ def test_check_notes_a_control_that_leads_grippers_of_which_there_are_none() -> 
     assert notes_with({"joints": ["finger_joint_1", "finger_joint_2"], "open_position": 0.025}) == []
 
 
-def test_what_may_touch_is_said() -> None:
+def test_check_says_which_pairs_may_touch() -> None:
     cell = with_contact(load_config("config/dual_iiwa7.yaml"), FINGERS)
     report = check_cell(cell)
     notes = [note for note in report.notes if "may touch in torque mode" in note]

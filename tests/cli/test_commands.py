@@ -1,4 +1,4 @@
-"""The table of commands: what the help says without them, and what is behind it."""
+"""The table of commands: its lines in the help, and the commands that they name."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_example_of_a_command_stands_in_its_help_and_is_understood(command: 
     assert f"Example: {command.example}\n" in q2r2(command.name, "--help").stdout
     program, name, *arguments = shlex.split(command.example)
     assert (program, name) == ("q2r2", command.name)
-    loaded.make_context(name, arguments)  # raises for an option that there is not
+    loaded.make_context(name, arguments)  # An unknown option would raise here.
 
 
 def test_the_help_has_every_command_once_under_the_heading_of_its_group() -> None:

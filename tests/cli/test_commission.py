@@ -31,7 +31,7 @@ from tests.plants.fri.conftest import free_ports
 from tests.plants.fri.waiting_cabinets import waiting_cabinets
 
 MODULE = "q2r2_control.cli.commission"
-GUIDED = ["", "y", "", "y"]  # both arms, and the joints are right
+GUIDED = ["", "y", "", "y"]  # Answers after both arms were guided and the joints were right.
 TO_THE_END = [*GUIDED, "keep", "", "", "Ada"]
 GOOD = CabinetReport(
     "left", 2, 10.0, 100, 0, 0.1, 0.1, "monitoring ready", "excellent", "normal", "t1", "off", [0.0] * 7, 0.0
@@ -40,7 +40,10 @@ GOOD = CabinetReport(
 
 @pytest.fixture
 def cell(tmp_path: Path) -> Path:
-    """One whose cabinets are real, and do not answer. Most of a test's time goes by ticks, so they are few."""
+    """Return a cell with real cabinets that do not answer.
+
+    It has few ticks per second, because ticks take most of the time.
+    """
     text = find_resource("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8").replace("127.0.0.2", "192.0.2.1")
     text = text.replace("loop_rate_hz: 500.0", "loop_rate_hz: 250.0")
     (file := tmp_path / "my_cell.yaml").write_text(text, encoding="utf-8")
@@ -49,7 +52,7 @@ def cell(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def virtual(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Puts cabinets in virtual time in the place of real ones, whose arms are guided by a quarter of a radian."""
+    """Replace real cabinets by cabinets in virtual time, whose arms are guided by a quarter of a radian."""
 
     def use(
         run: Callable[[Config], SlowRun] = slow_run,
@@ -74,13 +77,13 @@ def virtual(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def commission(cell: Path, answers: list[str], *options: str) -> tuple[int, list[str], str]:
-    """Exit code, lines on stderr, and stdout."""
+    """Return exit code, lines on stderr, and stdout."""
     done = q2r2("commission", str(cell), "--duration", "1", *options, typed="".join(f"{line}\n" for line in answers))
     return done.exit_code, done.stderr.splitlines(), done.stdout
 
 
 def refused(cell: Path, answers: list[str]) -> str:
-    """The one line that ends a commissioning that is not passed; nothing is kept."""
+    """Return the only line about a commissioning that fails and leaves no sign-off."""
     code, lines, _ = commission(cell, answers)
     assert code == 1
     assert lines[-1].startswith("q2r2: ")
@@ -91,11 +94,11 @@ def refused(cell: Path, answers: list[str]) -> str:
 
 
 @pytest.mark.slow
-def test_a_cell_that_shows_all_it_has_to_is_signed_off_and_may_run(
+def test_a_cell_that_passes_all_steps_is_signed_off_and_may_run(
     cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     virtual()
-    # Postures that are nearer to each other will do without noise, and slow arms are there sooner.
+    # Nearer postures are sufficient without noise, and slow arms reach them sooner.
     monkeypatch.setattr("q2r2_control.pipeline.commissioning._SPREAD", 0.4 * _SPREAD)
     before = q2r2("run", str(cell), "--input", "scripted")
     assert before.exit_code == 2
@@ -112,7 +115,7 @@ def test_a_cell_that_shows_all_it_has_to_is_signed_off_and_may_run(
     for load in kept["steps"]["load"]:
         assert load["identified_kg"] == pytest.approx(load["expected_kg"], abs=0.01)
     after = q2r2("run", str(cell), "--input", "scripted", "--trajectory", "nowhere")
-    assert "nowhere" in after.stderr  # it came as far as that
+    assert "nowhere" in after.stderr  # The run got as far as this fault.
     assert "joints at a tenth of their speed" in after.stderr
     assert "a tenth" not in q2r2("run", str(cell), "--trajectory", "nowhere", "--full-speed").stderr
     cell.write_text(cell.read_text(encoding="utf-8").replace("192.0.2.1", "192.0.2.2"), encoding="utf-8")
@@ -132,13 +135,14 @@ def test_a_commissioning_goes_through_all_steps_by_sockets_and_processes(
     ask, tries = _Commissioning._ask, iter(range(5))
 
     def asked(work: _Commissioning, question: str, *allowed: str) -> str:
-        """An operator who lets a step be repeated that a busy computer has spoiled, but not for ever."""
+        """Answer as an operator who repeats a step that a busy computer has spoiled, but only a few times."""
         if question == "try again" and next(tries, None) is not None:
             return "y"
         return "" if "press Enter" in question else ask(work, question, *allowed)
 
     monkeypatch.setattr(_Commissioning, "_ask", asked)
-    # A busy machine lets threads wait for milliseconds; cabinets that ask more often would fall ever further behind.
+    # On a busy machine, threads wait for milliseconds, so that cabinets with a shorter period would fall ever further
+    # behind.
     with waiting_cabinets(Robot.from_config(config), config, period=0.02):
         code, lines, out = commission(cell, answers, "--json")
     assert code == 0, "\n".join(lines)
@@ -154,7 +158,7 @@ def test_a_user_who_knows_runs_a_cell_without_a_sign_off(cell: Path) -> None:
     assert "nowhere" in done.stderr
 
 
-def test_cabinets_that_stand_in_need_no_sign_off() -> None:
+def test_simulated_cabinets_need_no_sign_off() -> None:
     done = q2r2("run", "config/dual_iiwa7_fri.yaml", "--input", "scripted", "--trajectory", "nowhere")
     assert "nowhere" in done.stderr
     assert "a tenth" not in done.stderr
@@ -170,7 +174,7 @@ def test_cabinets_that_stand_in_need_no_sign_off() -> None:
     ],
     ids=["poor connection", "lost messages", "safety stop"],
 )
-def test_a_cabinet_that_is_not_heard_well_may_be_tried_again(
+def test_the_operator_may_repeat_the_step_of_a_cabinet_that_is_not_heard_well(
     cell: Path, virtual: Callable[..., None], report: CabinetReport, told: str
 ) -> None:
     virtual(report=report)
@@ -179,12 +183,14 @@ def test_a_cabinet_that_is_not_heard_well_may_be_tried_again(
     assert told in line
 
 
-def test_joints_that_an_operator_does_not_recognise_end_it(cell: Path, virtual: Callable[..., None]) -> None:
+def test_joints_that_an_operator_does_not_recognise_end_the_commissioning(
+    cell: Path, virtual: Callable[..., None]
+) -> None:
     virtual()
     assert "the right arm's joints are not those that moved" in refused(cell, ["", "y", "", "n"])
 
 
-def test_an_arm_that_was_not_moved_is_said_and_takes_another_word(cell: Path, virtual: Callable[..., None]) -> None:
+def test_an_arm_that_was_not_moved_needs_another_answer(cell: Path, virtual: Callable[..., None]) -> None:
     virtual(guided=0.0)
     code, lines, _ = commission(cell, ["", "y", "confirm", "", "again", "", "n"])
     assert code == 1
@@ -194,19 +200,23 @@ def test_an_arm_that_was_not_moved_is_said_and_takes_another_word(cell: Path, vi
 
 
 @pytest.mark.parametrize("answers", [[], [*GUIDED, "keep"]])
-def test_an_input_that_ends_ends_it(cell: Path, virtual: Callable[..., None], answers: list[str]) -> None:
+def test_the_end_of_the_input_ends_the_commissioning(
+    cell: Path, virtual: Callable[..., None], answers: list[str]
+) -> None:
     virtual()
     assert "no more input; allowed: " in refused(cell, answers)
 
 
 @pytest.mark.slow
-def test_an_arm_that_does_not_move_ends_the_motion(cell: Path, virtual: Callable[..., None]) -> None:
+def test_an_arm_that_does_not_move_ends_the_commissioning_in_the_motion_step(
+    cell: Path, virtual: Callable[..., None]
+) -> None:
     virtual(partial(slow_run, arm=StuckArm))
     line = refused(cell, [*TO_THE_END[:-1], "n"])
     assert line.startswith("q2r2: motion: left_A1: commanded")
 
 
-def test_a_tool_that_is_heavier_than_its_model_ends_the_load(
+def test_a_tool_that_is_heavier_than_its_model_ends_the_commissioning_in_the_load_step(
     cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     virtual()
@@ -216,7 +226,7 @@ def test_a_tool_that_is_heavier_than_its_model_ends_the_load(
     assert refused(cell, TO_THE_END).startswith("q2r2: load: the left arm carries 1.86 kg")
 
 
-def test_arms_that_go_on_when_their_program_is_killed_end_it(
+def test_arms_that_go_on_when_their_program_is_killed_end_the_commissioning(
     cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     virtual(stopped_mm=5.0)
@@ -228,7 +238,7 @@ def test_arms_that_go_on_when_their_program_is_killed_end_it(
 
 @pytest.fixture
 def interrupted(virtual: Callable[..., None]) -> Iterator[list[PendantCabinets]]:
-    """A person presses Ctrl-C while the left arm moves, as in a terminal, whatever handles it in this process."""
+    """Press Ctrl-C while the left arm moves, as in a terminal, whatever signal handlers this process has."""
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     made: list[PendantCabinets] = []
 

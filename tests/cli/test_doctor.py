@@ -15,11 +15,11 @@ from tests.cli.command import changed_cell, one_object, q2r2
 
 @pytest.fixture
 def free_cell(tmp_path: Path) -> str:
-    """The shipped cell with a port that is free."""
+    """Return the shipped cell with a free port."""
     return changed_cell(tmp_path, "port: 10000 ", "port: 0 ")
 
 
-def test_where_nothing_is_missing_it_says_so_and_exits_with_0(free_cell: str) -> None:
+def test_if_nothing_is_missing_the_doctor_says_so_and_exits_with_0(free_cell: str) -> None:
     result = q2r2("doctor", free_cell, "--json")
     found = one_object(result.stdout)
     assert (result.exit_code, found["lacks"]) == (0, False)
@@ -28,7 +28,7 @@ def test_where_nothing_is_missing_it_says_so_and_exits_with_0(free_cell: str) ->
     assert all(finding["what"] and finding["cure"] for finding in found["findings"])
 
 
-def test_a_port_that_another_program_holds_is_missing_and_has_a_cure(free_cell: str) -> None:
+def test_a_port_that_another_program_uses_is_a_fault_with_a_cure(free_cell: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         file = Path(free_cell)
@@ -39,7 +39,7 @@ def test_a_port_that_another_program_holds_is_missing_and_has_a_cure(free_cell: 
     assert "cure: another headset.port in the YAML" in result.stdout
 
 
-def test_a_package_that_is_missing_or_too_old_has_its_pip_line() -> None:
+def test_a_missing_or_too_old_package_is_named_with_its_pip_line() -> None:
     wanted = ["numpy>=999", "no-such-package-of-ours>=1", "scipy>=1", "no-such-extra>=1; extra == 'dev'"]
     found = list(doctor._packages(wanted))
     assert [finding.what.partition(":")[0] for finding in found] == ["numpy", "no-such-package-of-ours"]
@@ -47,7 +47,7 @@ def test_a_package_that_is_missing_or_too_old_has_its_pip_line() -> None:
     assert found[0].cure.endswith("-m pip install 'numpy>=999'")
 
 
-def test_an_extra_that_is_not_there_is_named_with_what_needs_it() -> None:
+def test_a_missing_extra_is_named_with_the_commands_that_need_it() -> None:
     wanted = ["numpy>=999", "no-such-viewer>=1; extra == 'web'", "scipy>=1; extra == 'gym'"]
     (finding,) = doctor._extras(wanted)
     assert finding.what == "without no-such-viewer: no --web, no --input webxr"
@@ -55,7 +55,7 @@ def test_an_extra_that_is_not_there_is_named_with_what_needs_it() -> None:
     assert not finding.stops_arms
 
 
-def test_every_extra_that_is_named_is_one_of_the_package() -> None:
+def test_every_named_extra_exists_in_the_package() -> None:
     extras = metadata("q2r2_control").get_all("Provides-Extra") or []
     assert set(doctor._NEEDS_EXTRA) <= set(extras)
 
@@ -66,7 +66,7 @@ def test_without_a_display_only_the_window_is_missing() -> None:
     assert list(doctor._display({"DISPLAY": ":0"})) == []
 
 
-def test_what_the_kernel_refuses_stands_with_the_last_part_of_the_note_as_its_cure(
+def test_a_note_about_the_kernel_is_split_into_fault_and_cure(
     free_cell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     notes = ["real time: no SCHED_FIFO; the run goes on; give rtprio 40", *fair_server_notes("6.12.0", tmp_path)]
@@ -78,5 +78,5 @@ def test_what_the_kernel_refuses_stands_with_the_last_part_of_the_note_as_its_cu
     assert lines[at + 3].strip().startswith("cure: leave a processor free, or, as root")
 
 
-def test_a_cell_of_cabinets_is_sent_to_the_command_that_measures_their_jitter(fri_cell: str) -> None:
+def test_the_doctor_names_the_command_that_measures_the_jitter_of_cabinets(fri_cell: str) -> None:
     assert f"cabinets    q2r2 fri-check {fri_cell} says how evenly they send" in q2r2("doctor", fri_cell).stdout

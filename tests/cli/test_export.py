@@ -18,7 +18,7 @@ from tests.recording.runs import rewrite
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Path]:
-    """Files of two runs, each in a folder of its own."""
+    """Return the files of two runs, each in its own folder."""
     return record_two(tmp_path_factory.mktemp("recordings"))
 
 
@@ -35,13 +35,11 @@ def test_a_folder_of_recordings_is_a_folder_of_tables_with_or_without_the_time_b
             rows = list(csv.DictReader(stream))
         assert {row["task"] for row in rows} == {"a test"}
         lengths.append(len(rows))
-    assert lengths[0] >= DURATION * 100  # the arms come to rest after the end
-    assert lengths[0] - lengths[1] >= 10  # the press comes 0.1 s after the beginning
+    assert lengths[0] >= DURATION * 100  # The recording goes on after the end of the run, until the arms are at rest.
+    assert lengths[0] - lengths[1] >= 10  # The press comes 0.1 s after the beginning.
 
 
-def test_the_config_that_trains_openpi_is_printed_behind_its_dataset(
-    recordings: Sequence[Path], tmp_path: Path
-) -> None:
+def test_the_training_config_of_openpi_is_printed_after_the_dataset(recordings: Sequence[Path], tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="the extra export is not installed")
     result = q2r2("export", "lerobot-v2.1", *map(str, recordings), "--output", str(tmp_path / "circle"))
     assert result.stdout.startswith(f"{tmp_path / 'circle'}: 2 of 2 recordings at 30 frames per second\n# openpi: 16 ")
@@ -50,7 +48,7 @@ def test_the_config_that_trains_openpi_is_printed_behind_its_dataset(
     assert (tmp_path / "circle/data/chunk-000/episode_000001.parquet").exists()
 
 
-def test_hdf5_has_the_next_frames_actions_unless_it_is_told_otherwise(
+def test_hdf5_has_the_next_frames_actions_unless_an_option_changes_this(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
@@ -65,7 +63,7 @@ def test_hdf5_has_the_next_frames_actions_unless_it_is_told_otherwise(
     assert (actions["usual", 1] != actions["plain", 0]).any()
 
 
-def test_a_bad_recording_is_left_out_and_the_exit_code_tells_of_it_unless_it_is_skipped(
+def test_a_bad_recording_is_left_out_and_changes_the_exit_code_unless_it_is_skipped(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:
     (tmp_path / "notes.mcap").write_text("no recording\n")
@@ -81,7 +79,9 @@ def test_a_bad_recording_is_left_out_and_the_exit_code_tells_of_it_unless_it_is_
     assert "none of the recordings can be exported" in result.stderr
 
 
-def test_what_the_judge_discards_is_left_out_unless_it_is_asked_for(recordings: Sequence[Path], tmp_path: Path) -> None:
+def test_discarded_episodes_are_left_out_unless_an_option_keeps_them(
+    recordings: Sequence[Path], tmp_path: Path
+) -> None:
     file = rewrite(recordings[0], tmp_path / "lost.mcap", lambda _, one: None if 100 <= one.number < 120 else one)
     arguments = ("export", "csv", str(file), str(recordings[1]), "--output")
     result = q2r2(*arguments, str(tmp_path / "out"), "--fps", "10")
@@ -92,7 +92,7 @@ def test_what_the_judge_discards_is_left_out_unless_it_is_asked_for(recordings: 
     assert set(contents(tmp_path / "both")) == {f"{recordings[1].stem}.csv", "lost.csv"}
 
 
-def test_an_interrupted_export_leaves_nothing_half_and_the_next_one_ends_it(
+def test_an_interrupted_export_leaves_no_half_files_and_the_next_export_completes_it(
     recordings: Sequence[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*given: Any) -> None:

@@ -1,4 +1,4 @@
-"""``q2r2 fri-cabinet``, which stands in for a cell's cabinets."""
+"""``q2r2 fri-cabinet``, which simulates the cabinets of a cell."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_safety_stop_ends_a_session_and_lasts_a_second() -> None:
 @pytest.mark.slow
 def test_enter_at_the_terminal_stops_all_overlays_and_starts_them_again(fri_cell: str) -> None:
     ours, theirs = os.openpty()
-    # The first terminal that a new session opens is its own.
+    # The first terminal that a new session opens becomes its controlling terminal.
     opening = f"import os; os.dup2(os.open({os.ttyname(theirs)!r}, os.O_RDWR), 0)"
     code = f"{opening}; from q2r2_control.cli.app import app; app()"
     command = (sys.executable, "-c", code, "fri-cabinet", fri_cell, "--json")
@@ -71,7 +71,7 @@ def test_enter_at_the_terminal_stops_all_overlays_and_starts_them_again(fri_cell
     os.close(theirs)
 
 
-def test_overlays_that_were_stopped_at_the_pendant_start_at_the_next_key_only() -> None:
+def test_overlays_that_the_pendant_stopped_start_only_at_its_next_key() -> None:
     ones = (1.0,) * 7
     settings = CabinetSettings(ones, ones, ones, ones, ones)
     cabinets = {arm: Cabinet(settings, StillArm((0.0,) * 7)) for arm in ("left", "right")}
@@ -87,7 +87,7 @@ def test_overlays_that_were_stopped_at_the_pendant_start_at_the_next_key_only() 
     assert all(cabinet._overlay for cabinet in cabinets.values())
 
 
-def test_the_messages_say_how_many_of_them_there_are_to_one_answer(fri_cell: str) -> None:
+def test_messages_contain_the_number_of_messages_per_answer(fri_cell: str) -> None:
     port = load_config(fri_cell).fri["left"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.bind(("127.0.0.1", port))
@@ -97,7 +97,7 @@ def test_the_messages_say_how_many_of_them_there_are_to_one_answer(fri_cell: str
 
 
 @pytest.mark.parametrize("arguments", [(), ("--source-port", "0")], ids=["client's port", "any port"])
-def test_messages_come_from_the_cabinets_address_and_its_clients_port_unless_another_is_asked_for(
+def test_messages_come_from_the_cabinets_address_and_its_clients_port_unless_an_option_differs(
     fri_cell: str, arguments: tuple[str, ...]
 ) -> None:
     port = load_config(fri_cell).fri["left"].port
@@ -128,7 +128,7 @@ def test_a_rehearsal_begins_when_all_cabinets_send(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.slow
-def test_a_rehearsal_whose_cabinets_cannot_begin_says_why(fri_cell: str) -> None:
+def test_a_rehearsal_whose_cabinets_cannot_begin_gives_the_reason(fri_cell: str) -> None:
     port = load_config(fri_cell).fri["left"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.2", port))
@@ -158,7 +158,7 @@ def test_a_run_says_that_it_waits_for_a_cabinet_and_ctrl_c_ends_the_wait(fri_cel
     assert plant.is_released(), "nothing keeps the ports"
 
 
-def test_a_port_of_a_cabinet_that_another_program_has_is_one_line(fri_cell: str) -> None:
+def test_a_cabinets_port_that_another_program_uses_gives_one_line(fri_cell: str) -> None:
     port = load_config(fri_cell).fri["right"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.3", port))
@@ -176,7 +176,7 @@ def test_a_port_of_a_cabinet_that_another_program_has_is_one_line(fri_cell: str)
         ((CELL, "--mode", "torque"), "answered every 10 ms: allowed with torques: 5 ms or less"),
     ],
 )
-def test_a_wrong_option_is_one_line(arguments: tuple[str, ...], told: str) -> None:
+def test_a_wrong_option_gives_one_line(arguments: tuple[str, ...], told: str) -> None:
     done = q2r2("fri-cabinet", *arguments)
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
     assert told in done.stderr

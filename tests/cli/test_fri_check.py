@@ -16,9 +16,10 @@ from tests.support.robotiq_gripper import SimulatedGripper
 WIDE = (10.0,) * 7
 
 
-def test_jitter_is_about_the_cabinets_own_period_also_where_messages_are_missing() -> None:
+def test_jitter_is_measured_against_the_cabinets_period_even_if_messages_are_missing() -> None:
     cabinet = Cabinet(CabinetSettings(*(WIDE,) * 5, period=0.005), StillArm((0.5,) * 7))
-    times = [0.0, 0.005, 0.010, 0.016, 0.026]  # one is a millisecond late; before the last one, one is lost
+    # One message is a millisecond late. Before the last one, one message is lost.
+    times = [0.0, 0.005, 0.010, 0.016, 0.026]
     sent = [cabinet.send(0.0) for _ in range(6)]
     heard = [(sent[index], time) for index, time in zip((0, 1, 2, 3, 5), times, strict=True)]
     report = cabinet_report("left", heard, lost=1)
@@ -30,7 +31,9 @@ def test_jitter_is_about_the_cabinets_own_period_also_where_messages_are_missing
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
-def test_what_both_cabinets_send_is_said_and_where_one_does_not_command_the_exit_code_is_1(fri_cell: str) -> None:
+def test_the_messages_of_both_cabinets_are_described_and_a_cabinet_that_does_not_command_changes_the_exit_code(
+    fri_cell: str,
+) -> None:
     done = q2r2("fri-check", fri_cell, "--duration", "1", "--json")
     told = json.loads(done.stdout)
     assert [cabinet["arm"] for cabinet in told["cabinets"]] == ["left", "right"]
@@ -44,7 +47,7 @@ def test_what_both_cabinets_send_is_said_and_where_one_does_not_command_the_exit
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
-def test_a_line_says_of_each_gripper_by_modbus_whether_it_answers_and_none_is_moved(fri_cell: str) -> None:
+def test_a_line_says_whether_each_modbus_gripper_answers_and_none_is_moved(fri_cell: str) -> None:
     cell = yaml.safe_load(Path(fri_cell).read_text(encoding="utf-8"))
     with SimulatedGripper() as simulated:
         for arm, port in (("left", simulated.port), ("right", 1)):
@@ -58,13 +61,13 @@ def test_a_line_says_of_each_gripper_by_modbus_whether_it_answers_and_none_is_mo
     assert simulated.written == []
 
 
-def test_a_cabinet_that_says_nothing_is_one_line(fri_cell: str) -> None:
+def test_a_silent_cabinet_gives_one_line(fri_cell: str) -> None:
     done = q2r2("fri-check", fri_cell, "--wait", "0.1")
     assert done.exit_code == 2
     assert "left: no FRI message from cabinet 127.0.0.2 on port" in done.stderr.splitlines()[-1]
 
 
-def test_a_cell_without_cabinets_is_one_line() -> None:
+def test_a_cell_without_cabinets_gives_one_line() -> None:
     done = q2r2("fri-check", "config/dual_iiwa7.yaml")
     assert done.exit_code == 2
     assert "fri.left: missing; allowed: the cabinet of each arm" in done.stderr.splitlines()[-1]

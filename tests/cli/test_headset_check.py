@@ -1,4 +1,4 @@
-"""Commands that serve a headset: what they say of it, and how they end."""
+"""Commands that serve a headset: their messages about it, and their end."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def bound_port(running: subprocess.Popen[str]) -> int:
-    """The text of the documented line on stderr."""
+    """Return the text of the documented line on stderr."""
     assert running.stderr is not None
     for line in running.stderr:
         if line.startswith("headset: listening on "):
@@ -37,7 +37,7 @@ def bound_port(running: subprocess.Popen[str]) -> int:
 
 
 def fake_headset(port: int, duration: float) -> None:
-    """A headset in a process of its own that engages both arms and circles."""
+    """Run a headset in its own process, which engages both arms and circles."""
     arguments = ["--port", str(port), "--duration", str(duration)]
     subprocess.run([sys.executable, "-m", "tests.support.fake_headset", *arguments], check=True, timeout=30)
 
@@ -58,7 +58,7 @@ def test_headset_check_shows_a_headset_in_a_process_of_its_own() -> None:
     assert check["topics"]["q2r_left_hand_pose"]["count"] == 112
 
 
-def test_a_headset_server_on_every_network_says_what_to_enter_in_the_app_and_who_can_drive() -> None:
+def test_a_headset_server_on_every_network_names_the_address_for_the_app_and_the_allowed_hosts() -> None:
     result = q2r2("headset-check", "--host", "0.0.0.0", "--port", "0", "--duration", "0.1", "--json")
     port = one_object(result.stdout)["address"][1]
     listening, enter, drivers = result.stderr.splitlines()[:3]
@@ -76,11 +76,11 @@ def test_a_host_outside_the_cells_headset_allow_is_refused(tmp_path: Path) -> No
             assert b"127.0.0.1 is not in headset.allow" in headset.read_until("__error")
         running.send_signal(signal.SIGINT)
         assert running.stderr is not None
-        stderr = running.stderr.read()  # with what was read ahead behind the line of the address
+        stderr = running.stderr.read()  # The text contains what was read ahead after the line with the address.
     assert "only 10.0.0.0/8 can drive the arms" in stderr
 
 
-def test_headset_check_says_what_to_look_at_when_nothing_comes() -> None:
+def test_headset_check_gives_advice_if_nothing_comes() -> None:
     result = q2r2("headset-check", "--port", "0", "--duration", "2.3", "--json")
     assert result.exit_code == 1
     advice = "\n".join(one_object(result.stdout)["advice"])

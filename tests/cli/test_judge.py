@@ -18,7 +18,7 @@ IDLE = "max_idle_share: 0.5 "
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a recording that is kept, and one that ends before anything moves."""
+    """Return a folder with a recording that is kept, and one that ends before anything moves."""
     folder = tmp_path_factory.mktemp("recordings")
     for name, duration in (("a", 3.0), ("b", 0.5)):
         file = record_episode(folder / name, hands(2), duration)
@@ -53,7 +53,7 @@ def test_json_has_every_number_and_every_reason(recordings: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_report_is_one_page_of_all_of_them(recordings: Path, tmp_path: Path) -> None:
+def test_a_report_is_one_page_about_all_recordings(recordings: Path, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     result = q2r2("report", str(recordings), "--output", str(page))
     assert (result.exit_code, result.stderr) == (0, "")
@@ -87,7 +87,7 @@ def test_a_file_that_cannot_be_read_is_discarded_and_the_others_are_judged(recor
 class TestARunThatIsRecorded:
     OPTIONS = ("--trajectory", "line", "--human", "--seed", "5", "--duration", "3")
 
-    def test_prints_its_verdict_and_keeps_it_beside_the_file(self, tmp_path: Path) -> None:
+    def test_judging_one_file_prints_its_verdict_and_keeps_it_beside_the_file(self, tmp_path: Path) -> None:
         result = q2r2(*FAST, *self.OPTIONS, "--record", str(tmp_path))
         assert result.exit_code == 0
         (episode,) = one_object(result.stdout)["judge"]
@@ -97,10 +97,10 @@ class TestARunThatIsRecorded:
         assert written["episodes"] == [episode]
         again = one_object(q2r2("judge", str(tmp_path), "--json").stdout)["episodes"]
         assert again == [episode]
-        with AnyReader([kept.parent]) as bag:  # is one still
+        with AnyReader([kept.parent]) as bag:  # The file can still be read.
             assert bag.message_count > 0
 
-    def test_says_it_in_one_line_before_the_figures(self, tmp_path: Path) -> None:
+    def test_the_verdict_is_one_line_before_the_figures(self, tmp_path: Path) -> None:
         options = [option for option in (*FAST, *self.OPTIONS) if option != "--json"]
         cell = changed_cell(tmp_path, IDLE, "max_idle_share: 0.01 ")
         result = q2r2(options[0], cell, *options[2:], "--record", str(tmp_path / "here"))
@@ -111,7 +111,9 @@ class TestARunThatIsRecorded:
         assert [reason.name for reason in judged.verdict.reasons] == ["max_idle_share"]
         assert verdict == f"verdict: {judged.verdict.line}"
 
-    def test_ends_well_where_the_verdict_cannot_be_kept(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_verdict_that_cannot_be_kept_does_not_change_the_exit_code(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.setattr("q2r2_control.judging.judge.VERDICT_FILE", "x" * 300)
         result = q2r2(*FAST, "--duration", "0.3", "--record", str(tmp_path))
         assert result.exit_code == 0

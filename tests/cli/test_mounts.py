@@ -1,4 +1,4 @@
-"""``q2r2 mounts``, by which an operator measures where the right arm's base is."""
+"""``q2r2 mounts``, with which an operator measures the place of the right arm's base."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.cli.command import one_object, q2r2
 POINTS = np.array([[0.5, 0.1, 0.3], [0.6, -0.2, 0.3], [0.4, 0.0, 0.5]])
 
 
-def test_the_mount_that_is_printed_puts_the_right_tip_where_the_left_one_was() -> None:
+def test_the_printed_mount_puts_the_right_tip_where_the_left_tip_was() -> None:
     cell = load_config("config/dual_iiwa7_fri.yaml")
     mount = next(arm.mount for side, arm in cell.arms.items() if side == "right")
     assumed = pin.SE3(pin.rpy.rpyToMatrix(*mount.rpy), np.array(mount.position))
@@ -31,14 +31,14 @@ def test_the_mount_that_is_printed_puts_the_right_tip_where_the_left_one_was() -
 
 
 def test_written_postures_give_the_mount_of_arms_without_cabinets(tmp_path: Path) -> None:
-    """The right arm stands elsewhere than its cell says, and touches the same points with a tip beyond its tool."""
+    """The right arm's base differs from its cell, and the arm touches the same points with a tip beyond its tool."""
     tip, off = np.array([0.0, 0.0, 0.02]), np.array([0.012, -0.03, 0.004])
     robot = Robot.from_config(load_config("config/dual_ur5.yaml"))
     data = robot.model.createData()
     lines = ["# shoulder to wrist, left and right"]
     for point in ([0.45, 0.0, 0.5], [0.55, 0.1, 0.4], [0.4, -0.1, 0.35], [0.5, 0.05, 0.6]):
         q = robot.home.copy()
-        for _ in range(50):  # to where the cell has the tips then
+        for _ in range(50):  # The joints converge to a posture in which the tips are where the cell expects them.
             for name, wanted in (("left", np.array(point)), ("right", np.array(point) - off)):
                 pose, arm = robot.tool_pose(q, name), robot.arms[name]
                 frame = arm.frame_id, pin.LOCAL_WORLD_ALIGNED
@@ -70,7 +70,7 @@ def test_written_postures_give_the_mount_of_arms_without_cabinets(tmp_path: Path
         (2 * (12 * "0 " + "\n") + "45 " + 11 * "0 ", "point 3: left_shoulder_pan_joint = 45; allowed: -"),
     ],
 )
-def test_postures_that_tell_nothing_are_refused(tmp_path: Path, text: str, says: str) -> None:
+def test_postures_that_determine_no_mount_are_refused(tmp_path: Path, text: str, says: str) -> None:
     file = tmp_path / "touched.txt"
     file.write_text(text)
     done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", str(file))
@@ -92,13 +92,13 @@ def test_tips_that_did_not_touch_the_same_points_give_no_mount(tmp_path: Path) -
     assert "position:" not in done.stdout
 
 
-def test_arms_without_cabinets_are_told_of_the_file() -> None:
+def test_arms_without_cabinets_need_the_file_of_postures() -> None:
     done = q2r2("mounts", "config/dual_ur5.yaml")
     assert done.exit_code == 2
     assert "fri: missing; allowed: each arm's cabinet, as {port: 30200}, or --postures FILE" in done.stderr
 
 
-def test_a_count_of_points_beside_a_file_of_them_is_refused(tmp_path: Path) -> None:
+def test_a_count_of_points_together_with_a_file_of_postures_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "touched.txt"
     file.write_text(3 * (12 * "0 " + "\n"))
     done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", str(file), "--points", "3")
@@ -108,7 +108,7 @@ def test_a_count_of_points_beside_a_file_of_them_is_refused(tmp_path: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
-def test_arms_that_were_not_moved_between_the_points_tell_nothing(fri_cell: str) -> None:
+def test_arms_that_were_not_moved_between_the_points_determine_no_mount(fri_cell: str) -> None:
     done = q2r2("mounts", fri_cell, typed="\n" * 6)
     assert done.exit_code == 2
     assert "point 3 of 3: guide the right tip there" in done.stderr

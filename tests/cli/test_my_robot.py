@@ -1,4 +1,4 @@
-"""The page about a robot of one's own, followed step by step: a robot that no shipped cell has ends up moving."""
+"""The page about your own robot, step by step. At its end, a robot that no shipped cell has moves."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ PAGE = "docs/my_robot.md"
 
 
 @pytest.mark.slow
-def test_its_yaml_and_its_commands_lead_from_a_urdf_to_arms_that_follow(
+def test_the_yaml_and_commands_of_the_page_lead_from_a_urdf_to_arms_that_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     doctor, new_cell, check, run = (shlex.split(block)[1:] for block in blocks_of(PAGE, "sh"))
-    assert doctor == ["doctor"]  # test_doctor.py looks at what it says
+    assert doctor == ["doctor"]  # test_doctor.py tests the output of this command.
     model = new_cell[new_cell.index("--left") + 1]
     assert not any(model in file.read_text(encoding="utf-8") for file in SHIPPED.glob("*.yaml"))
     written = q2r2(*new_cell)

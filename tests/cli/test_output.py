@@ -1,4 +1,4 @@
-"""Tables print what they are given, whole, also in a terminal of 80 columns."""
+"""Tables print all of their cells, even in a terminal of 80 columns."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def printed(table: Table, width: int = 80) -> str:
     return console.file.getvalue()
 
 
-def test_figures_names_units_and_notes_are_whole_in_80_columns() -> None:
+def test_figures_names_units_and_notes_are_complete_in_80_columns() -> None:
     columns = ("joint", "min [rad]", "speed [rad/s]", "says")
     row = (f"{LINK}_{LINK}", -12.566, "10.472", "nothing is wrong with this joint as far as is known")
     text = printed(figure_table("one arm [m]", columns, [("a heading [x]",), row], ["[rad] is a unit, not a style"]))
@@ -65,7 +65,7 @@ def text_of(summary: RunSummary, verbose: bool = True) -> str:
     return printed(summary_table(summary, verbose), width=160)
 
 
-def test_the_verdict_says_what_is_wrong_or_that_nothing_is(summary: RunSummary) -> None:
+def test_the_verdict_names_the_faults_or_says_that_there_are_none(summary: RunSummary) -> None:
     still = {name: replace(arm, engaged_s=0.0) for name, arm in summary.arms.items()}
     good = replace(summary, arms=still | {"left": replace(still["left"], engaged_s=0.4)}, events=[])
     assert verdict_line(good) == "[green]as it should be[/]: left followed, every tick certified, at rest at the end"
@@ -82,7 +82,7 @@ def test_the_verdict_says_what_is_wrong_or_that_nothing_is(summary: RunSummary) 
     )
 
 
-def test_an_arm_that_refused_every_press_is_not_as_it_should_be(summary: RunSummary) -> None:
+def test_an_arm_that_refused_every_press_is_a_fault(summary: RunSummary) -> None:
     refused = Event(
         6.0, "left", "paused", "paused", Reason(ReasonKind.NOT_ENGAGED, cause=Reason(ReasonKind.TOOL_UNKNOWN))
     )
@@ -93,7 +93,7 @@ def test_an_arm_that_refused_every_press_is_not_as_it_should_be(summary: RunSumm
     assert replace(never, arms=engaged_later).broken == ()
 
 
-def test_what_is_printed_of_a_run_begins_with_its_verdict_and_those_on_its_tasks(
+def test_the_output_of_a_run_begins_with_its_verdict_and_those_of_its_tasks(
     summary: RunSummary, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tasks = (TaskResult("grasp", True, {}, ""), TaskResult("stack", False, {}, "it fell"))
@@ -104,7 +104,7 @@ def test_what_is_printed_of_a_run_begins_with_its_verdict_and_those_on_its_tasks
     assert any("duration" in line for line in figures)
 
 
-def test_tasks_of_a_run_that_somebody_stopped_are_not_judged_unless_they_succeeded(
+def test_tasks_of_a_stopped_run_are_not_judged_unless_they_succeeded(
     summary: RunSummary, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tasks = (TaskResult("grasp", True, {}, ""), TaskResult("stack", False, {}, "it fell"))
@@ -118,7 +118,7 @@ def test_tasks_of_a_run_that_somebody_stopped_are_not_judged_unless_they_succeed
     assert capsys.readouterr().out.startswith("not as it should be: 3 ticks without a certificate\n")
 
 
-def test_the_summary_is_short_unless_all_is_asked_for_and_never_hides_what_is_wrong(summary: RunSummary) -> None:
+def test_the_summary_is_short_without_verbose_but_never_hides_faults(summary: RunSummary) -> None:
     short, whole = text_of(summary, verbose=False), text_of(summary)
     for figure in ("input to command", "room to position limits", "velocity, acceleration", "certified stops"):
         assert figure not in short
@@ -132,7 +132,7 @@ def test_the_summary_is_short_unless_all_is_asked_for_and_never_hides_what_is_wr
         assert figure in wrong
 
 
-def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_the_reason(
+def test_an_arm_that_was_not_paused_by_its_button_is_named_with_the_reason(
     summary: RunSummary,
 ) -> None:
     reason, press = Reason.of(ReasonKind.LOOP_STALLED, duration=0.4), Reason.of(ReasonKind.PRESSED, control="lower")
@@ -150,7 +150,7 @@ def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_
     assert f"{sentence(refusal)}, at 6.00 s" in text
 
 
-def test_late_and_missed_ticks_are_told_and_what_held_a_gripper(summary: RunSummary) -> None:
+def test_late_and_missed_ticks_and_the_pair_that_held_a_gripper_are_printed(summary: RunSummary) -> None:
     assert "ticks late by" not in text_of(summary)
     assert "gripper held" not in text_of(summary)
     held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
@@ -162,7 +162,7 @@ def test_late_and_missed_ticks_are_told_and_what_held_a_gripper(summary: RunSumm
     assert "1.25 s, by left_finger_0 | block_0" in row
 
 
-def test_a_failed_task_is_told_with_how_late_the_loop_was(summary: RunSummary) -> None:
+def test_a_failed_task_is_printed_with_the_lateness_of_the_loop(summary: RunSummary) -> None:
     failed, done = TaskResult("grasp", False, {}, "bar: fell 30 mm"), TaskResult("stack", True, {}, "")
     late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 239_400.0))
     line = late_line(late, [done, failed])
@@ -178,7 +178,7 @@ def test_a_failed_task_is_told_with_how_late_the_loop_was(summary: RunSummary) -
     assert late_line(summary, [failed]) is None, "simulated time is never late"
 
 
-def test_no_task_succeeds_while_measured_links_met_no_stop_was_certified_or_a_tool_did_not_follow(
+def test_no_task_succeeds_if_measured_links_met_or_no_stop_was_certified_or_a_tool_did_not_follow(
     summary: RunSummary,
 ) -> None:
     done = TaskResult("stack", True, {}, "")
@@ -195,7 +195,7 @@ def test_no_task_succeeds_while_measured_links_met_no_stop_was_certified_or_a_to
     assert failed.reason == "fell; 3 ticks without a certificate"
 
 
-def test_a_tool_that_did_not_follow_is_said(summary: RunSummary) -> None:
+def test_a_tool_that_did_not_follow_is_printed(summary: RunSummary) -> None:
     assert "did not follow" not in text_of(summary)
     away = replace(summary, arms=summary.arms | {"left": replace(summary.arms["left"], end_error_mm=256.4)})
     assert "256 mm from its reference: the tool did not follow" in text_of(away)

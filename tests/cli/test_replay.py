@@ -1,4 +1,4 @@
-"""A run that is recorded and replayed from the command line, as a user does it."""
+"""A run is recorded and replayed from the command line, as a user does it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OPTIONS = (*FAST[2:], "--duration", "1.5")
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a recorded run, in which both arms are engaged and move."""
+    """Return the folder of a recorded run, in which both arms are engaged and move."""
     parent = tmp_path_factory.mktemp("recordings")
     cell = changed_cell(parent, "", "")
     given = ("--record", str(parent / "here"), "--task", "a circle", "--operator", "Ada")
@@ -27,13 +27,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(recording["file"]).parent
 
 
-def test_it_says_identical_and_exits_0(recorded: Path) -> None:
+def test_an_equal_replay_prints_identical_and_exits_with_0(recorded: Path) -> None:
     for file in (recorded, *recorded.glob("*.mcap")):
         result = q2r2("replay", str(file), "--compare")
         assert (result.exit_code, result.stdout, result.stderr) == (0, "identical\n", "")
 
 
-def test_with_another_cell_it_says_what_differs_then_and_now_and_exits_1(recorded: Path, tmp_path: Path) -> None:
+def test_with_another_cell_replay_prints_the_differences_and_exits_with_1(recorded: Path, tmp_path: Path) -> None:
     other = changed_cell(tmp_path, "position_scale: 1.0 ", "position_scale: 1.5 ")
     result = q2r2("replay", str(recorded), "--compare", "--config", other)
     assert result.exit_code == 1
@@ -42,7 +42,7 @@ def test_with_another_cell_it_says_what_differs_then_and_now_and_exits_1(recorde
     assert "teleop.position_scale: 1.0 when recorded, now 1.5" in result.stderr
 
 
-def test_on_another_plant_it_says_how_far_the_tools_are_off(recorded: Path) -> None:
+def test_on_another_plant_replay_prints_the_distances_of_the_tools(recorded: Path) -> None:
     data = one_object(q2r2("replay", str(recorded), "--plant", "mujoco", "--json").stdout)
     assert data["ticks"] == data["summary"]["ticks"] > 1000
     assert data["ended_by"] is None
@@ -65,7 +65,7 @@ def test_on_another_plant_it_says_how_far_the_tools_are_off(recorded: Path) -> N
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
-def test_options_that_cannot_be_together_are_one_line_and_exit_code_2(
+def test_options_that_exclude_each_other_give_one_line_and_exit_code_2(
     recorded: Path, options: tuple[str, ...], said: str
 ) -> None:
     result = q2r2("replay", str(recorded), *options)

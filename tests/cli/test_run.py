@@ -27,7 +27,7 @@ MODULE = "q2r2_control.cli.run"
 OPTIONS = (*FAST[2:], "--duration", "0.1")
 
 
-def test_what_check_refuses_is_refused_with_the_same_lines(tmp_path: Path) -> None:
+def test_a_cell_that_check_refuses_is_refused_with_the_same_lines(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "home: [0.0204, 0.348,", "home: [0.0204, 1.0,")
     refused = q2r2("run", file, *OPTIONS)
     assert (refused.exit_code, refused.stdout) == (2, "")
@@ -38,7 +38,7 @@ def test_what_check_refuses_is_refused_with_the_same_lines(tmp_path: Path) -> No
     assert allowed == "q2r2: dual_iiwa7: --force runs it all the same"
 
 
-def test_hands_of_a_task_whose_parts_a_cell_lacks_are_said_to_move_without_them(tmp_path: Path) -> None:
+def test_without_the_parts_of_a_task_a_note_says_that_the_hands_move_without_them(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "    bar:\n", "    rod:\n")
     result = q2r2("run", file, *OPTIONS, "--trajectory", "handover")
     assert (
@@ -47,7 +47,7 @@ def test_hands_of_a_task_whose_parts_a_cell_lacks_are_said_to_move_without_them(
     assert "mujoco.objects" not in q2r2("run", CELL, *OPTIONS, "--trajectory", "handover").stderr
 
 
-def test_with_force_it_says_what_is_wrong_and_runs(tmp_path: Path) -> None:
+def test_with_force_the_faults_are_printed_and_the_cell_runs(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "0.0204, 0.348,", "0.0204, 2.09,")
     result = q2r2("run", file, *OPTIONS, "--force")
     assert result.exit_code == 1, "no stop can be proven where links are in the floor"
@@ -73,7 +73,7 @@ def test_an_arm_that_begins_in_the_table_ends_with_exit_code_1(tmp_path: Path, m
 @pytest.mark.parametrize(
     ("change", "code"), [({}, 0), ({"uncertified_ticks": 3}, 1), ({"at_rest": False}, 1)], ids=["none", "proof", "rest"]
 )
-def test_the_exit_code_says_what_the_verdict_says(
+def test_the_exit_code_agrees_with_the_verdict(
     monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], code: int
 ) -> None:
     def as_if(*given: Any) -> CellRun:
@@ -95,7 +95,9 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_run(command: tupl
     assert f"--record {tmp_path / 'file' / 'recordings'}: Not a directory; allowed: a folder" in result.stderr
 
 
-def test_a_recording_that_ends_before_its_run_is_exit_code_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_that_ends_before_its_run_gives_exit_code_3(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("q2r2_control.recording.recorder.new_folder", full)
     result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path))
     assert result.exit_code == 3
@@ -112,7 +114,7 @@ def test_an_empty_task_is_refused(tmp_path: Path) -> None:
     assert "--task is empty; allowed: some words, or no --task" in result.stderr
 
 
-def test_rt_says_in_one_line_what_the_system_refuses_and_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rt_prints_one_line_about_what_the_system_refuses_and_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     refusal = "real time: no SCHED_FIFO: Operation not permitted; the run goes on without"
 
     @contextmanager
@@ -141,7 +143,7 @@ CAMERAS = ["above", "left_wrist", "right_wrist"]
         pytest.param(("--web",), True, True, (False, ("127.0.0.1", 8080, None)), id="a page is asked for"),
     ],
 )
-def test_a_demo_at_a_terminal_shows_the_arms_where_there_is_a_way_to(
+def test_a_demo_at_a_terminal_shows_the_arms_if_this_is_possible(
     monkeypatch: pytest.MonkeyPatch,
     options: tuple[str, ...],
     display: bool,
@@ -182,13 +184,13 @@ def test_a_demo_lays_the_parts_of_its_task_where_the_seed_has_them(tmp_path: Pat
 
 
 @pytest.mark.parametrize("other", [("--plant", "fri"), ("--seeds", "1")])
-def test_a_spread_is_refused_where_nothing_would_move(other: tuple[str, str]) -> None:
+def test_a_spread_that_would_move_nothing_is_refused(other: tuple[str, str]) -> None:
     result = q2r2("demo", "grasp", "--spread", "0.01", *other)
     assert result.exit_code == 2
     assert "--spread cannot be used with --" in result.stderr
 
 
-def test_an_anonymous_recording_tells_neither_whose_hands_nor_on_which_computer(tmp_path: Path) -> None:
+def test_an_anonymous_recording_names_neither_the_operator_nor_the_computer(tmp_path: Path) -> None:
     options = (*OPTIONS, "--operator", "Ada Lovelace", "--record")
     for name, more in (("named", ()), ("anonymous", ("--anonymous",))):
         assert q2r2("run", CELL, *options, str(tmp_path / name), *more).exit_code == 0
@@ -199,7 +201,7 @@ def test_an_anonymous_recording_tells_neither_whose_hands_nor_on_which_computer(
 
 
 @pytest.mark.slow
-def test_an_episode_of_the_demo_has_the_pictures_of_which_an_export_makes_videos(tmp_path: Path) -> None:
+def test_an_episode_of_the_demo_has_pictures_that_an_export_makes_videos_of(tmp_path: Path) -> None:
     needs_opengl()
     pytest.importorskip("av", reason="the extra export is not installed")
     options = ("--fast", "--json", "--headless", "--duration", "0.5", "--record", str(tmp_path / "recordings"))
@@ -209,14 +211,15 @@ def test_an_episode_of_the_demo_has_the_pictures_of_which_an_export_makes_videos
     counts = [len(list(file.pictures(name))) for name in CAMERAS]
     assert counts == [counts[0]] * 3
     assert sum(counts) == recording["pictures"] >= 3 * 8
-    output = ("--output", str(tmp_path / "grasp"), "--keep-discarded")  # the task takes longer
+    # The judge discards the episode, because the task takes longer than the run.
+    output = ("--output", str(tmp_path / "grasp"), "--keep-discarded")
     exported = q2r2("export", "lerobot-v2.1", str(tmp_path / "recordings"), *output)
     assert exported.exit_code == 0, exported.stderr
     assert len(list((tmp_path / "grasp/videos").rglob("episode_000000.mp4"))) == 3
 
 
 @pytest.mark.slow
-def test_where_nothing_can_be_drawn_one_line_says_so_and_all_else_is_recorded(
+def test_without_graphics_one_line_says_so_and_everything_else_is_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "nothing")
@@ -229,7 +232,7 @@ def test_where_nothing_can_be_drawn_one_line_says_so_and_all_else_is_recorded(
 
 
 @pytest.mark.slow
-def test_a_plant_without_pictures_is_named_and_recorded_without(tmp_path: Path) -> None:
+def test_a_plant_without_pictures_is_named_and_recorded_without_them(tmp_path: Path) -> None:
     result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path / "recordings"))
     assert result.exit_code == 0
     assert "no pictures are recorded: the kinematic plant has none; allowed: --plant mujoco\n" in result.stderr
@@ -246,7 +249,7 @@ class Still:
 
 
 @pytest.mark.slow
-def test_a_policy_of_this_folder_runs_and_is_refused_with_another_input(
+def test_a_policy_of_the_working_folder_runs_and_is_refused_with_another_input(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "still_policy.py").write_text(POLICY)
