@@ -36,14 +36,14 @@ def _state(q: Array, tau: Array | None) -> RobotState:
 
 
 def _jacobian(q: Array, arm: str = "left") -> Array:
-    """Of the arm's joints (6, 7)."""
+    """Return the Jacobian (6, 7) of the arm's joints."""
     found, data = ROBOT.arms[arm], ROBOT.model.createData()
     J = pin.computeFrameJacobian(ROBOT.model, data, q, found.frame_id, pin.LOCAL_WORLD_ALIGNED)
     return np.array(J[:, found.joints])
 
 
 def _touch(wrench: Array, arm: str = "left") -> RobotState:
-    """A state in which ``wrench`` acts on the arm's tool."""
+    """Return a state in which ``wrench`` acts on the arm's tool."""
     tau = REST.copy()
     tau[ROBOT.arms[arm].joints] = _jacobian(ROBOT.home, arm).T @ wrench
     return _state(ROBOT.home, tau)
@@ -53,14 +53,14 @@ UNTOUCHED = _state(ROBOT.home, REST)
 
 
 def _away(pose: pin.SE3 | None, goal: pin.SE3 | None) -> Array:
-    """Translation and rotation vector (6,) from ``goal`` to ``pose``, world axes."""
+    """Return translation and rotation vector (6,) from ``goal`` to ``pose``, in world axes."""
     assert pose is not None
     assert goal is not None
     return np.concatenate([pose.translation - goal.translation, pin.log3(pose.rotation @ goal.rotation.T)])
 
 
 def _displaced(admittance: Admittance, state: RobotState, ticks: int, dt: float = DT) -> list[Array]:
-    """Displacements of the left target."""
+    """Return the displacements of the left target."""
     return [_away(admittance.update(GOALS, state, dt)["left"], GOALS["left"]) for _ in range(ticks)]
 
 
@@ -69,7 +69,7 @@ def _stiffness(axis: int) -> float:
 
 
 def _ratio(x: Array) -> float:
-    """Damping ratio from the first two extremes of a decaying oscillation that starts at rest."""
+    """Return the damping ratio from the first two extremes of a decaying oscillation that starts at rest."""
     first = int(np.argmin(x * np.sign(x[0])))
     second = first + int(np.argmax(x[first:] * np.sign(x[0])))
     logarithm = float(np.log(abs(x[first]) / abs(x[second])))
@@ -89,18 +89,18 @@ def test_released_it_returns_with_the_damping_ratio_asked_for(axis: int, ratio: 
 
 
 @pytest.mark.slow
-def test_critically_damped_it_returns_steadily_and_in_the_end_leaves_the_target_as_it_is() -> None:
+def test_critically_damped_it_returns_without_overshoot_and_leaves_the_target_unchanged_at_the_end() -> None:
     admittance = Admittance(ROBOT)
     _displaced(admittance, _touch(_wrench(2, -20.0)), 2000)
     back = np.array(_displaced(admittance, UNTOUCHED, 4000))[:, 2]
-    # Below the dead band the low-pass still falls: a filter's time later nothing pushes.
+    # Below the dead band, the low-pass filter still decays. After its time constant, nothing pushes.
     assert (np.diff(back) >= 0.0).all()
     assert back[0] < -0.019
     assert admittance.update(GOALS, UNTOUCHED, DT)["left"] is GOALS["left"]
 
 
 @AXES
-def test_below_the_dead_band_nothing_moves_however_long(axis: int) -> None:
+def test_a_force_below_the_dead_band_never_moves_the_tool(axis: int) -> None:
     admittance, band = Admittance(ROBOT), DEFAULT.force_dead_band if axis < 3 else DEFAULT.torque_dead_band
     state = _touch(_wrench(axis, 0.99 * band))
     for _ in range(500):
@@ -110,7 +110,7 @@ def test_below_the_dead_band_nothing_moves_however_long(axis: int) -> None:
 
 
 @pytest.mark.slow
-def test_the_dead_band_ends_without_a_step_and_soon_leaves_the_whole_force() -> None:
+def test_the_dead_band_ends_without_a_step_and_soon_lets_the_whole_force_through() -> None:
     forces = np.linspace(1.5, 30.0, 115)
     ends = np.array([_displaced(Admittance(ROBOT), _touch(_wrench(0, force)), 100, 0.1)[-1][0] for force in forces])
     slopes = np.diff(ends) / np.diff(forces)
@@ -136,7 +136,7 @@ def test_any_wrench_at_any_tick_keeps_the_displacement_inside_its_limits() -> No
     np.testing.assert_allclose(farthest, [DEFAULT.max_displacement, DEFAULT.max_rotation], rtol=1e-6)
 
 
-def test_the_limit_takes_the_speed_with_which_it_is_met() -> None:
+def test_motion_stops_where_the_displacement_meets_its_limit() -> None:
     admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=0.1, filter_time=0.0))
     push, x = _touch(_wrench(0, 95.0)), 0.0
     while x < DEFAULT.max_displacement - 1e-9:
@@ -145,7 +145,7 @@ def test_the_limit_takes_the_speed_with_which_it_is_met() -> None:
     assert (np.diff([x, *back]) < 0.0).all()
 
 
-def test_an_arm_yields_to_its_own_push_only() -> None:
+def test_an_arm_yields_only_to_its_own_push() -> None:
     admittance = Admittance(ROBOT)
     for _ in range(500):
         targets = admittance.update(GOALS, _touch(_wrench(2, 20.0), "right"), DT)
@@ -160,7 +160,7 @@ def test_an_arm_that_holds_is_not_displaced_and_starts_again_from_its_new_target
         assert admittance.update(holding, push, DT) == holding
         assert not admittance.report().arms["left"].displacement.any()
         assert admittance.report().arms["left"].wrench[0] == pytest.approx(20.0, rel=1e-3)
-    # The push is still there: it sets off from rest, at the virtual mass's acceleration.
+    # The push is still there, so that the tool starts from rest with the acceleration of the virtual mass.
     first = _displaced(admittance, push, 1)[0]
     assert 0.0 < first[0] <= 0.5 * 20.0 / DEFAULT.mass * DT**2 * 1.001
 
@@ -183,7 +183,7 @@ BAD = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BAD)
-def test_a_measurement_that_is_no_number_holds_the_last_wrench_and_is_reported(kind: str) -> None:
+def test_a_measurement_that_is_not_finite_holds_the_last_wrench_and_is_reported(kind: str) -> None:
     admittance, (tau, q) = Admittance(ROBOT), BAD[kind]
     _displaced(admittance, _touch(_wrench(1, 20.0)), 3000)
     before = admittance.report().arms["left"]
@@ -196,7 +196,7 @@ def test_a_measurement_that_is_no_number_holds_the_last_wrench_and_is_reported(k
 
 
 @pytest.mark.parametrize("dt", [0.0, np.nan])
-def test_a_time_that_cannot_be_moves_nothing_and_is_reported(dt: float) -> None:
+def test_an_impossible_dt_moves_nothing_and_is_reported(dt: float) -> None:
     admittance, push = Admittance(ROBOT), _touch(_wrench(1, 20.0))
     before = _displaced(admittance, push, 100)[-1]
     np.testing.assert_array_equal(_displaced(admittance, push, 1, dt)[0], before)
@@ -217,7 +217,7 @@ def test_settings_that_would_drift_or_add_energy_are_refused(key: str) -> None:
         AdmittanceSettings(**{key: 0.0})
 
 
-SOFT = 4000.0  # servos [Nm/rad]
+SOFT = 4000.0  # Stiffness of the servos [Nm/rad].
 
 
 @cache
@@ -228,7 +228,10 @@ def _plant() -> MujocoPlant:
 
 
 def _loop(goals: dict[str, pin.SE3 | None], dt: float, ticks: int) -> Iterator[Array]:
-    """The reference's displacement of the left tool from its goal, tick by tick; each keeps the contract."""
+    """Return the displacement of the left tool from its goal in the reference at every tick.
+
+    Each tick keeps the contract.
+    """
     controller, admittance, plant = CartesianController(ROBOT), Admittance(ROBOT), _plant()
     plant.reset()
     contract = Contract(controller, ROBOT.home)
@@ -242,11 +245,13 @@ def _loop(goals: dict[str, pin.SE3 | None], dt: float, ticks: int) -> Iterator[A
 
 @pytest.mark.slow
 @AXES
-def test_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_and_the_servos_give(axis: int) -> None:
+def test_when_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_plus_the_give_of_the_servos(
+    axis: int,
+) -> None:
     push = _wrench(axis, 20.0 if axis < 3 else 5.0)
     for tick, x in enumerate(_loop(GOALS, 0.002, 1500)):
         if tick == 50:
-            np.testing.assert_allclose(x, 0.0, atol=1e-6)  # no drift before
+            np.testing.assert_allclose(x, 0.0, atol=1e-6)  # The tool does not drift before the push.
             _plant().push("left", push, 1.95)
         if tick == 1000:
             expected = push[axis] / _stiffness(axis)
@@ -260,7 +265,7 @@ def test_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_and_th
 
 
 @pytest.mark.slow
-def test_leaning_on_a_body_of_ten_kilonewtons_per_metre_it_comes_to_rest() -> None:
+def test_a_tool_that_leans_on_a_body_of_ten_kilonewtons_per_metre_comes_to_rest() -> None:
     body = 10000.0
     surface = ROBOT.tool_pose(ROBOT.home, "left").translation[2] - 0.02
     below = {arm: pin.SE3(goal.rotation, goal.translation - [0.0, 0.0, 0.06]) for arm, goal in GOALS.items() if goal}
@@ -313,12 +318,12 @@ def test_stretched_out_the_estimate_stays_bounded_and_knows_nothing_of_the_force
         bent = upright.copy()
         bent[3] = angle
         tau = random.uniform(-1.0, 1.0, 7)
-        # With f(s) = s / (s^2 + e^2 (1 - s^2/e^2)^2) <= 1.16 / e for e = 0.05.
+        # The inequality is f(s) = s / (s^2 + e^2 (1 - s^2/e^2)^2) <= 1.16 / e for e = 0.05.
         assert np.linalg.norm(estimate_wrench(_jacobian(bent), tau) / SCALE) <= 1.16 / 0.05 * np.linalg.norm(tau)
 
 
 @pytest.mark.parametrize("ratio", [0.1, 1.0 - 1e-9, 1.0, 1.3])
-def test_one_step_of_the_oscillator_is_what_a_thousand_small_ones_come_to(ratio: float) -> None:
+def test_one_step_of_the_oscillator_equals_a_thousand_small_ones(ratio: float) -> None:
     start, many = np.array([0.03]), np.array([0.03])
     x, v = oscillate(start, np.array([-0.2]), 12.0, ratio, 0.1)
     # The slope of each small step is that of the differential equation.

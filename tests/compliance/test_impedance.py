@@ -16,7 +16,7 @@ from q2r2_control.types import Array, RobotState
 from tests.support.torque_loop import reference
 
 DT = 0.001
-SETTINGS = ImpedanceSettings(torque_rate_limit=1000.0)  # 1 Nm a tick
+SETTINGS = ImpedanceSettings(torque_rate_limit=1000.0)  # The limit is 1 Nm per tick.
 STRETCHED = np.zeros(14)
 
 
@@ -29,7 +29,7 @@ def gravity(robot: Robot, q: Array) -> Array:
 
 
 def started(robot: Robot, settings: ImpedanceSettings = SETTINGS) -> ImpedanceController:
-    """A controller that was reset at home."""
+    """Return a controller that was reset at home."""
     controller = ImpedanceController(robot, settings)
     controller.reset(at(robot.home))
     return controller
@@ -47,17 +47,17 @@ def test_settings_that_would_not_hold_the_arm_are_refused(key: str, value: float
 
 class TestController:
     @pytest.mark.parametrize("scale", [1.0, 0.5])
-    def test_the_first_torque_is_gravitys_at_the_measured_posture(self, robot: Robot, scale: float) -> None:
+    def test_the_first_torque_is_gravity_at_the_measured_posture(self, robot: Robot, scale: float) -> None:
         controller = ImpedanceController(robot, ImpedanceSettings(torque_scale=scale))
         q = robot.home + 0.1
         controller.reset(at(q))
-        # Wherever the newest reference is: it is due only at the end of the tick.
+        # The newest reference does not matter, because it is due only at the end of the tick.
         command = controller.step(reference(q + 0.2), at(q), DT)
         np.testing.assert_allclose(command.tau, gravity(robot, q), atol=1e-9)
         assert not command.report.held
         assert command.report.clipped == ()
 
-    def test_extra_torque_is_added_and_bounded_with_the_rest(self, robot: Robot) -> None:
+    def test_extra_torque_is_added_and_bounded_with_all_other_torques(self, robot: Robot) -> None:
         controller = started(robot)
         extra = np.zeros(14)
         extra[0], extra[5] = 0.5, 1e6
@@ -80,7 +80,7 @@ class TestController:
 
     @pytest.mark.parametrize("field", ["q", "v"])
     @pytest.mark.parametrize("value", [np.nan, np.inf])
-    def test_a_state_that_is_no_state_holds_the_last_gravity_torque_and_says_so(
+    def test_an_unusable_state_holds_the_last_gravity_torque_and_is_reported(
         self, robot: Robot, field: str, value: float
     ) -> None:
         controller, good, q = started(robot), at(robot.home), robot.home + 0.05
@@ -96,7 +96,7 @@ class TestController:
         np.testing.assert_allclose(last, gravity(robot, q), atol=1e-9)
         assert not controller.step(reference(robot.home), good, DT).report.held
 
-    def test_arrays_that_their_owner_writes_anew_change_nothing_that_is_kept(self, robot: Robot) -> None:
+    def test_later_changes_of_given_arrays_change_nothing_in_the_controller(self, robot: Robot) -> None:
         controller = ImpedanceController(robot, SETTINGS)
         state, newest = at(robot.home.copy()), reference(robot.home.copy())
         controller.reset(state)
@@ -119,7 +119,7 @@ class TestController:
                 last = tau
 
     @pytest.mark.parametrize("value", [np.nan, np.inf])
-    def test_a_reference_that_is_no_reference_is_held(self, robot: Robot, value: float) -> None:
+    def test_an_unusable_reference_is_not_used_and_the_last_one_is_held(self, robot: Robot, value: float) -> None:
         controller = started(robot)
         moved = at(robot.home + 0.01)
         for _ in range(50):
@@ -131,20 +131,22 @@ class TestController:
             assert not command.report.held
 
     @pytest.mark.parametrize(("dt", "change"), [(0.0, 0.0), (-1.0, 0.0), (np.nan, 0.0), (0.01, 10.0), (50.0, 100.0)])
-    def test_the_torque_changes_with_the_time_that_passed(self, robot: Robot, dt: float, change: float) -> None:
+    def test_the_change_of_torque_is_limited_by_the_time_that_passed(
+        self, robot: Robot, dt: float, change: float
+    ) -> None:
         controller = started(robot)
         tau = controller.step(reference(robot.home), at(robot.home), dt, np.full(14, 1e4)).tau
         expected = np.minimum(gravity(robot, robot.home) + change, robot.torque_limit)
         np.testing.assert_allclose(tau, expected, atol=1e-9)
 
     @pytest.mark.parametrize("bad", [np.full(14, np.nan), np.zeros(7)], ids=["NaN", "one arm"])
-    def test_a_start_at_no_posture_is_refused(self, robot: Robot, bad: Array) -> None:
+    def test_a_start_at_an_unusable_posture_is_refused(self, robot: Robot, bad: Array) -> None:
         with pytest.raises(RobotError, match="expected 14 finite numbers"):
             ImpedanceController(robot).reset(at(bad))
 
 
 class TestAnImpedanceThatChanges:
-    def test_it_changes_on_a_straight_line_over_the_ramp_time(self, robot: Robot) -> None:
+    def test_a_setting_changes_on_a_straight_line_over_the_ramp_time(self, robot: Robot) -> None:
         controller = started(robot, ImpedanceSettings(ramp_time=0.1))
         before = controller.in_force("right")
         asked = {
@@ -160,7 +162,7 @@ class TestAnImpedanceThatChanges:
             assert controller.in_force("right") == before
         assert controller.in_force("left") == asked
 
-    def test_another_change_begins_where_the_last_one_is_and_what_it_does_not_name_goes_on(self, robot: Robot) -> None:
+    def test_another_change_begins_at_the_present_value_and_leaves_other_changes_alone(self, robot: Robot) -> None:
         controller = started(robot, ImpedanceSettings(ramp_time=0.1))
         controller.change({"damping_ratio": 0.5, "nullspace_stiffness": 10.0})
         for ticks, damping in ((50, None), (50, [1.25, 0.5]), (50, [1.75, 0.5])):
@@ -173,7 +175,7 @@ class TestAnImpedanceThatChanges:
             assert [values["damping_ratio"] for values in in_force] == pytest.approx(damping)
             assert [values["nullspace_stiffness"] for values in in_force] == pytest.approx([10.0, 10.0])
 
-    def test_what_is_in_force_afterwards_is_as_if_the_controller_had_been_made_with_it(self, robot: Robot) -> None:
+    def test_after_a_change_the_controller_is_as_if_made_with_the_new_settings(self, robot: Robot) -> None:
         soft = {"translational_stiffness": 300.0, "damping_ratio": 0.4, "nullspace_stiffness": 20.0}
         made, changed = started(robot, ImpedanceSettings(**soft)), ImpedanceController(robot)
         changed.change(soft)
@@ -196,7 +198,7 @@ class TestAnImpedanceThatChanges:
             ({"translational_stiffness": 100.0}, "middle", "no arm 'middle'; arms: left, right"),
         ],
     )
-    def test_what_cannot_be_is_refused_and_nothing_changes(
+    def test_an_impossible_setting_is_refused_and_nothing_changes(
         self, robot: Robot, values: dict, arm: str | None, message: str
     ) -> None:
         controller = ImpedanceController(robot)
@@ -209,7 +211,7 @@ class TestAnImpedanceThatChanges:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "tool", "joints"), [("panda", "panda_hand", 7), ("ur5", "tool0", 6)])
-def test_robots_whose_rotors_are_unknown_have_usual_ones(model: str, tool: str, joints: int) -> None:
+def test_robots_with_unknown_rotors_have_usual_ones(model: str, tool: str, joints: int) -> None:
     import example_robot_data
 
     robot = Robot.from_urdf(example_robot_data.load(model).urdf, {"left": tool})

@@ -27,13 +27,13 @@ STIFFNESS = np.array([2000.0] * 3 + [200.0] * 3)
 
 
 def tool_inertia(J: Array, M: Array) -> Array:
-    """Of the tool (6, 6)."""
+    """Return the inertia of the tool (6, 6)."""
     inertia: Array = inertia_and_damping(J @ np.linalg.solve(M, J.T), STIFFNESS)[0]
     return inertia
 
 
 def projector_of(J: Array, M: Array) -> Array:
-    """The matrix that torques are multiplied by."""
+    """Return the matrix that torques are multiplied by."""
     J, inertia, M_inverse = np.ascontiguousarray(J), tool_inertia(J, M), np.linalg.inv(M)
     consistent = [torque - J.T @ consistent_force(inertia, J, M_inverse, torque) for torque in np.eye(len(M))]
     return np.column_stack(consistent)
@@ -50,14 +50,14 @@ def test_each_part_of_an_error_is_clipped_by_its_length_and_keeps_its_direction(
 
 class TestASingularPosture:
     @pytest.mark.slow
-    def test_has_no_direction_heavier_than_1000_kg(self) -> None:
+    def test_the_tool_inertia_has_no_direction_heavier_than_1000_kg(self) -> None:
         J, M = left_arm(ROBOT, STRETCHED)
         assert np.linalg.matrix_rank(J) < 6
         root = np.sqrt(STIFFNESS / STIFFNESS[0])
         heaviest = np.linalg.eigvalsh(tool_inertia(J, M) / np.outer(root, root)).max()
         assert heaviest == pytest.approx(1000.0)
 
-    def test_makes_no_projector_jump_nor_amplify_without_bound(self) -> None:
+    def test_the_projector_neither_jumps_nor_amplifies_without_bound(self) -> None:
         projectors = []
         for bend in np.linspace(-0.02, 0.02, 41):
             q = STRETCHED.copy()
@@ -75,22 +75,22 @@ class TestLimitRepulsion:
         assert np.ptp(torques) == 0
         return float(torques[0])
 
-    def test_it_is_a_spring_that_begins_before_the_limit_or_where_the_reference_is(self) -> None:
+    def test_the_limit_torque_is_a_spring_that_begins_before_the_limit_or_at_the_reference(self) -> None:
         assert [self.torque(q) for q in (-0.9, 0.0, 0.9)] == [0.0, 0.0, 0.0]
         assert [self.torque(q) for q in (0.95, -0.95, 1.1)] == pytest.approx([-15.0, 15.0, -60.0])
         assert [self.torque(q, wanted=0.97) for q in (0.97, 0.98)] == pytest.approx([0.0, -3.0])
         assert self.torque(-0.98, wanted=-0.97) == pytest.approx(3.0)
 
-    def test_it_brakes_what_approaches_and_never_holds_what_leaves(self) -> None:
+    def test_the_limit_torque_brakes_approach_and_never_holds_retreat(self) -> None:
         assert [self.torque(0.95, v=v) for v in (1.0, -1.0, -3.0)] == pytest.approx([-25.0, -5.0, 0.0])
         assert self.torque(-0.95, v=3.0) == 0.0
 
-    def test_it_never_jumps(self) -> None:
+    def test_the_limit_torque_never_jumps(self) -> None:
         torques = [self.torque(q, v=0.5) for q in np.linspace(0.8, 1.1, 3001)]
         assert np.abs(np.diff(torques)).max() < 0.05
 
 
-def test_both_torque_bounds_hold_whatever_is_asked_for() -> None:
+def test_both_torque_bounds_hold_for_any_wanted_torque() -> None:
     random = np.random.default_rng(5)
     limit = np.array([176.0, 110.0, 40.0])
     bounded = np.zeros(3)
@@ -109,7 +109,7 @@ def test_both_torque_bounds_hold_whatever_is_asked_for() -> None:
 
 
 def damping(stiffness: Array, inertia: Array, ratio: float) -> Array:
-    """2 xi sqrt(K) sqrt(sqrt(K)^-1 Lambda sqrt(K)^-1) sqrt(K), the matrix square root by its eigenvalues."""
+    """Return 2 xi sqrt(K) sqrt(sqrt(K)^-1 Lambda sqrt(K)^-1) sqrt(K), with matrix square roots by eigenvalues."""
     root = np.sqrt(stiffness)
     values, vectors = np.linalg.eigh(inertia / np.outer(root, root))
     return np.asarray(2.0 * ratio * np.outer(root, root) * (vectors @ np.diag(np.sqrt(values)) @ vectors.T))
@@ -118,7 +118,7 @@ def damping(stiffness: Array, inertia: Array, ratio: float) -> Array:
 def arm_torque(
     arm: str, settings: ImpedanceSettings, wanted: tuple[Array, Array], measured: tuple[Array, Array]
 ) -> Array:
-    """Torque (7,) of one arm's spring and posture."""
+    """Return the torque (7,) of one arm's spring and posture."""
     model, joints, frame = ROBOT.model, ROBOT.arms[arm].joints, ROBOT.arms[arm].frame_id
     (q_wanted, v_wanted), (q, v) = wanted, measured
     jacobians = []
@@ -153,7 +153,7 @@ def test_the_torque_is_that_of_the_formulas(spread: float) -> None:
         q_wanted = q + random.uniform(-spread, spread, 14)
         state = RobotState(q, v, np.zeros(14), None, 0.0)
         controller.reset(state)
-        # The spring is about the reference of the tick before.
+        # The spring acts about the reference of the tick before.
         controller.step(reference(q_wanted, v_wanted), state, 0.001)
         command = controller.step(reference(q_wanted, v_wanted, a), state, 0.1)
         expected = pin.rnea(ROBOT.model, ROBOT.model.createData(), q, v, a)

@@ -39,7 +39,7 @@ def wall(**settings: float) -> MeasuredSeparation:
 
 @cache
 def _postures() -> list[tuple[Array, WallReport]]:
-    """Postures in which the wall presses and nothing touches."""
+    """Return postures in which the wall presses and nothing touches."""
     random, found = np.random.default_rng(31), []
     for _ in range(12000):
         q = random_posture(ROBOT, random)
@@ -63,7 +63,7 @@ def _mass_matrix(q: Array) -> Array:
 
 
 @pytest.mark.parametrize("kind", [_of_two_arms, _with_the_table], ids=["two arms", "an arm and the table"])
-def test_the_torque_at_rest_is_the_gradient_of_the_walls_energy(kind: Callable[[tuple[str, str]], bool]) -> None:
+def test_the_torque_at_rest_is_the_gradient_of_the_wall_energy(kind: Callable[[tuple[str, str]], bool]) -> None:
     chosen = [(q, report) for q, report in _postures() if any(map(kind, report.pressing))][:40]
     assert len(chosen) >= 20
     assert max(len(report.pressing) for _, report in chosen) >= 3
@@ -81,12 +81,12 @@ def test_the_energy_is_that_of_a_spring_over_each_pairs_depth_as_coal_measures_i
     for q, report in _postures()[:100]:
         depth = np.array([max(SHELL - pair.distance, 0.0) for pair in ROBOT.distances(q)])
         spring = 0.5 * stiffness * float((depth**2).sum())
-        # Smooth distances are up to 0.3 mm longer.
+        # Smooth distances are up to 0.3 mm longer than exact ones.
         least = 0.5 * stiffness * float((np.maximum(depth - 3e-4, 0.0) ** 2).sum())
         assert least - 1e-9 <= report.energy <= spring + 1e-4
 
 
-def test_the_report_names_what_presses_and_the_closest_pair() -> None:
+def test_the_report_names_the_pairs_that_press_and_the_closest_pair() -> None:
     for q, report in _postures()[:50]:
         distances = {frozenset((pair.name_a, pair.name_b)): pair.distance for pair in ROBOT.distances(q)}
         assert distances[frozenset(report.closest_pair)] == pytest.approx(report.closest_distance, abs=1e-4)
@@ -96,21 +96,21 @@ def test_the_report_names_what_presses_and_the_closest_pair() -> None:
         assert all(pair in pressing for pair, distance in distances.items() if distance < SHELL - 4e-4)
 
 
-def test_a_pair_that_touches_as_it_may_hides_no_pair_that_meets() -> None:
+def test_a_pair_that_may_touch_hides_no_pair_that_must_not() -> None:
     q = ROBOT.home.copy()
-    q[1] = 0.7  # the left fingers 10 mm in the table
+    q[1] = 0.7  # The left fingers are 10 mm inside the table.
     contact = {"pair": ("*_finger_*", "table"), "depth": 0.015, "speed": 0.03}
     settings = ControllerSettings.model_validate({"contact_allowed": [contact]})
     assert wall().update(q, REST).closest_distance == pytest.approx(-0.01, abs=1e-3)
     assert MeasuredSeparation(ROBOT, settings).update(q, REST).closest_distance == 0.0
     q[9] = q[2] = 0.0
-    q[1] = q[8] = 0.85  # hands too
+    q[1] = q[8] = 0.85  # The hands are inside the table too.
     report = MeasuredSeparation(ROBOT, settings).update(q, REST)
     assert report.closest_distance < 0.0
     assert not any("finger" in name for name in report.closest_pair)
 
 
-def test_fingers_press_at_the_openings_that_were_set() -> None:
+def test_fingers_press_with_the_openings_that_were_set() -> None:
     random, separation = np.random.default_rng(4), MeasuredSeparation(ROBOT, ControllerSettings(), WallSettings())
     closed = collision_model_at(ROBOT.collision_model, ROBOT.finger_bodies, {"left": (0.0, 0.1)})
     farther = 0
@@ -137,7 +137,7 @@ def test_there_is_no_torque_outside_the_shell_at_any_speed() -> None:
     assert seen > 20
 
 
-def test_no_speed_makes_the_wall_pull_a_pair_together() -> None:
+def test_the_wall_never_pulls_a_pair_together_at_any_speed() -> None:
     single = [(q, report) for q, report in _postures() if len(report.pressing) == 1 and report.force > 5.0][:30]
     assert len(single) >= 10
     for q, report in single:
@@ -164,7 +164,7 @@ def test_the_damping_takes_energy_at_every_velocity() -> None:
 def test_the_torque_grows_gradually_into_the_shell_while_closing() -> None:
     crossed = 0
     for q, report in _postures()[:12]:
-        # From outside along the torque, at a speed of its own, in steps of a few micrometres.
+        # The approach begins outside and goes along the torque at constant speed, in steps of a few micrometres.
         direction = report.tau / np.linalg.norm(report.tau)
         way = np.linspace(0.1, 0.0, 8001)
         torques = np.array([wall().update(q + s * direction, -0.3 * direction).tau for s in way])
@@ -173,7 +173,7 @@ def test_the_torque_grows_gradually_into_the_shell_while_closing() -> None:
     assert crossed >= 3
 
 
-def test_default_stiffness_is_never_scaled_down_and_stacked_pairs_of_a_hard_wall_are() -> None:
+def test_default_stiffness_is_never_scaled_down_but_that_of_stacked_pairs_of_a_hard_wall_is() -> None:
     firm = {"maximum_force": 2000.0}
     stiffest = max(_postures(), key=lambda posture: len(posture[1].pressing))[0]
     for q, _ in _postures():
@@ -184,7 +184,9 @@ def test_default_stiffness_is_never_scaled_down_and_stacked_pairs_of_a_hard_wall
 
 
 @pytest.mark.parametrize("stiffness", [1e4, 1e5])
-def test_damping_of_all_pairs_together_stays_a_quarter_of_what_two_milliseconds_can_take(stiffness: float) -> None:
+def test_damping_of_all_pairs_together_stays_below_a_quarter_of_the_stable_maximum_at_two_milliseconds(
+    stiffness: float,
+) -> None:
     separation, bound = wall(stiffness=stiffness, damping_ratio=2.0, maximum_force=2000.0), 0.5 / 0.002
     stacked = sorted(_postures(), key=lambda posture: -len(posture[1].pressing))[:40]
     reached = 0.0
@@ -198,7 +200,7 @@ def test_damping_of_all_pairs_together_stays_a_quarter_of_what_two_milliseconds_
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_numbers_that_are_not_finite_give_no_torque_and_no_distance(bad: float) -> None:
+def test_numbers_that_are_not_finite_give_neither_torque_nor_distance(bad: float) -> None:
     q = _postures()[0][0]
     broken = q.copy()
     broken[3] = bad
@@ -219,14 +221,14 @@ ROD = """<robot name="rod"><link name="base"/><link name="rod"><inertial><mass v
 <parent link="base"/><child link="rod"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
 
 
-def test_a_robot_without_pairs_meets_no_wall() -> None:
+def test_a_robot_without_pairs_has_no_wall() -> None:
     robot = Robot.from_urdf(ROD, {"left": "rod"}, unchecked_links=["rod"])
     report = MeasuredSeparation(robot, ControllerSettings()).update(np.zeros(1), np.ones(1))
     assert not report.tau.any()
     assert report.closest_distance == np.inf
 
 
-HOLD, HOLD_DAMPING = 2000.0, 60.0  # of the right arm's joints [Nm/rad, Nm s/rad]
+HOLD, HOLD_DAMPING = 2000.0, 60.0  # Stiffness [Nm/rad] and damping [Nm s/rad] that hold the right arm's joints.
 
 
 def _pushed(
@@ -285,7 +287,7 @@ def test_an_arm_pushed_at_the_other_with_40_newtons_never_touches_it_and_gets_no
     assert released[-1] < 0.7 * released[0]
 
 
-def test_a_wall_begins_where_pairs_are_told_to_stay_later_as_if_it_had_been_made_so() -> None:
+def test_a_wall_with_distances_that_changed_later_equals_a_wall_made_with_them() -> None:
     wider = ControllerSettings(min_distance=0.04)
     made, told = MeasuredSeparation(ROBOT, wider), MeasuredSeparation(ROBOT, ControllerSettings())
     q = _postures()[0][0]
@@ -294,7 +296,7 @@ def test_a_wall_begins_where_pairs_are_told_to_stay_later_as_if_it_had_been_made
     np.testing.assert_array_equal(told.update(q, REST).tau, made.update(q, REST).tau)
 
 
-def test_an_arm_pushed_at_a_box_that_was_put_down_never_touches_it_and_is_free_of_it_when_it_is_gone() -> None:
+def test_an_arm_pushed_at_a_new_box_never_touches_it_and_is_free_when_the_box_is_removed() -> None:
     controller = CartesianController(ROBOT, ControllerSettings(moving_obstacles=("hand", "box")))
     separation, size = MeasuredSeparation(ROBOT, controller.settings), (0.2, 0.05, 0.3)
     at = ROBOT.tool_pose(ROBOT.home, "left").translation + np.array([0.0, 0.14, 0.0])
@@ -323,7 +325,7 @@ def test_an_arm_pushed_at_a_box_that_was_put_down_never_touches_it_and_is_free_o
 
 
 @pytest.mark.parametrize("with_object", [False, True], ids=["empty hands", "an object in one hand's reach"])
-def test_a_hand_that_moves_is_no_wall_since_its_reports_would_push_the_arms(with_object: bool) -> None:
+def test_a_moving_hand_has_no_wall_because_its_reports_would_push_the_arms(with_object: bool) -> None:
     robot = Robot.from_config(object_cell(BLOCK)) if with_object else ROBOT
     controller = CartesianController(robot, ControllerSettings(moving_obstacles=("hand", "box")))
     separation = MeasuredSeparation(robot, controller.settings)
