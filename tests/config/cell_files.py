@@ -1,4 +1,4 @@
-"""Files of cells for tests: the shipped one with something changed, and what is said of a fault in one."""
+"""Files of cells for tests: the shipped one with changes, and the message about a fault in a file."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ CELL = SHIPPED / "dual_iiwa7.yaml"
 
 
 def shipped() -> dict[str, Any]:
-    """The text of the shipped cell of two iiwa 7."""
+    """Return the text of the shipped cell of two iiwa 7."""
     data: dict[str, Any] = yaml.safe_load(CELL.read_text(encoding="utf-8"))
     return data
 
 
 def loaded(tmp_path: Path, text: str | bytes) -> Config:
-    """The cell that a file with ``text`` describes."""
+    """Return the cell that a file with ``text`` describes."""
     file = tmp_path / "cell.yaml"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     return load_config(file)
 
 
 def fault(tmp_path: Path, text: str | bytes) -> str:
-    """The text of the one line after the file's name."""
+    """Return the text of the one line after the file's name."""
     with pytest.raises(ConfigError) as caught:
         loaded(tmp_path, text)
     message = str(caught.value)
@@ -41,7 +41,7 @@ def fault(tmp_path: Path, text: str | bytes) -> str:
 
 
 def changed(path: str, value: object, cell: Callable[[], dict[str, Any]] = shipped) -> str:
-    """A cell as YAML with one value replaced or added; ``path`` is written with dots."""
+    """Return a cell as YAML with one value replaced or added; ``path`` is written with dots."""
     data = yaml.safe_load(yaml.safe_dump(cell()))
     *parents, key = path.split(".")
     place = data

@@ -1,4 +1,4 @@
-"""The YAML of a cell: every fault ends in one line that says where it is and what is allowed."""
+"""The YAML of a cell: every fault gives one line that names its place and what is allowed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_the_keys_of_a_gripper_are_those_of_its_kind(tmp_path: Path, gripper: di
     assert message.startswith(f"fri.left.gripper.units = 9: unknown key; allowed here: {allowed}")
 
 
-def test_what_a_cabinet_sees_of_a_cell_while_answers_catch_up_is_within_the_velocity_limits(tmp_path: Path) -> None:
+def test_the_motion_that_a_cabinet_sees_while_answers_catch_up_is_within_the_velocity_limits(tmp_path: Path) -> None:
     def scale(given: float) -> float:
         text = changed("control.velocity_scale", given, lambda: shipped() | {"fri": {"left": {}, "right": {}}})
         return loaded(tmp_path, text).control.velocity_scale
@@ -63,7 +63,7 @@ def test_what_a_cabinet_sees_of_a_cell_while_answers_catch_up_is_within_the_velo
     assert scale(0.5) == 0.5
 
 
-def test_a_gripper_by_modbus_is_at_a_host_or_on_a_serial_device(tmp_path: Path) -> None:
+def test_a_gripper_by_modbus_has_a_host_or_a_serial_device(tmp_path: Path) -> None:
     for modbus, endpoint in (("[::1]:1502", ("::1", 1502)), ("gripper", ("gripper", 502)), ("/dev/ttyUSB0", None)):
         config = loaded(tmp_path, changed("fri.left.gripper", {"modbus": modbus}))
         gripper = config.fri["left"].gripper
@@ -71,7 +71,7 @@ def test_a_gripper_by_modbus_is_at_a_host_or_on_a_serial_device(tmp_path: Path) 
         assert gripper.endpoint == endpoint
 
 
-def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path: Path) -> None:
+def test_a_misspelt_key_is_named_before_the_missing_one(tmp_path: Path) -> None:
     message = fault(tmp_path, CELL.read_text().replace("shape: box", "shapes: box"))
     assert message.startswith("obstacles.table.shapes = 'box': unknown key; allowed here: colour, ")
 
@@ -79,7 +79,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
 @pytest.mark.parametrize(
     ("path", "value", "allowed"),
     [
-        # degrees, millimetres, milliseconds, percent
+        # Values in degrees, millimetres, milliseconds or percent are refused.
         ("arms.left.mount.rpy", [0, 0, 90], "6.2832 or less"),
         ("obstacles.table.size", [0.8, 1.6], "a box takes 3 size value(s)"),
         ("teleop.stance", "behind", "'side_by_side', 'mirror' or 'mirror_reflected'"),
@@ -114,12 +114,12 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("headset.allow", ["192.168.1.7/24"], "write 192.168.1.0/24, or 192.168.1.7 alone"),
         ("headset.allow", ["10.0.0.7", "the lab"], "'the lab' is neither an address nor a network such as"),
         ("arms.left.gripper.closed_position", 0.025, "have to differ"),
-        # not numbers, or not the ones meant
+        # Values that are not numbers, or not the intended ones, are refused.
         ("control.acceleration_limit", math.nan, "finite number"),
         ("control.position_margin", "0.01 rad", "allowed: a number"),
         ("control.priority", "middle", "allowed here: equal, left, right"),
         ("arms.middle", {"model": "iiwa7", "home": [0] * 7}, "'left' or 'right'"),
-        # of a cell with another controller
+        # These values belong to a cell with another controller.
         ("controller", "kuka", "'builtin' or 'external'"),
         ("external.preset", "kuka", "allowed are kuka_lbr_clik, kuka_lbr_impedance, fzi, mayr, crisp, moveit_servo, "),
         ("external.rate", 20, "preset kuka_lbr_clik needs at least 50 Hz"),
@@ -133,7 +133,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
 )
 def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, value: object, allowed: str) -> None:
     message = fault(tmp_path, changed(path, value, external if path.startswith("external") else shipped))
-    # A fault of two keys together is told of the mapping that has both.
+    # A fault of two keys together is reported at the mapping that contains both.
     assert message.startswith((path, path.rpartition(".")[0] + ": "))
     assert allowed in message
 
@@ -159,11 +159,11 @@ def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, va
     ],
     ids=lambda value: repr(value)[:40],
 )
-def test_what_is_no_cell_at_all_ends_in_one_line(tmp_path: Path, text: str | bytes, says: str) -> None:
+def test_a_file_that_is_not_a_cell_gives_one_line(tmp_path: Path, text: str | bytes, says: str) -> None:
     assert re.search(says, fault(tmp_path, text))
 
 
-def test_the_number_of_further_faults_is_told(tmp_path: Path) -> None:
+def test_the_message_contains_the_number_of_further_faults(tmp_path: Path) -> None:
     text = changed("control", {"acceleration_limit": -1, "min_distance": -1, "max_substep": -1})
     assert fault(tmp_path, text).endswith("(and 2 more)")
 
@@ -194,14 +194,14 @@ def test_a_mapping_may_be_merged_into_another_and_changed_there(tmp_path: Path) 
         ("arms.left.tool", {}, None),
     ],
 )
-def test_a_tool_frame_that_is_named_is_called_by_side(
+def test_a_tool_frame_that_the_file_names_gets_the_name_of_its_side(
     tmp_path: Path, path: str, value: object, frame: str | None
 ) -> None:
     config = loaded(tmp_path, changed(path, value))
     assert config.named_tool_frame("left") == frame
 
 
-def test_networks_that_may_connect_are_read_as_such(tmp_path: Path) -> None:
+def test_networks_that_may_connect_are_read_as_networks(tmp_path: Path) -> None:
     headset = loaded(tmp_path, changed("headset.allow", ["192.168.1.0/24", "10.0.0.7", "fd00::/64"])).headset
     assert headset.networks == tuple(map(ip_network, ("192.168.1.0/24", "10.0.0.7/32", "fd00::/64")))
     assert loaded(tmp_path, changed("headset.allow", None)).headset.networks is None

@@ -1,4 +1,4 @@
-"""The block of another controller in a cell: its faults are told as those of the rest are."""
+"""The block of another controller in a cell: its faults are reported like those of other blocks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ UNCLEAR = {
 
 
 @pytest.mark.parametrize(("text", "says"), UNCLEAR.values(), ids=UNCLEAR)
-def test_who_drives_the_arms_has_to_be_clear(tmp_path: Path, text: str, says: str) -> None:
+def test_a_cell_has_to_say_clearly_which_controller_drives_the_arms(tmp_path: Path, text: str, says: str) -> None:
     assert fault(tmp_path, text).startswith(says)
 
 
@@ -64,7 +64,7 @@ def test_limits_of_targets_are_for_presets_that_take_targets(tmp_path: Path) -> 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "kuka.md").read_text(encoding="utf-8")
 
 
-def test_the_blocks_of_the_page_about_kuka_are_those_of_a_cell() -> None:
+def test_the_blocks_of_the_page_about_kuka_are_valid_in_a_cell() -> None:
     lbr, kuka_drivers = (yaml.safe_load(dedent(block)) for block in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL))
     cell = yaml.safe_load(find_resource("config/dual_iiwa14.yaml").read_text(encoding="utf-8"))
     config = parse_config(yaml.safe_dump(cell | kuka_drivers), "cell.yaml")
@@ -79,7 +79,9 @@ def test_the_blocks_of_the_page_about_kuka_are_those_of_a_cell() -> None:
 
 @pytest.mark.parametrize(("name", "frame", "base"), [("iiwa7", "link_ee", 1.266), ("iiwa14", "link_7", 1.261)])
 def test_the_tool_that_the_page_puts_on_tf_is_the_shipped_cells(name: str, frame: str, base: float) -> None:
-    """``base``: height of that frame above the arm's base in the driver's own model, where the arm is stretched [m]."""
+    """The height ``base`` is that of the frame above the arm's base in the driver's own model, with the arm stretched
+    [m].
+    """
     text = find_resource(f"config/dual_{name}.yaml").read_text(encoding="utf-8")
     robot = Robot.from_config(parse_config(text, "cell.yaml"))
     stretched = pin.neutral(robot.model)

@@ -1,4 +1,4 @@
-"""A measured mount in the text of a cell."""
+"""A measured mount is written into the text of a cell."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def arms(*mounts: str) -> str:
         ),
     ],
 )
-def test_the_mount_is_replaced_and_all_else_stays(text: str) -> None:
+def test_the_mount_is_replaced_and_everything_else_stays(text: str) -> None:
     changed = with_mount(text, "right", POSITION, RPY)
     expected = yaml.safe_load(text)
     expected["arms"]["right"]["mount"] = {"position": POSITION, "rpy": RPY}
@@ -48,6 +48,6 @@ def test_the_mount_is_replaced_and_all_else_stays(text: str) -> None:
         pytest.param("[]", id="no cell"),
     ],
 )
-def test_a_mount_that_is_no_block_of_its_own_is_left_to_the_user(text: str) -> None:
+def test_a_mount_that_is_not_its_own_block_is_left_to_the_user(text: str) -> None:
     with pytest.raises(ConfigError, match=r"arms\.right\.mount: no block of its own"):
         with_mount(text, "right", POSITION, RPY)

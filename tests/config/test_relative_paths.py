@@ -1,4 +1,4 @@
-"""Where the files that a cell names are looked for."""
+"""The places where the files that a cell names are searched."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.config.cell_files import changed, loaded
 
 
 class TestRelativePathsAreLookedUp:
-    """From the file's folder, then from the working directory, then among what ships."""
+    """Paths are searched from the file's folder, then from the working directory, then among the shipped files."""
 
     URDF = (
         '<robot name="{name}"><link name="base"/><link name="rod"/><joint name="hinge" type="revolute">'
@@ -22,7 +22,7 @@ class TestRelativePathsAreLookedUp:
 
     @pytest.fixture
     def folders(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
-        """The folder of a YAML file and the working directory, each with everything."""
+        """Return the folder of a YAML file and the working directory, which both contain all files."""
         for name in ("cell", "work"):
             folder = tmp_path / name
             (folder / "robots").mkdir(parents=True)
@@ -55,7 +55,7 @@ class TestRelativePathsAreLookedUp:
         assert (config.model_of("left"), config.srdf) == (model, "pairs.srdf")
         assert Robot.from_config(config).joint_names == ("left_hinge",)
 
-    def test_of_a_robot_that_arms_share_and_of_tools_too(self, folders: tuple[Path, Path]) -> None:
+    def test_paths_of_a_shared_robot_and_of_tools_are_searched_too(self, folders: tuple[Path, Path]) -> None:
         cell, _ = folders
         (cell / "cell.yaml").write_text(
             "name: x\nrobot: {model: rod.urdf}\narms: {left: {home: [0], tool: {model: robots/rod.urdf}}}\n"
@@ -67,7 +67,7 @@ class TestRelativePathsAreLookedUp:
         assert config.packages == {"mine": str(cell / "robots")}
 
     @pytest.mark.parametrize("path", ["x" * 5000 + ".urdf", "a\x00.urdf", ""])
-    def test_and_what_no_file_can_be_called_ends_in_one_line(self, tmp_path: Path, path: str) -> None:
+    def test_a_name_that_no_file_can_have_gives_one_line(self, tmp_path: Path, path: str) -> None:
         config = loaded(tmp_path, changed("arms.left.model", path))
         with pytest.raises(Q2R2Error) as caught:
             Robot.from_config(config)

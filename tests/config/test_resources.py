@@ -1,4 +1,4 @@
-"""The shipped files are found from everywhere, and what is not found is said in one line."""
+"""The shipped files are found from every folder, and a missing file gives one line."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_file_in_the_working_folder_comes_first(tmp_path: Path, monkeypatch: p
     ["config", "", "config/triple.yaml", "x\0y", "~nobody_of_this_name/x.yaml"],
     ids=["a folder", "nothing", "a misspelling", "a zero byte", "unknown home"],
 )
-def test_what_is_no_file_ends_in_one_line(path: str) -> None:
+def test_a_name_that_is_not_a_file_gives_one_line(path: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load_config(path)
     assert len(str(caught.value).splitlines()) == 1
@@ -54,7 +54,7 @@ def test_every_file_of_config_and_robots_is_part_of_the_installation() -> None:
 
 @pytest.mark.slow
 def test_installed_beside_the_package_they_are_found_without_the_checkout(tmp_path: Path) -> None:
-    """The layout that pip makes with --target, run as a process of its own."""
+    """The layout is that of pip with --target. The test runs in its own process."""
     shutil.copytree(CHECKOUT / "q2r2_control", tmp_path / "q2r2_control", ignore=shutil.ignore_patterns("__pycache__"))
     for folder in ("config", "robots"):
         shutil.copytree(CHECKOUT / folder, tmp_path / "share" / "q2r2_control" / folder)

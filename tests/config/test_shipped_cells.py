@@ -1,4 +1,4 @@
-"""Every shipped cell loads, and the first of them shows with comments all that there is to tune."""
+"""Every shipped cell loads. The first one shows all settings with comments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.external_cell import external_text, robot_text
 
 
 @pytest.mark.parametrize("file", sorted(SHIPPED.glob("*.yaml")), ids=lambda file: file.stem)
-def test_every_shipped_cell_loads_and_is_called_as_its_file(file: Path) -> None:
+def test_every_shipped_cell_loads_and_has_the_name_of_its_file(file: Path) -> None:
     assert load_config(file).name == file.stem
 
 
@@ -31,7 +31,7 @@ def models_in(annotation: object) -> Iterator[type[BaseModel]]:
 
 
 def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iterator[tuple[str, type[BaseModel], Any]]:
-    """Every block of a file, with its place and its model; of blocks by name the first one."""
+    """Return every block of a file with its place and its model. Of blocks by name, only the first is returned."""
     yield place, model, data
     for key, field in model.model_fields.items():
         value, path = data.get(key), f"{place}.{key}".lstrip(".")
@@ -44,9 +44,9 @@ def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iter
 
 
 class TestTheShippedCellShowsAllThereIsToTune:
-    # Not the default, and the file says so.
+    # The value is not the default, and a comment in the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    # Placements, as an arm's mount is, which shows the keys.
+    # A placement, such as an arm's mount, shows its keys.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy", "robot.mount.rpy", "external")
 
     @pytest.mark.parametrize("text", [external_text(), robot_text()], ids=["arms of their own", "one robot"])
@@ -54,7 +54,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         lines = text.splitlines()
         for place, model, data in shown(Config, yaml.safe_load(text)):
             if place == "arms.left" and "robot:" in text:
-                continue  # whose model is the robot's
+                continue  # The arms are parts of the shared robot.
             for key in model.model_fields:
                 path = f"{place}.{key}".lstrip(".")
                 if path in self.SHOWN_ELSEWHERE:
@@ -76,13 +76,13 @@ class TestTheShippedCellShowsAllThereIsToTune:
         for key in ("loop_rate_hz", "controller"):
             assert getattr(load_config(CELL), key) == Config.model_fields[key].default
 
-    def test_the_example_of_a_pair_by_name_is_one_that_the_cell_has(self) -> None:
+    def test_the_example_of_a_pair_by_name_exists_in_the_cell(self) -> None:
         (example,) = re.findall(r"pairs: \[\] +# .*such as (\[.*?\}\])", CELL.read_text(encoding="utf-8"))
         config = Config.model_validate(yaml.safe_load(changed("control.pairs", yaml.safe_load(example))))
         kept = kept_distances(Robot.from_config(config), config.control)
         assert "pairs[0]" in kept.keys
 
-    def test_the_example_of_a_real_camera_is_one_and_the_cell_has_three_simulated_ones(self) -> None:
+    def test_the_example_of_a_real_camera_is_valid_and_the_cell_has_three_simulated_ones(self) -> None:
         (example,) = re.findall(r"# (\{front: \{topic.*\}\})\n", CELL.read_text(encoding="utf-8"))
         assert not Config.model_validate(yaml.safe_load(changed("cameras", yaml.safe_load(example)))).simulated_cameras
         assert list(load_config(CELL).simulated_cameras) == ["above", "left_wrist", "right_wrist"]
